@@ -1,0 +1,123 @@
+"""Pytrees that travel through the simulator. SI units, Y up, right-handed.
+
+Padding: arrays are padded to a bucket. The last vertex of a padded garment is a real row with zero area; padded
+faces, hinges and edges point at it and carry zero area, so every sum over them is exactly zero. An index is
+never out of range.
+"""
+
+from __future__ import annotations
+
+import jax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+
+@struct.dataclass
+class Garment:
+    """A garment's rest mesh, its topology tables and its skinning; constant during a rollout."""
+
+    rest_positions: Float[Array, "vertices 3"]  # [m], in the body's rest pose
+    faces: Int[Array, "faces 3"]  # counter-clockwise seen from outside
+    rest_areas: Float[Array, " faces"]  # [m^2], zero where padded
+    inverse_rest_frames: Float[Array, "faces 2 2"]  # inverse of D_m [1/m]
+    hinges: Int[Array, "hinges 4"]  # edge start, edge end, opposite vertex left, opposite vertex right
+    hinge_rest_areas: Float[Array, " hinges"]  # sum of the two rest areas [m^2], zero where padded
+    hinge_rest_angles: Float[Array, " hinges"]  # dihedral angle of the rest mesh [rad], zero is flat
+    vertex_areas: Float[Array, " vertices"]  # a third of the incident rest areas [m^2], zero where padded
+    senders: Int[Array, " edges"]  # directed mesh edges, both directions
+    receivers: Int[Array, " edges"]  # sorted ascending
+    reverse_edges: Int[Array, " edges"]  # index of the opposite directed edge
+    neighbors: Int[Array, "vertices degree"]  # padded with the vertex itself
+    neighbor_mask: Bool[Array, "vertices degree"]
+    face_incidence: Int[Array, "vertices face_degree"]  # see numerics.gather_rows
+    hinge_incidence: Int[Array, "vertices hinge_degree"]
+    edge_mask: Bool[Array, " edges"]
+    vertex_mask: Bool[Array, " vertices"]
+    geodesic_embedding: Float[Array, "vertices embedding"]  # [m]
+    skin_weights: Float[Array, "vertices influences"]  # rows sum to one
+    skin_indices: Int[Array, "vertices influences"]
+    is_pinned: Bool[Array, " vertices"]  # follows its skinned position
+
+
+@struct.dataclass
+class Material:
+    """Fabric of a garment; scalars, or one value per face (stretch), hinge (bending) or vertex (density)."""
+
+    density: Float[Array, "..."]  # [kg/m^2]
+    lame_mu: Float[Array, "..."]  # [Pa]
+    lame_lambda: Float[Array, "..."]  # [Pa]
+    bending_stiffness: Float[Array, "..."]  # [J]
+    thickness: Float[Array, "..."]  # [m]
+
+
+@struct.dataclass
+class Body:
+    """A rigged body in its rest pose."""
+
+    rest_positions: Float[Array, "body_vertices 3"]  # [m]
+    shape_directions: Float[Array, "body_vertices 3 shapes"]  # [m] per standard deviation
+    joint_rest_positions: Float[Array, "joints 3"]  # [m]
+    joint_shape_directions: Float[Array, "joints 3 shapes"]
+    skin_weights: Float[Array, "body_vertices influences"]
+    skin_indices: Int[Array, "body_vertices influences"]
+    faces: Int[Array, "body_faces 3"]
+    is_obstacle: Bool[Array, " body_faces"]  # faces that cloth may touch
+    parents: tuple[int, ...] = struct.field(pytree_node=False)  # -1 is the root
+    joint_names: tuple[str, ...] = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class BodyMotion:
+    """A body in motion: what a rollout reads, frame by frame."""
+
+    positions: Float[Array, "frames body_vertices 3"]  # [m]
+    joint_transforms: Float[Array, "frames joints 3 4"]  # rest point -> posed point
+    faces: Int[Array, "body_faces 3"]
+    is_obstacle: Bool[Array, " body_faces"]
+    timestep: Float[Array, ""]  # seconds between frames
+
+
+@struct.dataclass
+class ClothState:
+    """What changes from frame to frame."""
+
+    position: Float[Array, "vertices 3"]  # [m]
+    velocity: Float[Array, "vertices 3"]  # [m/s]
+    friction_load: Float[Array, " vertices"]  # normal force carried into the next frame's friction [N]
+    status: Int[Array, ""]  # errors.Status bits
+    first_bad_frame: Int[Array, ""]  # -1 while status is OK
+
+
+@struct.dataclass
+class Contacts:
+    """The nearest body point of every garment vertex, at both ends of a frame."""
+
+    points: Float[Array, "vertices 3"]  # on the body at frame t [m]
+    next_points: Float[Array, "vertices 3"]  # the same material points at t + 1 [m]
+    normals: Float[Array, "vertices 3"]  # outward unit normals at t
+    next_normals: Float[Array, "vertices 3"]  # at t + 1
+    distances: Float[Array, " vertices"]  # signed distance of the vertex at t, positive outside [m]
+    is_near: Bool[Array, " vertices"]  # close enough for the tangent plane to stand for the body
+
+
+@struct.dataclass
+class Trajectory:
+    """A simulated garment."""
+
+    positions: Float[Array, "frames vertices 3"]  # frame 0 is the skinned start
+    velocities: Float[Array, "frames vertices 3"]  # [m/s]
+    residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame's step
+    status: Int[Array, ""]
+    first_bad_frame: Int[Array, ""]
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, the start included."""
+        return self.positions.shape[0]
+
+
+def tree_cast(tree: object, dtype) -> object:
+    """Cast the floating-point leaves of a pytree, for float64 references."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if jax.numpy.issubdtype(leaf.dtype, jax.numpy.floating) else leaf, tree
+    )
