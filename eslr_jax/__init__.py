@@ -1,0 +1,3 @@
+"""Garment simulation in JAX: message passing with Laplacian smoothing, geodesic attention, physics."""
+
+__version__ = "0.1.0"

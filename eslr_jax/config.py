@@ -1,0 +1,135 @@
+"""Frozen configurations. Defaults are the paper's where it states them; each value names its source."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from eslr_jax.errors import ConfigError
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """Architecture of a network; the defaults are the paper's 15-layer model (4,753,108 parameters)."""
+
+    message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
+    smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
+    attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
+    latent_size: int = 128  # HOOD
+    hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
+    attention_size: int = 64  # q, k, v width, one head; fits the paper's parameter count
+    attention_features: int = 266  # random features, floor(64 ln 64): the Performer default
+    attention_kernel: Literal["relu", "softmax"] = "relu"
+    embedding_size: int = 8  # k of the geodesic embedding
+    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
+    smooth_world_edges: bool = True  # N(i) of eq. 3 counts incoming world edges too
+    features: Literal["hood", "gradient"] = "hood"  # HOOD's inputs, or those plus the potential's gradient
+    output: Literal["acceleration", "correction"] = "acceleration"  # of the state, or of the inertial guess
+    output_scale: float = 1.0  # metres per unit of output, for "correction"
+    passes: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
+    world_edge_radius: float = 0.03  # [m] (HOOD)
+    precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
+    remat: bool = True  # recompute layers in the backward pass
+    seed: int = 0  # of the random attention features
+
+
+@dataclasses.dataclass(frozen=True)
+class SimConfig:
+    """How a rollout is computed; static, so a change compiles anew."""
+
+    simulator: Literal["network", "physics"] = "network"
+    model: ModelConfig | None = None  # required by the network
+    energy_set: Literal["consistent", "hood"] = "consistent"
+    solver_iterations: int = 100  # L-BFGS iterations of the physics simulator
+    solver_memory: int = 8  # pairs kept by L-BFGS
+    corrector_steps: int = 0  # L-BFGS iterations behind the network
+    self_contact: bool = False
+
+
+Config = TypeVar("Config")
+
+
+def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> Config:
+    """Build a frozen config from plain values.
+
+    Args:
+        cls: A frozen dataclass of this module.
+        values: Field values; nested tables become nested configs.
+        where: Prefix of field names in messages.
+
+    Raises:
+        ConfigError: A field is unknown (the closest name is suggested) or has the wrong type.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    resolved: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in fields:
+            close = difflib.get_close_matches(key, fields, n=1)
+            hint = f"; did you mean {where}{close[0]}?" if close else f"; known: {', '.join(fields)}"
+            raise ConfigError(f"unknown option {where}{key}{hint}")
+        resolved[key] = _convert(cls, fields[key], value, f"{where}{key}")
+    try:
+        return cls(**resolved)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _convert(cls: type, field: dataclasses.Field, value: Any, name: str) -> Any:
+    """Check `value` against the field's annotation and convert nested tables, lists and whole floats."""
+    import typing
+
+    hint = typing.get_type_hints(cls)[field.name]
+    options = typing.get_args(hint) if typing.get_origin(hint) is not None else ()
+    if typing.get_origin(hint) is Literal:
+        if value not in options:
+            raise ConfigError(f"{name} = {value!r} is not one of {', '.join(map(repr, options))}")
+        return value
+    candidates = options if options and typing.get_origin(hint) is not tuple else (hint,)
+    for candidate in candidates:
+        origin = typing.get_origin(candidate) or candidate
+        if dataclasses.is_dataclass(candidate) and isinstance(value, dict):
+            return from_dict(candidate, value, where=f"{name}.")  # type: ignore[arg-type]
+        if origin is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        if origin is tuple and isinstance(value, list | tuple):
+            return tuple(value)
+        if origin is int and isinstance(value, bool):
+            continue
+        if isinstance(origin, type) and isinstance(value, origin):
+            return value
+    raise ConfigError(f"{name} = {value!r} has the wrong type; expected {hint}")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return a config as plain values, ready for JSON."""
+    return dataclasses.asdict(config)
+
+
+def to_json(config: Any) -> str:
+    """Return a config as JSON text."""
+    return json.dumps(to_dict(config), indent=2)
+
+
+def load_toml(cls: type[Config], path: str | Path, overrides: dict[str, Any] | None = None) -> Config:
+    """Read a config from a TOML file, then apply dotted overrides.
+
+    Raises:
+        ConfigError: The file is missing, not TOML, or holds an unknown or impossible value.
+    """
+    try:
+        values = tomllib.loads(Path(path).read_text())
+    except FileNotFoundError as error:
+        raise ConfigError(f"no config file {path}; give an existing TOML file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    for dotted, value in (overrides or {}).items():
+        *tables, key = dotted.split(".")
+        target = values
+        for table in tables:
+            target = target.setdefault(table, {})
+        target[key] = value
+    return from_dict(cls, values)
