@@ -14,27 +14,60 @@ from eslr_jax.errors import ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """Architecture of a network; the defaults are the paper's 15-layer model (4,753,108 parameters)."""
+    """Architecture of a network; the defaults are the paper's 15-layer model (4,753,108 parameters).
+
+    The fields marked "open" are points on which the paper is silent; the default is the reading that fits its
+    parameter counts, or else what MeshGraphNet and HOOD do.
+    """
 
     message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
     smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
     attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
     latent_size: int = 128  # HOOD
     hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
-    attention_size: int = 64  # q, k, v width, one head; fits the paper's parameter count
-    attention_features: int = 266  # random features, floor(64 ln 64): the Performer default
-    attention_kernel: Literal["relu", "softmax"] = "relu"
-    embedding_size: int = 8  # k of the geodesic embedding
+    residual: bool = True  # open: v and e of a layer are added to its inputs (MeshGraphNet)
+    readd_edges: bool = True  # open: every smoothing adds e of eq. 3 again, not the first alone
+    smooth_world_edges: bool = True  # open: N(i) of eq. 3 counts incoming world edges too
+    update_body: bool = True  # open: body rows pass messages and are smoothed like garment vertices
+    attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
+    attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
+    attention_kernel: Literal["relu", "softmax"] = "relu"  # open
+    attention_norm: bool = False  # LayerNorm before attention; keeps q and k small for "softmax"
+    attention_feedforward: bool = False  # an MLP behind the attention of every block
+    embedding_size: int = 8  # open: k of the geodesic embedding
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
-    smooth_world_edges: bool = True  # N(i) of eq. 3 counts incoming world edges too
     features: Literal["hood", "gradient"] = "hood"  # HOOD's inputs, or those plus the potential's gradient
     output: Literal["acceleration", "correction"] = "acceleration"  # of the state, or of the inertial guess
     output_scale: float = 1.0  # metres per unit of output, for "correction"
     passes: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
+    world_edge_capacity: int | None = None  # rows for world edges; None is one per vertex
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
     remat: bool = True  # recompute layers in the backward pass
     seed: int = 0  # of the random attention features
+
+    def __post_init__(self) -> None:
+        """Reject impossible or contradictory values.
+
+        Raises:
+            ValueError: Names the field and what to change.
+        """
+        sizes = ("message_passing_steps", "latent_size", "attention_size", "attention_features", "passes")
+        for name in sizes:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("smoothing_steps", "attention_blocks", "hidden_layers", "embedding_size"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("output_scale", "world_edge_radius"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.world_edge_capacity is not None and self.world_edge_capacity < 1:
+            raise ValueError("world_edge_capacity must be at least 1, or null for one row per vertex")
+        if self.passes > 1 and self.features != "gradient":
+            raise ValueError('passes > 1 needs features = "gradient": others are the same in every pass')
+        if self.passes > 1 and self.output != "correction":
+            raise ValueError('passes > 1 needs output = "correction": an acceleration has one pass')
 
 
 @dataclasses.dataclass(frozen=True)
