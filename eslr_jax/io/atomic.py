@@ -1,0 +1,96 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from eslr_jax.errors import AssetError
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; move it onto `path` when the block succeeds.
+
+    Readers see the old file or the complete new one. The temporary name keeps the suffix of `path`, because
+    many writers choose their format by it. When the block raises, the temporary file is removed and `path`
+    is as before.
+
+    Args:
+        path: The file to write; its folder must exist.
+
+    Yields:
+        The path to write to, in the same folder.
+
+    Raises:
+        AssetError: If the folder is missing, or the file can't be written or moved into place.
+    """
+    target = Path(path)
+    # Hidden, and unique to this call, so that two processes may write the same target.
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+    try:
+        if target.is_dir():
+            raise AssetError(f"can't write {target}: it is a folder; name a file in it")
+        if not target.parent.is_dir():
+            raise AssetError(f"can't write {target}: folder {target.parent} doesn't exist; create it first")
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, target)
+        _flush(target.parent)
+    except OSError as error:
+        raise AssetError(
+            f"can't write {target}: {_reason(error)}; free space or choose another folder"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def ensure_output_dir(path: str | Path) -> Path:
+    """Create a folder with its parents, unless it is there, and prove that a file can be written in it.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        The folder.
+
+    Raises:
+        AssetError: If it can't be created, is not a folder, or refuses a file.
+    """
+    folder = Path(path).expanduser()
+    if folder.exists() and not folder.is_dir():
+        raise AssetError(f"output folder {folder} is a file; choose another name or remove the file")
+    probe = folder / f".{secrets.token_hex(6)}.probe"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # A permission bit says nothing to root, on a read-only mount or on a full disk: write one byte.
+        probe.write_bytes(b"\0")
+        probe.unlink()
+    except OSError as error:
+        raise AssetError(
+            f"output folder {folder} can't be written: {_reason(error)}; choose one that you may write to"
+        ) from error
+    return folder
+
+
+def _flush(path: Path) -> None:
+    """Push a file's bytes, or a folder's entries, to the disk."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # a folder can't be opened on Windows; its entries need no flush there
+            return
+        raise
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _reason(error: OSError) -> str:
+    """The operating system's own words, without the path that the caller names already."""
+    return (error.strerror or str(error)).lower()
