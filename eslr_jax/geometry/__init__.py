@@ -1,1 +1,1 @@
-"""TODO."""
+"""Host rooms on rest meshes: topology, validation, geodesics, embedding, padding, skin transfer."""

@@ -1,0 +1,125 @@
+"""From a rest mesh to a `Garment`."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from eslr_jax.errors import MeshError
+from eslr_jax.geometry import topology
+from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
+from eslr_jax.geometry.padding import pad_garment
+from eslr_jax.geometry.validate import validate_mesh
+from eslr_jax.types import Garment
+
+
+def prepare_garment(
+    rest_positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    skin_weights: Float[np.ndarray, "vertices influences"],
+    skin_indices: Int[np.ndarray, "vertices influences"],
+    is_pinned: Bool[np.ndarray, " vertices"] | None = None,
+    embedding_size: int = 8,
+    embedding_mode: EmbeddingMode = "canonical",
+    anchors: Float[np.ndarray, "anchors 3"] | None = None,
+    pad: bool = False,
+    name: str = "garment",
+) -> Garment:
+    """Validate a rest mesh and compute everything about it that stays constant during a rollout.
+
+    Args:
+        rest_positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
+        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
+        skin_weights: Joint weights, normalised to rows that sum to one, shape [vertices, influences].
+        skin_indices: Joint of every weight, shape [vertices, influences].
+        is_pinned: Vertices that follow their skinned position; none by default, shape [vertices].
+        embedding_size: Coordinates of the geodesic embedding.
+        embedding_mode: See `embedding.geodesic_embedding`.
+        anchors: Body points of embedding mode `landmarks` [m].
+        pad: Pad to the garment's bucket.
+        name: What messages call the garment.
+
+    Returns:
+        The garment, with float32, int32 and bool leaves.
+
+    Raises:
+        MeshError: The mesh can't be simulated, or an array has the wrong number of rows.
+        ConfigError: The embedding mode is unknown, or the number of anchors is not the embedding's size.
+    """
+    validate_mesh(rest_positions, faces, name=name, allow_components=True)
+    positions = np.asarray(rest_positions, np.float64)
+    faces = np.asarray(faces, np.int64)
+    num_vertices = len(positions)
+    is_pinned = np.zeros(num_vertices, bool) if is_pinned is None else np.asarray(is_pinned, bool)
+    skin_weights = np.asarray(skin_weights, np.float64)
+    skin_indices = np.asarray(skin_indices)
+    _check_rows(name, num_vertices, skin_weights, skin_indices, is_pinned)
+
+    areas = topology.face_areas(positions, faces)
+    hinges, hinge_faces = topology.find_hinges(faces)
+    senders, receivers, reverse = topology.directed_edges(topology.unique_edges(faces))
+    neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
+    garment = Garment(
+        rest_positions=positions,
+        faces=faces,
+        rest_areas=areas,
+        inverse_rest_frames=topology.inverse_rest_frames(positions, faces),
+        hinges=hinges,
+        hinge_rest_areas=areas[hinge_faces].sum(axis=1),
+        hinge_rest_angles=topology.hinge_angles(positions, hinges),
+        vertex_areas=topology.vertex_areas(areas, faces, num_vertices),
+        senders=senders,
+        receivers=receivers,
+        reverse_edges=reverse,
+        neighbors=neighbors,
+        neighbor_mask=neighbor_mask,
+        face_incidence=topology.incidence_table(faces, num_vertices),
+        hinge_incidence=topology.incidence_table(hinges, num_vertices),
+        edge_mask=np.ones(len(senders), bool),
+        vertex_mask=np.ones(num_vertices, bool),
+        geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode, anchors),
+        skin_weights=skin_weights / skin_weights.sum(axis=1, keepdims=True),
+        skin_indices=skin_indices,
+        is_pinned=is_pinned,
+    )
+    return to_device(pad_garment(garment) if pad else garment)
+
+
+def to_device(garment: Garment) -> Garment:
+    """Return a garment with float32, int32 and bool JAX leaves."""
+    dtypes = {"f": jnp.float32, "i": jnp.int32, "u": jnp.int32, "b": jnp.bool_}
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtypes[leaf.dtype.kind]), garment)
+
+
+def _check_rows(
+    name: str,
+    num_vertices: int,
+    skin_weights: np.ndarray,
+    skin_indices: np.ndarray,
+    is_pinned: np.ndarray,
+) -> None:
+    """Raise where skinning or pins don't fit the mesh."""
+    if (
+        skin_weights.ndim != 2
+        or len(skin_weights) != num_vertices
+        or skin_weights.shape != skin_indices.shape
+    ):
+        raise MeshError(
+            f"{name}: skin weights {skin_weights.shape} and indices {skin_indices.shape} do not fit "
+            f"{num_vertices} vertices; give both one row per vertex, or compute them with transfer_skin_weights"
+        )
+    sums = skin_weights.sum(axis=1)
+    is_bad = ~(np.isfinite(sums) & (sums > 0)) | np.any(skin_weights < 0, axis=1)
+    if is_bad.any():
+        vertex = int(np.argmax(is_bad))
+        raise MeshError(
+            f"{name}: skin weights of vertex {vertex} are {skin_weights[vertex]}; "
+            "give finite, non-negative weights with a positive sum"
+        )
+    if is_pinned.shape != (num_vertices,):
+        raise MeshError(
+            f"{name}: is_pinned has shape {is_pinned.shape} for {num_vertices} vertices; give one value per vertex"
+        )

@@ -1,0 +1,215 @@
+"""Index tables and rest quantities of a triangle mesh, on the host and vectorised.
+
+A half-edge is a face's directed side; half-edge 3 f + c runs from corner c of face f to corner c + 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+
+def half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return start, end and opposite vertex of every half-edge, each of shape [3 * faces]."""
+    starts = faces.ravel()
+    ends = faces[:, [1, 2, 0]].ravel()
+    opposites = faces[:, [2, 0, 1]].ravel()
+    return starts, ends, opposites
+
+
+def unique_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "pairs 2"]:
+    """Return every undirected edge once, as (smaller, larger) vertex, sorted."""
+    starts, ends, _ = half_edges(faces)
+    if not len(starts):
+        return np.empty((0, 2), np.int64)
+    base = int(faces.max()) + 1
+    keys = np.unique(np.minimum(starts, ends).astype(np.int64) * base + np.maximum(starts, ends))
+    return np.stack([keys // base, keys % base], axis=1)
+
+
+def directed_edges(
+    edges: Int[np.ndarray, "pairs 2"],
+) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edges"], Int[np.ndarray, " edges"]]:
+    """Return both directions of every edge, sorted by receiver, then sender.
+
+    Args:
+        edges: Undirected edges, each once.
+
+    Returns:
+        Senders, receivers, and the index of every directed edge's opposite.
+    """
+    senders = np.concatenate([edges[:, 0], edges[:, 1]])
+    receivers = np.concatenate([edges[:, 1], edges[:, 0]])
+    order = np.lexsort((senders, receivers))
+    position = np.empty(len(order), np.int64)
+    position[order] = np.arange(len(order))
+    reverse = position[np.roll(np.arange(len(order)), len(edges))]  # undirected edge e sits at e and at n + e
+    return senders[order], receivers[order], reverse[order]
+
+
+def neighbor_table(
+    senders: Int[np.ndarray, " edges"], receivers: Int[np.ndarray, " edges"], num_vertices: int
+) -> tuple[Int[np.ndarray, "vertices degree"], Bool[np.ndarray, "vertices degree"]]:
+    """Return every vertex's neighbours in ascending order, padded with the vertex itself, and their mask.
+
+    Args:
+        senders: Start of every directed edge.
+        receivers: End of every directed edge, sorted ascending.
+        num_vertices: Number of rows of the table.
+    """
+    degrees = np.bincount(receivers, minlength=num_vertices)
+    slots = np.arange(len(receivers)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
+    table = np.repeat(np.arange(num_vertices)[:, None], max(int(degrees.max(initial=0)), 1), axis=1)
+    mask = np.zeros(table.shape, bool)
+    table[receivers, slots] = senders
+    mask[receivers, slots] = True
+    return table, mask
+
+
+def incidence_table(
+    indices: Int[np.ndarray, "items corners"], num_rows: int
+) -> Int[np.ndarray, "rows degree"]:
+    """Return for every row the ascending flat positions in `indices` that name it.
+
+    Args:
+        indices: Row of every corner of every item (faces, hinges).
+        num_rows: Number of rows that may be named.
+
+    Returns:
+        The table that `numerics.gather_rows` reads, padded with `indices.size`.
+    """
+    flat = indices.ravel()
+    order = np.argsort(flat, kind="stable")
+    degrees = np.bincount(flat, minlength=num_rows)
+    slots = np.arange(len(flat)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
+    table = np.full((num_rows, max(int(degrees.max(initial=0)), 1)), indices.size)
+    table[flat[order], slots] = order
+    return table
+
+
+def find_hinges(
+    faces: Int[np.ndarray, "faces 3"],
+) -> tuple[Int[np.ndarray, "hinges 4"], Int[np.ndarray, "hinges 2"]]:
+    """Return the interior edges with their opposite vertices, and the two faces of each.
+
+    Row (i, j, a, b): the left face runs i -> j -> a, the right face j -> i -> b, and i < j. The mesh must be
+    manifold and consistently oriented (`validate_mesh`).
+
+    Returns:
+        Hinges sorted by (i, j), and the index of their left and right face.
+    """
+    starts, ends, opposites = half_edges(faces)
+    if not len(starts):
+        return np.empty((0, 4), np.int64), np.empty((0, 2), np.int64)
+    base = int(faces.max()) + 1
+    keys = starts.astype(np.int64) * base + ends
+    order = np.argsort(keys, kind="stable")
+    twin_keys = ends.astype(np.int64) * base + starts
+    found = order[np.minimum(np.searchsorted(keys[order], twin_keys), len(order) - 1)]
+    left = np.flatnonzero((keys[found] == twin_keys) & (starts < ends))
+    left = left[np.argsort(keys[left], kind="stable")]
+    right = found[left]
+    hinges = np.stack([starts[left], ends[left], opposites[left], opposites[right]], axis=1)
+    return hinges, np.stack([left // 3, right // 3], axis=1)
+
+
+def face_cross_products(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3"]:
+    """Return (x1 - x0) x (x2 - x0) of every face: twice the area along the counter-clockwise normal [m^2]."""
+    corners = positions[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def face_areas(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, " faces"]:
+    """Return the area of every face [m^2]."""
+    return 0.5 * np.linalg.norm(face_cross_products(positions, faces), axis=1)
+
+
+def vertex_areas(
+    areas: Float[np.ndarray, " faces"], faces: Int[np.ndarray, "faces 3"], num_vertices: int
+) -> Float[np.ndarray, " vertices"]:
+    """Return a third of the area of the faces around every vertex [m^2]."""
+    return np.bincount(faces.ravel(), weights=np.repeat(areas / 3.0, 3), minlength=num_vertices)
+
+
+def inverse_rest_frames(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 2 2"]:
+    """Return the inverse of D_m, the rest edges of every face in a frame of its own plane [1/m].
+
+    D_m = [x0 - x2 | x1 - x2] in the orthonormal frame whose first axis follows x0 - x2 and whose second is the
+    in-plane perpendicular on the side of x1; so D_m is upper triangular with a positive diagonal.
+
+    Source: HOOD, `stretching_energy.py`: frames from the 3-D rest mesh, not from UV coordinates.
+    """
+    corners = positions[faces]
+    first = corners[:, 0] - corners[:, 2]
+    second = corners[:, 1] - corners[:, 2]
+    length = np.linalg.norm(first, axis=1)
+    along = np.sum(first * second, axis=1) / length
+    height = np.linalg.norm(np.cross(first, second), axis=1) / length
+    inverse = np.zeros((len(faces), 2, 2))
+    inverse[:, 0, 0] = 1.0 / length
+    inverse[:, 0, 1] = -along / (length * height)
+    inverse[:, 1, 1] = 1.0 / height
+    return inverse
+
+
+def hinge_angles(
+    positions: Float[np.ndarray, "vertices 3"], hinges: Int[np.ndarray, "hinges 4"]
+) -> Float[np.ndarray, " hinges"]:
+    """Return the signed dihedral angle of every hinge [rad]; zero is flat, a convex ridge is positive.
+
+    theta = atan2(e . (n_a x n_b), n_a . n_b), e the unit edge i -> j, n_a and n_b the unit normals of the left
+    and right face.
+
+    Source: HOOD, `bending_energy.py`.
+    """
+    start, end, left, right = (positions[hinges[:, k]] for k in range(4))
+    edge = _normalize(end - start)
+    normal_left = _normalize(np.cross(end - start, left - start))
+    normal_right = _normalize(np.cross(start - end, right - end))
+    sine = np.sum(edge * np.cross(normal_left, normal_right), axis=1)
+    return np.arctan2(sine, np.sum(normal_left * normal_right, axis=1))
+
+
+def vertex_components(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> tuple[int, np.ndarray]:
+    """Return the number of connected components and the component of every vertex."""
+    starts, ends, _ = half_edges(faces)
+    graph = scipy.sparse.coo_array((np.ones(len(starts), bool), (starts, ends)), (num_vertices, num_vertices))
+    return connected_components(graph, directed=False)
+
+
+def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " loop"]]:
+    """Return the boundary loops as vertex cycles, each along its faces' half-edges.
+
+    Loops are sorted by length, longest first, ties by smallest vertex; each starts at its smallest vertex. The
+    mesh must be manifold, so that a vertex lies on at most one loop.
+    """
+    starts, ends, _ = half_edges(faces)
+    if not len(starts):
+        return []
+    base = int(faces.max()) + 1
+    is_boundary = ~np.isin(starts.astype(np.int64) * base + ends, ends.astype(np.int64) * base + starts)
+    following = dict(zip(starts[is_boundary].tolist(), ends[is_boundary].tolist(), strict=True))
+    loops = []
+    for first in sorted(following):
+        loop = []
+        vertex = first
+        while vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if loop:
+            loops.append(np.array(loop))
+    return sorted(loops, key=lambda loop: (-len(loop), loop[0]))
+
+
+def _normalize(vectors: np.ndarray) -> np.ndarray:
+    """Return unit vectors; a zero vector stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)

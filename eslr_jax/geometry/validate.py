@@ -1,0 +1,264 @@
+"""Checks of user meshes; the first failure raises a `MeshError` that names the place and the remedy."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from eslr_jax.errors import MeshError
+from eslr_jax.geometry.topology import face_areas, face_cross_products, half_edges, vertex_components
+
+MIN_DIAGONAL = 0.05  # [m] of the bounding box; smaller is no garment
+MAX_DIAGONAL = 5.0  # [m]
+DUPLICATE_TOLERANCE = 1e-7  # of the bounding box's diagonal
+DEGENERATE_TOLERANCE = 1e-10  # of the longest edge squared
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}  # metres per unit
+GARMENT_DIAGONAL = 1.0  # [m] a typical garment, to guess the unit by
+
+
+def validate_mesh(
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    name: str = "mesh",
+    allow_components: bool = False,
+) -> None:
+    """Check that a mesh can be simulated.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        name: What messages call the mesh.
+        allow_components: Accept several connected components.
+
+    Raises:
+        MeshError: The mesh is empty, has wrong shapes, indices out of range, NaN, an implausible scale,
+            unreferenced or duplicate vertices, degenerate or duplicate faces, non-manifold edges or vertices,
+            inconsistent orientation, or several components.
+    """
+    positions, faces = np.asarray(positions), np.asarray(faces)
+    _check_arrays(positions, faces, name)
+    _check_scale(positions, name)
+    _check_vertices(positions, faces, name)
+    _check_faces(positions, faces, name)
+    _check_edges(faces, name)
+    _check_fans(faces, len(positions), name)
+    num_components, component = vertex_components(faces, len(positions))
+    if num_components > 1 and not allow_components:
+        sizes = np.bincount(component)
+        other = int(np.argmax(component != np.argmax(sizes)))
+        raise MeshError(
+            f"{name}: {num_components} separate components (sizes {_shorten(np.sort(sizes)[::-1])}; vertex {other} "
+            "is not connected to the largest); simulate them one by one, or sew or delete the loose parts"
+        )
+
+
+def _check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """Raise on empty arrays, wrong shapes or dtypes, non-finite positions and indices out of range."""
+    if positions.size == 0 or faces.size == 0:
+        raise MeshError(
+            f"{name}: empty mesh ({len(positions)} vertices, {len(faces)} faces); give a triangle mesh"
+        )
+    if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
+        raise MeshError(
+            f"{name}: positions have shape {positions.shape} and dtype {positions.dtype}; give [vertices, 3] floats"
+        )
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"{name}: faces have shape {faces.shape}, not [faces, 3]; triangulate the mesh")
+    if faces.dtype.kind not in "iu":
+        raise MeshError(f"{name}: faces have dtype {faces.dtype}; give integer vertex indices")
+    is_bad = ~np.isfinite(positions).all(axis=1)
+    if is_bad.any():
+        vertex = int(np.argmax(is_bad))
+        raise MeshError(
+            f"{name}: vertex {vertex} is not finite ({_point(positions[vertex])}); repair its position"
+        )
+    is_bad = ((faces < 0) | (faces >= len(positions))).any(axis=1)
+    if is_bad.any():
+        face = int(np.argmax(is_bad))
+        raise MeshError(
+            f"{name}: face {face} {_ids(faces[face])} names a vertex outside 0..{len(positions) - 1}; "
+            "export the mesh again, with 0-based indices"
+        )
+
+
+def _check_scale(positions: np.ndarray, name: str) -> None:
+    """Raise on a bounding box that is no garment in metres, and guess the unit."""
+    diagonal = _diagonal(positions)
+    if MIN_DIAGONAL <= diagonal <= MAX_DIAGONAL:
+        return
+    cause = f"{name}: bounding-box diagonal {diagonal:.4g} m is outside {MIN_DIAGONAL}-{MAX_DIAGONAL} m"
+    if diagonal > MAX_DIAGONAL:
+        unit, factor = min(UNITS.items(), key=lambda item: abs(np.log(diagonal * item[1] / GARMENT_DIAGONAL)))
+        if MIN_DIAGONAL <= diagonal * factor <= MAX_DIAGONAL:
+            raise MeshError(f"{cause}; it looks like {unit}: scale by {factor:g}")
+    elif diagonal > 0:
+        factor = 10.0 ** round(-np.log10(diagonal))
+        raise MeshError(f"{cause}; positions must be in metres: scale by about {factor:g}")
+    raise MeshError(f"{cause}; positions must be in metres")
+
+
+def _check_vertices(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """Raise on vertices that no face uses, and on coincident vertices."""
+    is_used = np.zeros(len(positions), bool)
+    is_used[faces] = True
+    if not is_used.all():
+        vertex = int(np.argmin(is_used))
+        raise MeshError(
+            f"{name}: {np.sum(~is_used)} vertices belong to no face, the first is vertex {vertex}; delete loose vertices"
+        )
+    pairs = cKDTree(positions).query_pairs(DUPLICATE_TOLERANCE * _diagonal(positions), output_type="ndarray")
+    if len(pairs):
+        first, second = np.sort(pairs, axis=1)[np.lexsort(np.sort(pairs, axis=1).T[::-1])[0]]
+        raise MeshError(
+            f"{name}: vertices {first} and {second} coincide at {_point(positions[first])} "
+            f"({len(pairs)} such pairs); merge vertices by distance"
+        )
+
+
+def _check_faces(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
+    """Raise on faces without area and on faces that name the same three vertices."""
+    corners = positions[faces]
+    longest = np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1)
+    is_bad = face_areas(positions, faces) <= DEGENERATE_TOLERANCE * longest
+    if is_bad.any():
+        face = int(np.argmax(is_bad))
+        raise MeshError(
+            f"{name}: face {face} {_ids(faces[face])} has no area ({is_bad.sum()} such faces); "
+            "dissolve degenerate faces"
+        )
+    ordered = np.sort(faces, axis=1)
+    order = np.lexsort(ordered.T)
+    is_same = np.all(ordered[order][1:] == ordered[order][:-1], axis=1)
+    if is_same.any():
+        first, second = np.sort(order[np.argmax(is_same) + np.arange(2)])
+        raise MeshError(
+            f"{name}: faces {first} and {second} are the same triangle {_ids(faces[first])} "
+            f"({is_same.sum()} duplicates); delete duplicate faces"
+        )
+
+
+def _check_edges(faces: np.ndarray, name: str) -> None:
+    """Raise on edges with more than two faces, and on neighbours that wind in opposite directions."""
+    starts, ends, _ = half_edges(faces.astype(np.int64))
+    base = int(faces.max()) + 1
+    keys = np.minimum(starts, ends) * base + np.maximum(starts, ends)
+    unique, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    if counts.max() > 2:
+        edge = int(np.argmax(counts > 2))
+        users = np.flatnonzero(inverse == edge) // 3
+        raise MeshError(
+            f"{name}: edge {(int(unique[edge] // base), int(unique[edge] % base))} belongs to {counts[edge]} faces "
+            f"{_ids(users[:6])} ({np.sum(counts > 2)} such edges); cloth is a sheet: "
+            "delete or separate the extra faces"
+        )
+    forward = np.bincount(inverse, weights=starts < ends, minlength=len(unique))
+    is_bad = (counts == 2) & (forward != 1)
+    if is_bad.any():
+        edge = int(np.argmax(is_bad))
+        users = np.flatnonzero(inverse == edge) // 3
+        raise MeshError(
+            f"{name}: faces {users[0]} and {users[1]} wind in opposite directions along edge "
+            f"{(int(unique[edge] // base), int(unique[edge] % base))} ({is_bad.sum()} such edges); "
+            "recalculate normals so that all point outside"
+        )
+
+
+def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
+    """Raise on vertices whose faces form more than one fan (bow-ties).
+
+    Corners are nodes; across every interior edge the corners at each of its ends are joined, so each fan is one
+    component, and a manifold mesh has as many components as vertices.
+    """
+    starts, ends, _ = half_edges(faces.astype(np.int64))
+    base = int(faces.max()) + 1
+    corner = np.arange(len(starts))  # of the half-edge's start
+    following = corner - corner % 3 + (corner + 1) % 3  # corner of its end
+    keys = starts * base + ends
+    order = np.argsort(keys)
+    twin_keys = ends * base + starts
+    found = order[np.minimum(np.searchsorted(keys[order], twin_keys), len(order) - 1)]
+    has_twin = keys[found] == twin_keys
+    rows = np.concatenate([corner[has_twin], following[has_twin]])
+    columns = np.concatenate([following[found[has_twin]], found[has_twin]])
+    graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (len(starts), len(starts)))
+    num_fans, fan = connected_components(graph, directed=False)
+    if num_fans == num_vertices:
+        return
+    fan_vertex = np.empty(num_fans, np.int64)
+    fan_vertex[fan] = starts
+    counts = np.bincount(fan_vertex, minlength=num_vertices)
+    vertex = int(np.argmax(counts > 1))
+    raise MeshError(
+        f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
+        f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
+    )
+
+
+def validate_orientation(
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    body_positions: Float[np.ndarray, "body_vertices 3"] | None = None,
+    body_faces: Int[np.ndarray, "body_faces 3"] | None = None,
+    *,
+    name: str = "mesh",
+) -> None:
+    """Check that the faces of a garment point outside.
+
+    With a body, outside is where the nearest body face points; without one it is away from the vertical axis of
+    the mesh. The mesh is refused only where most of its area clearly disagrees.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        body_positions: Body vertices in the same pose [m], shape [body_vertices, 3].
+        body_faces: Triangles of the body, counter-clockwise seen from outside.
+        name: What messages call the mesh.
+
+    Raises:
+        MeshError: The faces point inside.
+    """
+    positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
+    crosses = face_cross_products(positions, faces)
+    centers = positions[faces].mean(axis=1)
+    if body_positions is not None and body_faces is not None:
+        body_positions, body_faces = np.asarray(body_positions, np.float64), np.asarray(body_faces)
+        body_crosses = face_cross_products(body_positions, body_faces)
+        outward = body_crosses / np.maximum(np.linalg.norm(body_crosses, axis=1, keepdims=True), 1e-30)
+        _, nearest = cKDTree(body_positions[body_faces].mean(axis=1)).query(centers)
+        outward = outward[nearest]
+        where = "into the body"
+        threshold = -0.2
+    else:
+        weights = np.linalg.norm(crosses, axis=1)
+        outward = (centers - weights @ centers / weights.sum()) * np.array([1.0, 0.0, 1.0])
+        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
+        where = "inside"
+        threshold = -0.4
+    agreement = np.sum(crosses * outward) / np.sum(np.linalg.norm(crosses, axis=1))
+    if agreement < threshold:
+        raise MeshError(f"{name}: its faces point {where} (agreement {agreement:.2f}); flip the normals")
+
+
+def _diagonal(positions: np.ndarray) -> float:
+    """Return the bounding box's diagonal [m]."""
+    return float(np.linalg.norm(positions.max(axis=0).astype(float) - positions.min(axis=0)))
+
+
+def _ids(values: np.ndarray) -> str:
+    """Format indices as (a, b, c)."""
+    return "(" + ", ".join(str(int(value)) for value in values) + ")"
+
+
+def _point(values: np.ndarray) -> str:
+    """Format a position."""
+    return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
+
+
+def _shorten(values: np.ndarray, limit: int = 5) -> str:
+    """Format the first few of many counts."""
+    text = ", ".join(str(int(value)) for value in values[:limit])
+    return text + (", ..." if len(values) > limit else "")
