@@ -29,7 +29,7 @@ class Garment:
     reverse_edges: Int[Array, " edges"]  # index of the opposite directed edge
     neighbors: Int[Array, "vertices degree"]  # padded with the vertex itself
     neighbor_mask: Bool[Array, "vertices degree"]
-    face_incidence: Int[Array, "vertices face_degree"]  # see numerics.gather_rows
+    face_incidence: Int[Array, "vertices face_degree"]  # see numerics.gather_corners
     hinge_incidence: Int[Array, "vertices hinge_degree"]
     edge_mask: Bool[Array, " edges"]
     vertex_mask: Bool[Array, " vertices"]
@@ -78,12 +78,29 @@ class BodyMotion:
 
 
 @struct.dataclass
+class BodySurface:
+    """Part of a body that cloth can touch, with a two-level search structure.
+
+    Vertices are grouped into patches that stay together when the body bends: the nearest patches lead to the
+    nearest vertex, and that vertex to the faces around it.
+    """
+
+    vertex_ids: Int[Array, " surface_vertices"]  # of the whole body's vertices
+    faces: Int[Array, "surface_faces 3"]  # into `vertex_ids`
+    face_incidence: Int[Array, "surface_vertices degree"]  # see numerics.gather_corners
+    patch_centers: Int[Array, " patches"]  # a vertex of each patch
+    patch_vertices: Int[Array, "patches members"]  # padded by repetition
+    vertex_faces: Int[Array, "surface_vertices candidates"]  # padded by repetition
+
+
+@struct.dataclass
 class ClothState:
     """What changes from frame to frame."""
 
     position: Float[Array, "vertices 3"]  # [m]
     velocity: Float[Array, "vertices 3"]  # [m/s]
     friction_load: Float[Array, " vertices"]  # normal force carried into the next frame's friction [N]
+    frame: Int[Array, ""]  # index of this frame
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # -1 while status is OK
 
@@ -101,12 +118,27 @@ class Contacts:
 
 
 @struct.dataclass
+class Scene:
+    """All that a rollout reads. What is None is not modelled: it is absent from the compiled step."""
+
+    garment: Garment
+    material: Material
+    start: ClothState
+    timestep: Float[Array, ""]  # [s]
+    surface: BodySurface | None  # None: no body
+    body_positions: Float[Array, "frames surface_vertices 3"] | None  # [m], in the order of the surface
+    pin_targets: Float[Array, "frames vertices 3"] | None  # [m]; None: nothing is pinned
+    num_frames: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
 class Trajectory:
     """A simulated garment."""
 
     positions: Float[Array, "frames vertices 3"]  # frame 0 is the skinned start
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
-    residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame's step
+    residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame's step; 0 at the start
+    iterations: Int[Array, " frames"]  # solver or corrector iterations spent on each frame
     status: Int[Array, ""]
     first_bad_frame: Int[Array, ""]
 

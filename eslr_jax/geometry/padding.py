@@ -132,10 +132,10 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
         leaves["neighbors"], leaves["neighbor_mask"], bucket
     )
     padded["face_incidence"] = _pad_incidence(
-        leaves["face_incidence"], 3 * have.faces, 3 * bucket.faces, (bucket.vertices, bucket.face_degree)
+        leaves["face_incidence"], 3, (have.faces, bucket.faces), (bucket.vertices, bucket.face_degree)
     )
     padded["hinge_incidence"] = _pad_incidence(
-        leaves["hinge_incidence"], 4 * have.hinges, 4 * bucket.hinges, (bucket.vertices, bucket.hinge_degree)
+        leaves["hinge_incidence"], 4, (have.hinges, bucket.hinges), (bucket.vertices, bucket.hinge_degree)
     )
     return garment.replace(**padded)
 
@@ -149,10 +149,17 @@ def _pad_neighbors(neighbors: np.ndarray, mask: np.ndarray, bucket: Bucket) -> t
     return table, np.pad(mask, ((0, bucket.vertices - rows), (0, bucket.degree - columns)))
 
 
-def _pad_incidence(table: np.ndarray, size: int, new_size: int, shape: tuple[int, int]) -> np.ndarray:
-    """Return an incidence table grown to `shape`, with padding moved from `size` to `new_size`."""
-    padded = np.full(shape, new_size, table.dtype)
-    padded[: table.shape[0], : table.shape[1]] = np.where(table == size, new_size, table)
+def _pad_incidence(
+    table: np.ndarray, corners: int, items: tuple[int, int], shape: tuple[int, int]
+) -> np.ndarray:
+    """Return an incidence table grown to `shape` and from items[0] to items[1] items.
+
+    Entry corner * items[0] + item becomes corner * items[1] + item; the padding, corners * items[0], moves to
+    corners * items[1] by the same rule.
+    """
+    corner, item = np.divmod(table, max(items[0], 1))
+    padded = np.full(shape, corners * items[1], table.dtype)
+    padded[: table.shape[0], : table.shape[1]] = corner * items[1] + item
     return padded
 
 

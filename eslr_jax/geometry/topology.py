@@ -71,16 +71,16 @@ def neighbor_table(
 def incidence_table(
     indices: Int[np.ndarray, "items corners"], num_rows: int
 ) -> Int[np.ndarray, "rows degree"]:
-    """Return for every row the ascending flat positions in `indices` that name it.
+    """Return for every row the ascending flat positions in `indices.T` (corner by corner) that name it.
 
     Args:
         indices: Row of every corner of every item (faces, hinges).
         num_rows: Number of rows that may be named.
 
     Returns:
-        The table that `numerics.gather_rows` reads, padded with `indices.size`.
+        The table that `numerics.gather_corners` reads, padded with `indices.size`.
     """
-    flat = indices.ravel()
+    flat = indices.T.ravel()
     order = np.argsort(flat, kind="stable")
     degrees = np.bincount(flat, minlength=num_rows)
     slots = np.arange(len(flat)) - np.repeat(np.cumsum(degrees) - degrees, degrees)

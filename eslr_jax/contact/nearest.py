@@ -1,0 +1,172 @@
+"""The nearest body point of every garment vertex."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.numerics import Vector3, components, cross3, dot3, gather_corners, safe_normalize, sub3
+from eslr_jax.types import BodySurface, Contacts
+
+_NEAREST_PATCHES = 4  # patches whose vertices are tried
+CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
+
+
+class SurfacePoint(NamedTuple):
+    """A point of a body surface per garment vertex."""
+
+    face: Int[Array, " vertices"]
+    barycentric: Vector3  # weights of the face's corners
+    squared_distance: Float[Array, " vertices"]  # [m^2]
+
+
+def vertex_normals(
+    positions: Float[Array, "surface_vertices 3"], surface: BodySurface
+) -> Float[Array, "surface_vertices 3"]:
+    """Return area-weighted unit vertex normals of the surface."""
+    a, b, c = gather_corners(positions, surface.faces, surface.face_incidence)
+    normal = cross3(sub3(b, a), sub3(c, a))
+    num_faces = surface.faces.shape[0]
+    # A vertex's incidence entries count corners; all three corners of a face share its normal.
+    face = jnp.where(surface.face_incidence < 3 * num_faces, surface.face_incidence % num_faces, num_faces)
+    sums = []
+    for component in normal:
+        padded = jnp.concatenate([component, jnp.zeros_like(component[:1])])
+        sums.append(sum(padded[face[:, k]] for k in range(face.shape[1])))
+    return safe_normalize(jnp.stack(sums, axis=-1))
+
+
+def nearest_point(
+    query: Float[Array, "vertices 3"], positions: Float[Array, "surface_vertices 3"], surface: BodySurface
+) -> SurfacePoint:
+    """Find the nearest surface point of every query point.
+
+    Not exact: the faces around the nearest vertex of the four nearest patches are tried. Garment vertices of
+    the bundled assets get a point within 0.1 mm of the nearest in more than 99.9 % of cases.
+
+    Args:
+        query: Points [m].
+        positions: Surface vertices [m], in the order of `surface.vertex_ids`.
+        surface: Search tables.
+    """
+    body = components(positions)
+    point = components(query)
+    vertex = _nearest_vertex(point, body, surface)
+    candidates = surface.vertex_faces[vertex]
+    corners = [tuple(c[surface.faces[:, k]] for c in body) for k in range(3)]
+    triangles = [tuple(c[candidates] for c in corner) for corner in corners]
+    expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
+    squared, u, v = _point_triangle(expanded, triangles[0], triangles[1], triangles[2])
+    best = jnp.min(squared, axis=1)
+    slot = _first_true(squared <= best[:, None])
+    picked = jnp.arange(candidates.shape[1]) == slot[:, None]
+    u = jnp.sum(jnp.where(picked, u, 0.0), axis=1)
+    v = jnp.sum(jnp.where(picked, v, 0.0), axis=1)
+    face = jnp.sum(jnp.where(picked, candidates, 0), axis=1)
+    return SurfacePoint(face, (1.0 - u - v, u, v), best)
+
+
+def _nearest_vertex(point: Vector3, body: Vector3, surface: BodySurface) -> Int[Array, " vertices"]:
+    """Return the surface vertex nearest to each point, looking into the nearest patches."""
+    squared = _squared_distances(point, tuple(c[surface.patch_centers] for c in body))
+    members = []
+    for _ in range(min(_NEAREST_PATCHES, squared.shape[1])):
+        patch = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
+        members.append(surface.patch_vertices[patch])
+        squared = jnp.where(jnp.arange(squared.shape[1]) == patch[:, None], jnp.inf, squared)
+    candidates = jnp.concatenate(members, axis=1)
+    squared = sum((c[candidates] - p[:, None]) ** 2 for c, p in zip(body, point, strict=True))
+    slot = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
+    return jnp.take_along_axis(candidates, slot[:, None], axis=1)[:, 0]
+
+
+def _squared_distances(a: Vector3, b: Vector3) -> Float[Array, "rows columns"]:
+    """Return all pairs' squared distances, by differences: no cancellation far from the origin."""
+    return sum((p[:, None] - q[None, :]) ** 2 for p, q in zip(a, b, strict=True))  # type: ignore[return-value]
+
+
+def _first_true(mask: Bool[Array, "rows columns"]) -> Int[Array, " rows"]:
+    """Return the first true column of each row (zero if none); argmin is slow on XLA's CPU backend."""
+    width = mask.shape[1]
+    index = jnp.min(jnp.where(mask, jnp.arange(width, dtype=jnp.int32), width), axis=1)
+    return jnp.minimum(index, width - 1)
+
+
+def _point_triangle(point: Vector3, a: Vector3, b: Vector3, c: Vector3):
+    """Return the squared distance to a triangle and the weights of b and c at the closest point.
+
+    The closest of: the plane's foot point if inside, and the three edges. Degenerate triangles fall back to
+    their edges.
+    """
+    ab, ac, ap = sub3(b, a), sub3(c, a), sub3(point, a)
+    d00, d01, d11 = dot3(ab, ab), dot3(ab, ac), dot3(ac, ac)
+    d20, d21, d22 = dot3(ap, ab), dot3(ap, ac), dot3(ap, ap)
+    determinant = d00 * d11 - d01 * d01
+    inverse = 1.0 / jnp.where(determinant > 0, determinant, 1.0)
+    u = (d11 * d20 - d01 * d21) * inverse
+    v = (d00 * d21 - d01 * d20) * inverse
+    is_inside = (determinant > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
+
+    def squared(u, v):
+        return d22 + u * (u * d00 - 2 * d20 + 2 * v * d01) + v * (v * d11 - 2 * d21)
+
+    def ratio(numerator, denominator):
+        return jnp.clip(numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0, 1.0)
+
+    along_ab = ratio(d20, d00)
+    along_ac = ratio(d21, d11)
+    along_bc = ratio((d21 - d20) - (d01 - d00), d00 - 2 * d01 + d11)
+    best_u, best_v, best = along_ab, jnp.zeros_like(along_ab), squared(along_ab, 0.0)
+    for edge_u, edge_v in ((jnp.zeros_like(along_ac), along_ac), (1.0 - along_bc, along_bc)):
+        value = squared(edge_u, edge_v)
+        is_better = value < best
+        best_u = jnp.where(is_better, edge_u, best_u)
+        best_v = jnp.where(is_better, edge_v, best_v)
+        best = jnp.where(is_better, value, best)
+    u = jnp.where(is_inside, u, best_u)
+    v = jnp.where(is_inside, v, best_v)
+    return jnp.maximum(jnp.where(is_inside, squared(u, v), best), 0.0), u, v
+
+
+def interpolate(
+    values: Float[Array, "surface_vertices 3"], location: SurfacePoint, surface: BodySurface
+) -> Float[Array, "vertices 3"]:
+    """Return per-vertex values of the surface at located points."""
+    corners = surface.faces[location.face]
+    weights = location.barycentric
+    return sum(weights[k][:, None] * values[corners[:, k]] for k in range(3))  # type: ignore[return-value]
+
+
+def find_contacts(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    next_body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+) -> Contacts:
+    """Pair every garment vertex with its nearest body point at t, and carry that point to t + 1.
+
+    The side of the body is decided at t, where the cloth is known to be outside; a limb that moves fast then
+    carries its contact planes along instead of jumping over the cloth.
+
+    Args:
+        position: Garment vertices at t [m].
+        body: Surface vertices at t [m].
+        next_body: Surface vertices at t + 1 [m].
+        surface: Search tables.
+    """
+    location = nearest_point(position, body, surface)
+    points = interpolate(body, location, surface)
+    normals = safe_normalize(interpolate(vertex_normals(body, surface), location, surface))
+    next_normals = safe_normalize(interpolate(vertex_normals(next_body, surface), location, surface))
+    side = jnp.sum((position - points) * normals, axis=-1)
+    distance = jnp.sqrt(location.squared_distance)
+    return Contacts(
+        points=points,
+        next_points=interpolate(next_body, location, surface),
+        normals=normals,
+        next_normals=next_normals,
+        distances=jnp.where(side < 0, -distance, distance),
+        is_near=distance < CONTACT_RADIUS,
+    )

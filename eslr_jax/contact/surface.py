@@ -1,0 +1,74 @@
+"""Search tables of a body surface, built once per scene on the host."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from eslr_jax.types import BodySurface
+
+_PATCH_SIZE = 14  # vertices per patch; more make the first level cheaper and the second dearer
+_CANDIDATE_FACES = 20  # faces tried around the nearest vertex: its own and most of its neighbours'
+
+
+def prepare_surface(rest_positions: np.ndarray, faces: np.ndarray) -> BodySurface:
+    """Build the search tables of a body surface.
+
+    Args:
+        rest_positions: All body vertices in any pose without self-contact [m], shape [body_vertices, 3].
+        faces: The faces to keep, shape [surface_faces, 3]; other vertices are dropped.
+    """
+    vertex_ids, flat = np.unique(faces, return_inverse=True)
+    faces = flat.reshape(-1, 3)
+    positions = np.asarray(rest_positions, np.float64)[vertex_ids]
+    centers, patch_vertices = _patches(positions)
+    return BodySurface(
+        vertex_ids=jnp.asarray(vertex_ids, jnp.int32),
+        faces=jnp.asarray(faces, jnp.int32),
+        face_incidence=jnp.asarray(_corner_incidence(faces, len(positions)), jnp.int32),
+        patch_centers=jnp.asarray(centers, jnp.int32),
+        patch_vertices=jnp.asarray(patch_vertices, jnp.int32),
+        vertex_faces=jnp.asarray(_candidate_faces(positions, faces), jnp.int32),
+    )
+
+
+def _patches(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split vertices into compact patches by farthest points, then the medoid of each Voronoi cell."""
+    num_patches = max(1, round(len(positions) / _PATCH_SIZE))
+    chosen = np.zeros(num_patches, int)
+    distance = np.full(len(positions), np.inf)
+    for index in range(1, num_patches):
+        distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[index - 1]], axis=1))
+        chosen[index] = np.argmax(distance)
+    owner = cKDTree(positions[chosen]).query(positions)[1]
+    members = [np.flatnonzero(owner == patch) for patch in range(num_patches)]
+    members = [member for member in members if len(member)]
+    centers = [
+        member[np.argmin(np.linalg.norm(positions[member] - positions[member].mean(0), axis=1))]
+        for member in members
+    ]
+    width = max(len(member) for member in members)
+    return np.array(centers), np.stack([np.resize(member, width) for member in members])
+
+
+def _corner_incidence(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """For each vertex the positions in `faces.T.ravel()` that name it, padded with `faces.size`."""
+    flat = faces.T.ravel()
+    order = np.argsort(flat, kind="stable")
+    degree = np.bincount(flat, minlength=num_vertices)
+    slot = np.arange(len(flat)) - np.concatenate([[0], np.cumsum(degree)[:-1]])[flat[order]]
+    table = np.full((num_vertices, degree.max()), len(flat))
+    table[flat[order], slot] = order
+    return table
+
+
+def _candidate_faces(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """For each vertex its own faces, then the nearest of the faces around it."""
+    centroids = positions[faces].mean(axis=1)
+    count = min(_CANDIDATE_FACES, len(faces))
+    _, nearest = cKDTree(centroids).query(positions, k=2 * count if 2 * count <= len(faces) else count)
+    nearest = nearest.reshape(len(positions), -1)
+    is_own = (faces[nearest] == np.arange(len(positions))[:, None, None]).any(axis=-1)
+    order = np.argsort(~is_own, axis=1, kind="stable")
+    return np.take_along_axis(nearest, order, axis=1)[:, :count]

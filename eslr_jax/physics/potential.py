@@ -1,0 +1,94 @@
+"""The incremental potential: the sum of the energies whose minimum is one step of implicit Euler."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Float
+
+from eslr_jax.numerics import safe_norm
+from eslr_jax.physics.bending import bending_energy
+from eslr_jax.physics.collision import collision_energy, contact_forces
+from eslr_jax.physics.friction import friction_energy
+from eslr_jax.physics.gravity import gravity_energy
+from eslr_jax.physics.inertia import inertia_energy, vertex_masses
+from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.types import Garment, Material
+
+
+class PotentialTerms(NamedTuple):
+    """The energies of one frame [J]."""
+
+    stretch: Float[Array, ""]
+    bending: Float[Array, ""]
+    inertia: Float[Array, ""]
+    gravity: Float[Array, ""]
+    collision: Float[Array, ""] | float
+    friction: Float[Array, ""] | float
+
+
+def potential_terms(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> PotentialTerms:
+    """Return every energy of the frame at `position` (set `consistent`).
+
+    Args:
+        position: Candidate positions at t + 1 [m]; pinned vertices are put in place first, so that the
+            gradient vanishes there.
+        problem: What the frame holds constant.
+        garment: Rest mesh.
+        material: Fabric.
+    """
+    position = pin(problem, garment, position)
+    parameters, contacts = problem.parameters, problem.contacts
+    masses = vertex_masses(garment, material)
+    collision: Float[Array, ""] | float = 0.0
+    friction: Float[Array, ""] | float = 0.0
+    if contacts is not None:
+        assert problem.friction_load is not None
+        collision = collision_energy(
+            position, contacts, garment, parameters.collision_stiffness, parameters.collision_thickness
+        )
+        friction = friction_energy(
+            position,
+            problem.position,
+            contacts,
+            problem.friction_load,
+            parameters.friction_coefficient,
+            parameters.friction_speed * problem.timestep,
+        )
+    return PotentialTerms(
+        stretch=stretch_energy(position, garment, material),
+        bending=bending_energy(position, garment, material),
+        inertia=inertia_energy(position, problem.inertial_guess, masses, problem.timestep),
+        gravity=gravity_energy(position, problem.position, masses, parameters.gravity),
+        collision=collision,
+        friction=friction,
+    )
+
+
+def potential(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> Float[Array, ""]:
+    """Return the incremental potential [J]: the sum of all terms."""
+    return sum(potential_terms(position, problem, garment, material))  # type: ignore[return-value]
+
+
+def next_friction_load(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment
+) -> Float[Array, " vertices"]:
+    """Return the contact force at t + 1 [N], which loads the next frame's friction."""
+    assert problem.contacts is not None
+    parameters = problem.parameters
+    return contact_forces(
+        position, problem.contacts, garment, parameters.collision_stiffness, parameters.collision_thickness
+    )
+
+
+def relative_residual(
+    gradient: Float[Array, "vertices 3"], garment: Garment, material: Material, gravity: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Return the norm of the remaining force over the norm of the vertex weights, without unit."""
+    weight = gravity * safe_norm(vertex_masses(garment, material))
+    return safe_norm(gradient.reshape(-1)) / weight

@@ -1,0 +1,92 @@
+"""The minimisation problem of one frame: everything that stays constant while its cloth moves."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from eslr_jax.types import ClothState, Contacts, Garment
+
+
+@struct.dataclass
+class PhysicsParameters:
+    """Constants of the scene; traced, so that changing one does not compile anew."""
+
+    gravity: Float[Array, ""] | float = 9.81  # [m/s^2], along -y
+    collision_stiffness: Float[Array, ""] | float = 3.5e7
+    """[J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt."""
+    collision_thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD)
+    friction_coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
+    friction_speed: Float[Array, ""] | float = 9e-4
+    """[m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5."""
+
+
+@struct.dataclass
+class FrameProblem:
+    """One step of implicit Euler as a minimisation."""
+
+    position: Float[Array, "vertices 3"]  # at t [m]
+    inertial_guess: Float[Array, "vertices 3"]  # position + timestep * velocity [m]
+    timestep: Float[Array, ""]  # [s]
+    pin_targets: Float[Array, "vertices 3"] | None  # positions of pinned vertices at t + 1; None: no pins
+    contacts: Contacts | None  # None: no body in the scene
+    friction_load: Float[Array, " vertices"] | None  # normal force at t [N]
+    parameters: PhysicsParameters
+
+
+def make_problem(
+    state: ClothState,
+    contacts: Contacts | None,
+    pin_targets: Float[Array, "vertices 3"] | None,
+    timestep: Float[Array, ""],
+    parameters: PhysicsParameters,
+) -> FrameProblem:
+    """Collect what one frame's potential depends on.
+
+    Args:
+        state: Cloth at time t.
+        contacts: Nearest body points of every vertex, or None without a body.
+        pin_targets: Where pinned vertices are at t + 1, or None without pins.
+        timestep: Duration of the frame [s].
+        parameters: Constants of the scene.
+    """
+    return FrameProblem(
+        position=state.position,
+        inertial_guess=state.position + timestep * state.velocity,
+        timestep=timestep,
+        pin_targets=pin_targets,
+        contacts=contacts,
+        friction_load=None if contacts is None else state.friction_load,
+        parameters=parameters,
+    )
+
+
+def pin(problem: FrameProblem, garment: Garment, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+    """Put pinned vertices where the body carries them."""
+    if problem.pin_targets is None:
+        return position
+    return jnp.where(garment.is_pinned[:, None], problem.pin_targets, position)
+
+
+def push_out(
+    problem: FrameProblem, garment: Garment, position: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
+    """Move vertices onto the offset tangent plane of their nearest body point where they are behind it.
+
+    The cubic collision energy has no curvature at first touch, so a minimiser that starts deep inside only
+    halves the depth per iteration; this start costs nothing and is 30 to 2000 times lower in energy.
+    """
+    position = pin(problem, garment, position)
+    contacts = problem.contacts
+    if contacts is None:
+        return position
+    height = jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=-1)
+    lift = jnp.maximum(problem.parameters.collision_thickness - height, 0.0)
+    lift = jnp.where(contacts.is_near, lift, 0.0)
+    return pin(problem, garment, position + lift[:, None] * contacts.next_normals)
+
+
+def start_guess(problem: FrameProblem, garment: Garment) -> Float[Array, "vertices 3"]:
+    """Return the inertial guess pushed out of the body: the best cheap start that was found."""
+    return push_out(problem, garment, problem.inertial_guess)

@@ -1,0 +1,131 @@
+"""One frame: contacts, the stepper's answer, the corrector, and the new state."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.errors import Status
+from eslr_jax.numerics import safe_norm
+from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.lbfgs import Minimum, minimize
+from eslr_jax.physics.potential import next_friction_load, potential
+from eslr_jax.physics.preconditioner import hessian_diagonal
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, start_guess
+from eslr_jax.simulate.network import network_step
+from eslr_jax.types import BodySurface, ClothState, Garment, Material
+
+
+class FrameInput(NamedTuple):
+    """What the outside world does during one frame; None is not modelled."""
+
+    body: Float[Array, "surface_vertices 3"] | None  # at t [m]
+    next_body: Float[Array, "surface_vertices 3"] | None  # at t + 1 [m]
+    pin_targets: Float[Array, "vertices 3"] | None  # at t + 1 [m]
+
+
+class StepReport(NamedTuple):
+    """How a frame went."""
+
+    residual: Float[Array, ""]  # force norm over weight
+    iterations: Int[Array, ""]
+
+
+def frame_problem(
+    state: ClothState,
+    frame: FrameInput,
+    surface: BodySurface | None,
+    timestep: Float[Array, ""],
+    parameters: PhysicsParameters,
+) -> FrameProblem:
+    """Find the frame's contacts and state its minimisation problem."""
+    contacts = None
+    if surface is not None:
+        assert frame.body is not None
+        assert frame.next_body is not None
+        contacts = find_contacts(state.position, frame.body, frame.next_body, surface)
+    return make_problem(state, contacts, frame.pin_targets, timestep, parameters)
+
+
+def solve(
+    problem: FrameProblem,
+    garment: Garment,
+    material: Material,
+    start: Float[Array, "vertices 3"],
+    *,
+    iterations: int,
+    memory: int,
+    tolerance: float,
+) -> Minimum:
+    """Minimise the frame's potential from `start` by L-BFGS; stop at `tolerance` of the weight's norm."""
+    weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
+    return minimize(
+        lambda position: potential(position, problem, garment, material),
+        start,
+        hessian_diagonal(problem, garment, material, start),
+        iterations=iterations,
+        memory=memory,
+        residual_tolerance=tolerance * weight,
+    )
+
+
+def step(
+    params: Any,
+    garment: Garment,
+    material: Material,
+    problem: FrameProblem,
+    state: ClothState,
+    config: SimConfig,
+) -> tuple[ClothState, StepReport]:
+    """Advance the cloth by one frame.
+
+    Args:
+        params: Weights of the network; None for the physics simulator.
+        garment: Rest mesh.
+        material: Fabric.
+        problem: The frame's minimisation problem, which holds contacts and pins.
+        state: Cloth at t.
+        config: Choice of simulator; static.
+    """
+    if config.simulator == "physics":
+        start, iterations = start_guess(problem, garment), config.solver_iterations
+    else:
+        assert config.model is not None
+        start = network_step(params, garment, material, problem, state, config.model)
+        iterations = config.corrector_steps
+    minimum = solve(
+        problem,
+        garment,
+        material,
+        start,
+        iterations=iterations,
+        memory=config.solver_memory,
+        tolerance=config.tolerance,
+    )
+    position = pin(problem, garment, minimum.position)
+    weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
+    report = StepReport(safe_norm(minimum.gradient.reshape(-1)) / weight, minimum.iterations)
+    return _next_state(position, problem, garment, state), report
+
+
+def _next_state(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, state: ClothState
+) -> ClothState:
+    """Semi-implicit Euler: the velocity that brought the cloth to `position`, and what the frame left behind."""
+    load = state.friction_load
+    if problem.contacts is not None:
+        load = next_friction_load(position, problem, garment)
+    is_finite = jnp.all(jnp.isfinite(position))
+    status = state.status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
+    return ClothState(
+        position=position,
+        velocity=(position - problem.position) / problem.timestep,
+        friction_load=load,
+        status=status,
+        frame=state.frame + 1,
+        first_bad_frame=jnp.where((state.status == 0) & (status != 0), state.frame + 1, state.first_bad_frame),
+    )
