@@ -1,16 +1,16 @@
 """Geodesic embeddings: k coordinates per vertex whose distances follow geodesic distances on the rest mesh.
 
-Metric multidimensional scaling by stress majorisation against landmarks; memory is landmarks x vertices, never
-vertices x vertices. Classical scaling alone gets worse with k: geodesic distances are not Euclidean, and its later
-axes are noise that nothing cancels.
+Metric multidimensional scaling by stress majorisation against landmarks; memory is landmarks x vertices,
+never vertices x vertices. Classical scaling alone gets worse with k: geodesic distances are not Euclidean,
+and its later axes are noise that nothing cancels.
 
 Three modes:
 - `raw`: landmark classical scaling, then majorisation: the paper's embedding. Axes and signs are those of an
   eigendecomposition, so two meshes of one garment get incompatible coordinates.
 - `canonical`: the same stress, reached from a start that is a smooth function of the rest pose (its centred
-  coordinates, then small quadratic monomials), and rotated back onto the body's axes by least squares. The first
-  three coordinates are the body's axes bent to geodesic lengths, with their signs; the others fold as the
-  monomials do. No eigenvector is involved, so nothing flips between meshes.
+  coordinates, then small quadratic monomials), and rotated back onto the body's axes by least squares. The
+  first three coordinates are the body's axes bent to geodesic lengths, with their signs; the others fold as
+  the monomials do. No eigenvector is involved, so nothing flips between meshes.
 - `landmarks`: no scaling; a falling function of the geodesic distance to points fixed on the body.
 """
 
@@ -21,10 +21,10 @@ from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float
-from scipy.spatial import cKDTree
+from jaxtyping import Float, Int
 
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.geodesic import farthest_point_landmarks, geodesic_distances, geodesic_graph
 from eslr_jax.geometry.topology import face_areas, vertex_areas
 
@@ -33,13 +33,13 @@ EmbeddingMode = Literal["raw", "canonical", "landmarks"]
 NUM_LANDMARKS = 128  # landmarks of the stress; 64 and 256 differ by less than 0.002 in stress
 NUM_ITERATIONS = 60  # majorisation steps; stress falls by less than 0.001 beyond
 START_AMPLITUDE = 0.2  # size of the monomials in the canonical start, relative to the garment's size
-ANCHOR_REACH = 0.25  # [m] an anchor with no garment vertex this near is missing
+ANCHOR_REACH = 0.25  # [m] an anchor with no garment this near is missing
 ANCHOR_FALLOFF = 0.4  # [m] decay length of landmark coordinates, about the size of a limb
 
 
 def geodesic_embedding(
     rest_positions: Float[np.ndarray, "vertices 3"],
-    faces: np.ndarray,
+    faces: Int[np.ndarray, "faces 3"],
     size: int = 8,
     mode: EmbeddingMode = "canonical",
     anchors: Float[np.ndarray, "anchors 3"] | None = None,
@@ -53,8 +53,8 @@ def geodesic_embedding(
         faces: Triangles, shape [faces, 3].
         size: Coordinates per vertex, k.
         mode: See the module's docstring.
-        anchors: Body points of mode `landmarks` [m], one per coordinate, in the rest pose (joints, say); by default
-            the corners of the garment's bounding box.
+        anchors: Body points of mode `landmarks` [m], one per coordinate, in the rest pose (joints, say); by
+            default the corners of the garment's bounding box.
         body_axes: Rows are the rest body's left, up and front; by default x, y and z.
 
     Returns:
@@ -75,7 +75,7 @@ def geodesic_embedding(
     graph = geodesic_graph(rest_positions, faces)
     if mode == "landmarks":
         points = None if anchors is None else np.asarray(anchors, np.float64) @ axes.T
-        return anchor_coordinates(graph, rest_positions, size, points)
+        return anchor_coordinates(graph, rest_positions, faces, size, points)
     areas = vertex_areas(face_areas(rest_positions, faces), faces, len(rest_positions))
     weights = areas / areas.sum()
     first = int(np.argmax(rest_positions @ np.array([1e-3, 1.0, 1e-4])))  # the top; ties broken
@@ -114,8 +114,8 @@ def canonical_start(
 ) -> Float[np.ndarray, "vertices embedding"]:
     """Return centred rest positions followed by small monomials of them, orthogonal to what is linear [m].
 
-    Every column is a smooth function of the rest position, with area-weighted moments: a finer mesh samples the
-    same functions.
+    Every column is a smooth function of the rest position, with area-weighted moments: a finer mesh samples
+    the same functions.
     """
     centered = rest_positions - weights @ rest_positions
     scale = np.sqrt(weights @ np.sum(centered**2, axis=1))
@@ -164,7 +164,7 @@ def majorize_stress(
 
 
 def align(embedding: np.ndarray, start: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the centred embedding rotated so that its first three axes follow `start`'s by weighted least squares.
+    """Rotate a centred embedding so that its first three axes fit `start`'s by weighted least squares.
 
     The rotation acts in the plane of the old and new axes only; a reflection is excluded because majorisation
     leaves the axes close to where they began.
@@ -181,13 +181,14 @@ def align(embedding: np.ndarray, start: np.ndarray, weights: np.ndarray) -> np.n
 def anchor_coordinates(
     graph: scipy.sparse.csr_array,
     rest_positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
     size: int,
     anchors: Float[np.ndarray, "anchors 3"] | None = None,
 ) -> Float[np.ndarray, "vertices embedding"]:
     """Return L exp(-d / L) [m] for the geodesic distance d to each anchor, L = `ANCHOR_FALLOFF`.
 
-    A coordinate falls with slope one at its anchor and fades to zero far away, so a missing anchor, being far,
-    is a column of zeros.
+    A coordinate falls with slope one at its anchor and fades to zero far away, so a missing anchor, being
+    far, is a column of zeros.
 
     Raises:
         ConfigError: The number of anchors is not `size`.
@@ -201,7 +202,10 @@ def anchor_coordinates(
         raise ConfigError(
             f"{len(anchors)} anchors for an embedding of size {size}; give one anchor per coordinate"
         )
-    gaps, nearest = cKDTree(rest_positions).query(anchors)
-    distances = geodesic_distances(graph, nearest).T
+    nearest, barycentric = closest_points(anchors, rest_positions, faces)
+    corners = faces[nearest]  # three sources an anchor: the nearest vertex alone would jump between meshes
+    gaps = np.linalg.norm(np.einsum("ac,acx->ax", barycentric, rest_positions[corners]) - anchors, axis=1)
+    from_corners = geodesic_distances(graph, corners.ravel()).reshape(*corners.shape, -1)
+    distances = np.einsum("ac,acv->va", barycentric, from_corners)
     coordinates = ANCHOR_FALLOFF * np.exp(-(distances + gaps) / ANCHOR_FALLOFF)
     return coordinates if is_default else np.where(gaps <= ANCHOR_REACH, coordinates, 0.0)

@@ -1,8 +1,8 @@
 """Geodesic distances on a triangle mesh by Dijkstra over mesh edges and unfolded shortcuts.
 
-Over every interior edge one straight edge joins the two opposite vertices, when their segment crosses the edge
-after both faces are unfolded into a plane. The shortcut is an exact geodesic of the two faces; it cuts the bias
-of edge-only Dijkstra three to five times. Distances stay a metric, which the heat method's do not.
+Over every interior edge one straight edge joins the two opposite vertices, when their segment crosses the
+edge after both faces are unfolded into a plane. The shortcut is an exact geodesic of the two faces; it cuts
+the bias of edge-only Dijkstra three to five times. Distances stay a metric, which the heat method's do not.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def farthest_point_landmarks(
 
 
 def _unfolded_shortcuts(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the opposite-vertex pairs whose unfolded segment crosses their hinge, and the segments' lengths."""
+    """Return the opposite-vertex pairs whose unfolded segment crosses their hinge, and its length."""
     hinges, _ = find_hinges(faces)
     start, end, left, right = (positions[hinges[:, k]] for k in range(4))
     length = np.linalg.norm(end - start, axis=1)
@@ -90,7 +90,7 @@ def _unfolded_shortcuts(positions: np.ndarray, faces: np.ndarray) -> tuple[np.nd
 
 
 def _bridges(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return one vertex pair per component but the first (Prim's order, nearest first), and their distances."""
+    """Return one vertex pair per component but the first (Prim's order), and their distances."""
     num_components, component = vertex_components(faces, len(positions))
     pairs, lengths = [], []
     is_joined = component == component[0] if len(component) else np.zeros(0, bool)

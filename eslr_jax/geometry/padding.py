@@ -35,8 +35,8 @@ def choose_bucket(garment: Garment) -> Bucket:
     """Return the bucket of an unpadded garment; almost a function of its vertex count alone.
 
     A mesh of n vertices without handles has fewer than 2 n faces, 3 n hinges and 6 n directed edges. Sizes
-    follow those bounds, so garments of like vertex counts share a bucket; a mesh beyond them gets its own counts
-    rounded up. One vertex is always left over, for the padding to point at.
+    follow those bounds, so garments of like vertex counts share a bucket; a mesh beyond them gets its own
+    counts rounded up. One vertex is always left over, for the padding to point at.
     """
     vertices = round_up(len(garment.vertex_mask) + 1)
     return Bucket(
@@ -71,8 +71,8 @@ def common_bucket(buckets: list[Bucket]) -> Bucket:
 def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     """Pad a garment's arrays to a bucket.
 
-    Padded vertices rest at the garment's mean position with zero area and the first vertex's skin; padded faces,
-    hinges and edges point at the last vertex with zero area; incidence tables don't list them.
+    Padded vertices rest at the garment's mean position with zero area and the first vertex's skin; padded
+    faces, hinges and edges point at the last vertex with zero area; incidence tables don't list them.
 
     Args:
         garment: A garment; NumPy or JAX leaves.

@@ -11,7 +11,7 @@ from eslr_jax.errors import MeshError
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
 from eslr_jax.geometry.padding import pad_garment
-from eslr_jax.geometry.validate import validate_mesh
+from eslr_jax.geometry.validate import validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 
 
@@ -25,6 +25,7 @@ def prepare_garment(
     embedding_size: int = 8,
     embedding_mode: EmbeddingMode = "canonical",
     anchors: Float[np.ndarray, "anchors 3"] | None = None,
+    allow_components: bool = False,
     pad: bool = False,
     name: str = "garment",
 ) -> Garment:
@@ -39,6 +40,7 @@ def prepare_garment(
         embedding_size: Coordinates of the geodesic embedding.
         embedding_mode: See `embedding.geodesic_embedding`.
         anchors: Body points of embedding mode `landmarks` [m].
+        allow_components: Accept a mesh of several connected components.
         pad: Pad to the garment's bucket.
         name: What messages call the garment.
 
@@ -49,7 +51,8 @@ def prepare_garment(
         MeshError: The mesh can't be simulated, or an array has the wrong number of rows.
         ConfigError: The embedding mode is unknown, or the number of anchors is not the embedding's size.
     """
-    validate_mesh(rest_positions, faces, name=name, allow_components=True)
+    validate_mesh(rest_positions, faces, name=name, allow_components=allow_components)
+    validate_orientation(rest_positions, faces, name=name)
     positions = np.asarray(rest_positions, np.float64)
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
@@ -109,7 +112,7 @@ def _check_rows(
     ):
         raise MeshError(
             f"{name}: skin weights {skin_weights.shape} and indices {skin_indices.shape} do not fit "
-            f"{num_vertices} vertices; give both one row per vertex, or compute them with transfer_skin_weights"
+            f"{num_vertices} vertices; give one row per vertex, or use transfer_skin_weights"
         )
     sums = skin_weights.sum(axis=1)
     is_bad = ~(np.isfinite(sums) & (sums > 0)) | np.any(skin_weights < 0, axis=1)
@@ -121,5 +124,5 @@ def _check_rows(
         )
     if is_pinned.shape != (num_vertices,):
         raise MeshError(
-            f"{name}: is_pinned has shape {is_pinned.shape} for {num_vertices} vertices; give one value per vertex"
+            f"{name}: is_pinned has shape {is_pinned.shape} for {num_vertices} vertices; give one per vertex"
         )

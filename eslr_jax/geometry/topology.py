@@ -142,8 +142,8 @@ def inverse_rest_frames(
 ) -> Float[np.ndarray, "faces 2 2"]:
     """Return the inverse of D_m, the rest edges of every face in a frame of its own plane [1/m].
 
-    D_m = [x0 - x2 | x1 - x2] in the orthonormal frame whose first axis follows x0 - x2 and whose second is the
-    in-plane perpendicular on the side of x1; so D_m is upper triangular with a positive diagonal.
+    D_m = [x0 - x2 | x1 - x2] in the orthonormal frame whose first axis follows x0 - x2 and whose second is
+    the in-plane perpendicular on the side of x1; so D_m is upper triangular with a positive diagonal.
 
     Source: HOOD, `stretching_energy.py`: frames from the 3-D rest mesh, not from UV coordinates.
     """
@@ -165,8 +165,8 @@ def hinge_angles(
 ) -> Float[np.ndarray, " hinges"]:
     """Return the signed dihedral angle of every hinge [rad]; zero is flat, a convex ridge is positive.
 
-    theta = atan2(e . (n_a x n_b), n_a . n_b), e the unit edge i -> j, n_a and n_b the unit normals of the left
-    and right face.
+    theta = atan2(e . (n_a x n_b), n_a . n_b), e the unit edge i -> j, n_a and n_b the unit normals of the
+    left and right face.
 
     Source: HOOD, `bending_energy.py`.
     """
@@ -188,8 +188,8 @@ def vertex_components(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> t
 def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " loop"]]:
     """Return the boundary loops as vertex cycles, each along its faces' half-edges.
 
-    Loops are sorted by length, longest first, ties by smallest vertex; each starts at its smallest vertex. The
-    mesh must be manifold, so that a vertex lies on at most one loop.
+    Loops are sorted by length, longest first, ties by smallest vertex; each starts at its smallest vertex.
+    The mesh must be manifold, so that a vertex lies on at most one loop.
     """
     starts, ends, _ = half_edges(faces)
     if not len(starts):

@@ -9,13 +9,22 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from eslr_jax.errors import MeshError
-from eslr_jax.geometry.topology import face_areas, face_cross_products, half_edges, vertex_components
+from eslr_jax.geometry.topology import (
+    boundary_loops,
+    face_areas,
+    face_cross_products,
+    half_edges,
+    vertex_components,
+)
 
 MIN_DIAGONAL = 0.05  # [m] of the bounding box; smaller is no garment
 MAX_DIAGONAL = 5.0  # [m]
 DUPLICATE_TOLERANCE = 1e-7  # of the bounding box's diagonal
 DEGENERATE_TOLERANCE = 1e-10  # of the longest edge squared
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}  # metres per unit
+MIN_BODY_AGREEMENT = -0.2  # mean cosine with the body's normals; below, the garment is inside out
+MIN_VOLUME_RATIO = -0.03  # of the volume of a sphere of the same area; below, it is inside out
+MAX_HOLE_SHARE = 0.7  # of the mesh's area; with larger holes it has no inside
 GARMENT_DIAGONAL = 1.0  # [m] a typical garment, to guess the unit by
 
 
@@ -51,8 +60,9 @@ def validate_mesh(
         sizes = np.bincount(component)
         other = int(np.argmax(component != np.argmax(sizes)))
         raise MeshError(
-            f"{name}: {num_components} separate components (sizes {_shorten(np.sort(sizes)[::-1])}; vertex {other} "
-            "is not connected to the largest); simulate them one by one, or sew or delete the loose parts"
+            f"{name}: {num_components} separate components (sizes {_shorten(np.sort(sizes)[::-1])}; "
+            f"vertex {other} is not connected to the largest); join them, delete the loose parts, "
+            "or allow several components"
         )
 
 
@@ -64,7 +74,8 @@ def _check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
         )
     if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
         raise MeshError(
-            f"{name}: positions have shape {positions.shape} and dtype {positions.dtype}; give [vertices, 3] floats"
+            f"{name}: positions have shape {positions.shape} and dtype {positions.dtype}; "
+            "give [vertices, 3] floats"
         )
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"{name}: faces have shape {faces.shape}, not [faces, 3]; triangulate the mesh")
@@ -108,7 +119,8 @@ def _check_vertices(positions: np.ndarray, faces: np.ndarray, name: str) -> None
     if not is_used.all():
         vertex = int(np.argmin(is_used))
         raise MeshError(
-            f"{name}: {np.sum(~is_used)} vertices belong to no face, the first is vertex {vertex}; delete loose vertices"
+            f"{name}: {np.sum(~is_used)} vertices belong to no face, the first is vertex {vertex}; "
+            "delete loose vertices"
         )
     pairs = cKDTree(positions).query_pairs(DUPLICATE_TOLERANCE * _diagonal(positions), output_type="ndarray")
     if len(pairs):
@@ -151,8 +163,8 @@ def _check_edges(faces: np.ndarray, name: str) -> None:
         edge = int(np.argmax(counts > 2))
         users = np.flatnonzero(inverse == edge) // 3
         raise MeshError(
-            f"{name}: edge {(int(unique[edge] // base), int(unique[edge] % base))} belongs to {counts[edge]} faces "
-            f"{_ids(users[:6])} ({np.sum(counts > 2)} such edges); cloth is a sheet: "
+            f"{name}: edge {(int(unique[edge] // base), int(unique[edge] % base))} belongs to "
+            f"{counts[edge]} faces {_ids(users[:6])} ({np.sum(counts > 2)} such edges); cloth is a sheet: "
             "delete or separate the extra faces"
         )
     forward = np.bincount(inverse, weights=starts < ends, minlength=len(unique))
@@ -170,8 +182,8 @@ def _check_edges(faces: np.ndarray, name: str) -> None:
 def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     """Raise on vertices whose faces form more than one fan (bow-ties).
 
-    Corners are nodes; across every interior edge the corners at each of its ends are joined, so each fan is one
-    component, and a manifold mesh has as many components as vertices.
+    Corners are nodes; across every interior edge the corners at each of its ends are joined, so each fan is
+    one component, and a manifold mesh has as many components as vertices.
     """
     starts, ends, _ = half_edges(faces.astype(np.int64))
     base = int(faces.max()) + 1
@@ -208,12 +220,13 @@ def validate_orientation(
 ) -> None:
     """Check that the faces of a garment point outside.
 
-    With a body, outside is where the nearest body face points; without one it is away from the vertical axis of
-    the mesh. The mesh is refused only where most of its area clearly disagrees.
+    With a body, outside is where the nearest body face points. Without one, the garment's holes are closed
+    with fans and the sign of the enclosed volume decides, where the holes are small enough to call it
+    enclosed. The mesh is refused only where it clearly disagrees.
 
     Args:
         positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
+        faces: Triangles of a valid mesh, shape [faces, 3].
         body_positions: Body vertices in the same pose [m], shape [body_vertices, 3].
         body_faces: Triangles of the body, counter-clockwise seen from outside.
         name: What messages call the mesh.
@@ -221,26 +234,43 @@ def validate_orientation(
     Raises:
         MeshError: The faces point inside.
     """
-    positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
-    crosses = face_cross_products(positions, faces)
-    centers = positions[faces].mean(axis=1)
+    positions, faces = np.asarray(positions, np.float64), np.asarray(faces, np.int64)
     if body_positions is not None and body_faces is not None:
-        body_positions, body_faces = np.asarray(body_positions, np.float64), np.asarray(body_faces)
-        body_crosses = face_cross_products(body_positions, body_faces)
-        outward = body_crosses / np.maximum(np.linalg.norm(body_crosses, axis=1, keepdims=True), 1e-30)
-        _, nearest = cKDTree(body_positions[body_faces].mean(axis=1)).query(centers)
-        outward = outward[nearest]
-        where = "into the body"
-        threshold = -0.2
-    else:
-        weights = np.linalg.norm(crosses, axis=1)
-        outward = (centers - weights @ centers / weights.sum()) * np.array([1.0, 0.0, 1.0])
-        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
-        where = "inside"
-        threshold = -0.4
-    agreement = np.sum(crosses * outward) / np.sum(np.linalg.norm(crosses, axis=1))
-    if agreement < threshold:
-        raise MeshError(f"{name}: its faces point {where} (agreement {agreement:.2f}); flip the normals")
+        agreement = _body_agreement(
+            positions, faces, np.asarray(body_positions, np.float64), np.asarray(body_faces)
+        )
+        if agreement < MIN_BODY_AGREEMENT:
+            raise MeshError(f"{name}: its faces point into the body ({agreement:.2f} of 1); flip the normals")
+    elif _enclosed_volume_ratio(positions, faces) < MIN_VOLUME_RATIO:
+        raise MeshError(f"{name}: its faces point inside; flip the normals")
+
+
+def _body_agreement(
+    positions: np.ndarray, faces: np.ndarray, body_positions: np.ndarray, body_faces: np.ndarray
+) -> float:
+    """Return the area-weighted mean cosine between garment normals and those of the nearest body faces."""
+    crosses = face_cross_products(positions, faces)
+    body_crosses = face_cross_products(body_positions, body_faces)
+    outward = body_crosses / np.maximum(np.linalg.norm(body_crosses, axis=1, keepdims=True), 1e-30)
+    _, nearest = cKDTree(body_positions[body_faces].mean(axis=1)).query(positions[faces].mean(axis=1))
+    return float(np.sum(crosses * outward[nearest]) / np.sum(np.linalg.norm(crosses, axis=1)))
+
+
+def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
+    """Return the closed mesh's volume over that of a sphere of its area; 0 where it is mostly hole."""
+    centered = positions - positions.mean(axis=0)
+    triangles = [centered[faces]]
+    for loop in boundary_loops(faces):
+        rim = centered[loop]
+        center = np.broadcast_to(rim.mean(axis=0), rim.shape)
+        triangles.append(np.stack([np.roll(rim, -1, axis=0), rim, center], axis=1))
+    areas = [
+        0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in triangles
+    ]
+    if sum(areas[1:]) > MAX_HOLE_SHARE * areas[0]:
+        return 0.0
+    volume = sum(np.sum(np.linalg.det(t)) for t in triangles) / 6.0
+    return float(6.0 * np.sqrt(np.pi) * volume / sum(areas) ** 1.5)
 
 
 def _diagonal(positions: np.ndarray) -> float:
