@@ -1,8 +1,9 @@
 """Geodesic distances on a triangle mesh by Dijkstra over mesh edges and unfolded shortcuts.
 
-Over every interior edge one straight edge joins the two opposite vertices, when their segment crosses the
-edge after both faces are unfolded into a plane. The shortcut is an exact geodesic of the two faces; it cuts
-the bias of edge-only Dijkstra three to five times. Distances stay a metric, which the heat method's do not.
+A shortcut is a straight segment between two vertices that crosses up to three hinges once their faces are
+unfolded into a plane: a path on the surface, so distances stay upper bounds and a metric (the heat method's
+are neither). With shortcuts over three hinges the mean error is 0.4 % on garments and 1.1 % on a tube of
+right triangles; over one hinge 1.3 % and 3.9 %; on edges alone 6 % and 16 %.
 """
 
 from __future__ import annotations
@@ -13,7 +14,13 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from eslr_jax.geometry.topology import find_hinges, unique_edges, vertex_components
+from eslr_jax.geometry.topology import (
+    half_edges,
+    next_half_edges,
+    twin_half_edges,
+    unique_edges,
+    vertex_components,
+)
 
 
 def geodesic_graph(
@@ -26,7 +33,7 @@ def geodesic_graph(
     """
     edges = unique_edges(faces)
     lengths = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
-    shortcuts, shortcut_lengths = _unfolded_shortcuts(positions, faces)
+    shortcuts, shortcut_lengths = unfolded_shortcuts(positions, faces)
     bridges, bridge_lengths = _bridges(positions, faces)
     pairs = np.concatenate([edges, shortcuts, bridges])
     values = np.concatenate([lengths, shortcut_lengths, bridge_lengths])
@@ -73,20 +80,75 @@ def farthest_point_landmarks(
     return landmarks, distances
 
 
-def _unfolded_shortcuts(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the opposite-vertex pairs whose unfolded segment crosses their hinge, and its length."""
-    hinges, _ = find_hinges(faces)
-    start, end, left, right = (positions[hinges[:, k]] for k in range(4))
-    length = np.linalg.norm(end - start, axis=1)
-    axis = (end - start) / length[:, None]
-    left_along = np.sum((left - start) * axis, axis=1)
-    right_along = np.sum((right - start) * axis, axis=1)
-    left_height = np.linalg.norm(left - start - left_along[:, None] * axis, axis=1)
-    right_height = np.linalg.norm(right - start - right_along[:, None] * axis, axis=1)
-    crossing = left_along + (right_along - left_along) * left_height / (left_height + right_height)
-    is_inside = (crossing >= 0) & (crossing <= length) & (hinges[:, 2] != hinges[:, 3])
-    distances = np.hypot(left_along - right_along, left_height + right_height)
-    return hinges[is_inside, 2:], distances[is_inside]
+def unfolded_shortcuts(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], max_hinges: int = 3
+) -> tuple[Int[np.ndarray, "shortcuts 2"], Float[np.ndarray, " shortcuts"]]:
+    """Return the vertex pairs joined by a straight segment across one to `max_hinges` unfolded hinges.
+
+    Each vertex looks through the opposite side of each of its faces, and on through the faces behind, all
+    laid out in one plane with the vertex at the origin. A window is the side looked through and the cone of
+    directions that reach it. A pair may occur in both directions.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        max_hinges: Most hinges that a segment crosses.
+
+    Returns:
+        Vertex pairs, and the lengths of their segments [m].
+    """
+    starts, ends, opposites = half_edges(faces)
+    twins = twin_half_edges(faces)
+    edges = positions[ends] - positions[starts]
+    arms = positions[opposites] - positions[starts]
+    lengths = np.linalg.norm(edges, axis=1)
+    along = np.sum(edges * arms, axis=1) / lengths  # of the opposite vertex, from the half-edge's start [m]
+    height = np.linalg.norm(np.cross(edges, arms), axis=1) / lengths  # of the opposite vertex above it [m]
+    tolerance = 1e-12 * float(np.mean(lengths)) ** 2
+
+    sources = opposites
+    sides = np.arange(len(starts))
+    right = np.stack([-along, -height], axis=1)  # the side's start, seen from the source
+    left = np.stack([lengths - along, -height], axis=1)  # the side's end, counter-clockwise of `right`
+    low, high = right, left  # the cone's bounds
+    pairs, segments = [], []
+    for _ in range(max_hinges):
+        sides = twins[sides]
+        windows = (sources, sides, right, left, low, high)
+        sources, sides, right, left, low, high = (array[sides >= 0] for array in windows)
+        axis = (right - left) / lengths[sides][:, None]  # the twin runs from left to right
+        apex = left + along[sides][:, None] * axis + height[sides][:, None] * _turn_left(axis)
+        from_low, to_high = _cross(low, apex), _cross(apex, high)
+        is_seen = (from_low >= -tolerance) & (to_high >= -tolerance)
+        pairs.append(np.stack([sources[is_seen], opposites[sides[is_seen]]], axis=1))
+        segments.append(np.linalg.norm(apex[is_seen], axis=1))
+        # behind the hinge: the side right -> apex for directions below the apex, apex -> left above it
+        below, above = from_low > tolerance, to_high > tolerance
+        to_right = next_half_edges(sides)
+        to_left = next_half_edges(to_right)
+        lowest = np.where((from_low > 0)[:, None], apex, low)
+        highest = np.where((to_high > 0)[:, None], apex, high)
+        sources = np.concatenate([sources[below], sources[above]])
+        sides = np.concatenate([to_right[below], to_left[above]])
+        low = np.concatenate([low[below], lowest[above]])
+        high = np.concatenate([highest[below], high[above]])
+        right, left = (
+            np.concatenate([right[below], apex[above]]),
+            np.concatenate([apex[below], left[above]]),
+        )
+    joined, values = np.concatenate(pairs), np.concatenate(segments)
+    is_pair = joined[:, 0] != joined[:, 1]
+    return joined[is_pair], values[is_pair]
+
+
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the plane cross product; positive where `second` is counter-clockwise of `first`."""
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def _turn_left(vectors: np.ndarray) -> np.ndarray:
+    """Return plane vectors turned counter-clockwise by a right angle."""
+    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
 
 
 def _bridges(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

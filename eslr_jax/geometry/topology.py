@@ -19,6 +19,24 @@ def half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarra
     return starts, ends, opposites
 
 
+def next_half_edges(half_edge: Int[np.ndarray, " items"]) -> Int[np.ndarray, " items"]:
+    """Return the half-edge that follows each one around its face."""
+    return half_edge - half_edge % 3 + (half_edge + 1) % 3
+
+
+def twin_half_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " half_edges"]:
+    """Return for every half-edge the neighbour face's that runs back along it; -1 on the boundary."""
+    starts, ends, _ = half_edges(faces)
+    if not len(starts):
+        return np.empty(0, np.int64)
+    base = int(faces.max()) + 1
+    keys = starts.astype(np.int64) * base + ends
+    twin_keys = ends.astype(np.int64) * base + starts
+    order = np.argsort(keys, kind="stable")
+    found = order[np.minimum(np.searchsorted(keys[order], twin_keys), len(order) - 1)]
+    return np.where(keys[found] == twin_keys, found, -1)
+
+
 def unique_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "pairs 2"]:
     """Return every undirected edge once, as (smaller, larger) vertex, sorted."""
     starts, ends, _ = half_edges(faces)
@@ -101,16 +119,10 @@ def find_hinges(
         Hinges sorted by (i, j), and the index of their left and right face.
     """
     starts, ends, opposites = half_edges(faces)
-    if not len(starts):
-        return np.empty((0, 4), np.int64), np.empty((0, 2), np.int64)
-    base = int(faces.max()) + 1
-    keys = starts.astype(np.int64) * base + ends
-    order = np.argsort(keys, kind="stable")
-    twin_keys = ends.astype(np.int64) * base + starts
-    found = order[np.minimum(np.searchsorted(keys[order], twin_keys), len(order) - 1)]
-    left = np.flatnonzero((keys[found] == twin_keys) & (starts < ends))
-    left = left[np.argsort(keys[left], kind="stable")]
-    right = found[left]
+    twins = twin_half_edges(faces)
+    left = np.flatnonzero((twins >= 0) & (starts < ends))
+    left = left[np.lexsort((ends[left], starts[left]))]
+    right = twins[left]
     hinges = np.stack([starts[left], ends[left], opposites[left], opposites[right]], axis=1)
     return hinges, np.stack([left // 3, right // 3], axis=1)
 

@@ -14,6 +14,8 @@ from eslr_jax.geometry.topology import (
     face_areas,
     face_cross_products,
     half_edges,
+    next_half_edges,
+    twin_half_edges,
     vertex_components,
 )
 
@@ -185,17 +187,13 @@ def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     Corners are nodes; across every interior edge the corners at each of its ends are joined, so each fan is
     one component, and a manifold mesh has as many components as vertices.
     """
-    starts, ends, _ = half_edges(faces.astype(np.int64))
-    base = int(faces.max()) + 1
+    starts, _, _ = half_edges(faces.astype(np.int64))
+    twins = twin_half_edges(faces)
     corner = np.arange(len(starts))  # of the half-edge's start
-    following = corner - corner % 3 + (corner + 1) % 3  # corner of its end
-    keys = starts * base + ends
-    order = np.argsort(keys)
-    twin_keys = ends * base + starts
-    found = order[np.minimum(np.searchsorted(keys[order], twin_keys), len(order) - 1)]
-    has_twin = keys[found] == twin_keys
+    following = next_half_edges(corner)  # corner of its end
+    has_twin = twins >= 0
     rows = np.concatenate([corner[has_twin], following[has_twin]])
-    columns = np.concatenate([following[found[has_twin]], found[has_twin]])
+    columns = np.concatenate([following[twins[has_twin]], twins[has_twin]])
     graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (len(starts), len(starts)))
     num_fans, fan = connected_components(graph, directed=False)
     if num_fans == num_vertices:
