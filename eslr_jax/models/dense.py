@@ -1,0 +1,115 @@
+"""The products, biases and norms of every layer, with backward passes that suit a CPU.
+
+XLA sums the columns of a tall matrix one strided element at a time on a CPU; as a product with a row of ones
+the same sum runs at the speed of a matrix product.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
+from jaxtyping import Array, Float
+
+Precision = Literal["float32", "bfloat16"]
+NORM_EPSILON = 1e-5  # PyTorch's LayerNorm, as in HOOD
+TALL = 512  # rows from which a weight gradient pays for a transposed copy
+
+
+def kernel_spread(gain: float):
+    """Return an initialiser that fills a kernel with the standard deviation of its weights.
+
+    `registry.init_model` multiplies them by normal numbers from NumPy: the same on every machine, and without
+    the seconds that compiling a random generator per kernel takes.
+
+    Args:
+        gain: Variance of a weight times its fan-in.
+    """
+
+    def fill(key, shape, dtype=jnp.float32):
+        del key
+        return jnp.full(shape, (gain / shape[0]) ** 0.5, dtype)
+
+    return fill
+
+
+def matmul(
+    x: Float[Array, "rows inputs"], w: Float[Array, "inputs outputs"], precision: Precision = "float32"
+) -> Float[Array, "rows outputs"]:
+    """Return x @ w, with operands rounded to bfloat16 and float32 sums where `precision` says so."""
+    return _matmul_bfloat16(x, w) if precision == "bfloat16" else x @ w
+
+
+def sum_columns(x: Float[Array, "rows columns"]) -> Float[Array, " columns"]:
+    """Sum over the rows, as a product."""
+    return (jnp.ones((1, x.shape[0]), x.dtype) @ x)[0]
+
+
+@jax.custom_vjp
+def add_bias(x: Float[Array, "rows columns"], bias: Float[Array, " columns"]) -> Float[Array, "rows columns"]:
+    """Return x + bias."""
+    return x + bias[None]
+
+
+add_bias.defvjp(
+    lambda x, bias: (x + bias[None], None), lambda _, cotangent: (cotangent, sum_columns(cotangent))
+)
+
+
+@jax.custom_vjp
+def layer_norm(
+    x: Float[Array, "rows columns"], scale: Float[Array, " columns"], bias: Float[Array, " columns"]
+) -> Float[Array, "rows columns"]:
+    """Normalise every row to zero mean and unit variance, then scale and shift its columns."""
+    return _layer_norm_forward(x, scale, bias)[0]
+
+
+def _layer_norm_forward(x, scale, bias):
+    centred = x - jnp.mean(x, axis=1, keepdims=True)
+    inverse = jax.lax.rsqrt(jnp.mean(centred * centred, axis=1, keepdims=True) + NORM_EPSILON)
+    unit = centred * inverse
+    return unit * scale[None] + bias[None], (unit, inverse, scale)
+
+
+def _layer_norm_backward(residuals, cotangent):
+    unit, inverse, scale = residuals
+    scaled = cotangent * scale[None]
+    mean = jnp.mean(scaled, axis=1, keepdims=True)
+    slope = jnp.mean(scaled * unit, axis=1, keepdims=True)
+    return inverse * (scaled - mean - unit * slope), sum_columns(cotangent * unit), sum_columns(cotangent)
+
+
+layer_norm.defvjp(_layer_norm_forward, _layer_norm_backward)
+
+
+def _dot_bfloat16(a, b, contract_a: int, contract_b: int):
+    """Contract bfloat16 matrices into float32; a bfloat16 result would be slower than no bfloat16 at all."""
+    dimensions = (((contract_a,), (contract_b,)), ((), ()))
+    return jax.lax.dot_general(a, b, dimensions, preferred_element_type=jnp.float32)
+
+
+@jax.custom_vjp
+def _matmul_bfloat16(x, w):
+    return _dot_bfloat16(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16), 1, 0)
+
+
+def _matmul_bfloat16_forward(x, w):
+    x, w = x.astype(jnp.bfloat16), w.astype(jnp.bfloat16)
+    return _dot_bfloat16(x, w, 1, 0), (x, w)
+
+
+def _matmul_bfloat16_backward(residuals, cotangent):
+    x, w = residuals
+    cotangent = cotangent.astype(jnp.bfloat16)
+    if x.shape[0] > TALL:
+        # A contraction over rows leaves the CPU's bfloat16 kernels unless the operand is stored transposed.
+        transposed = with_layout_constraint(x.T, Layout((0, 1)))
+        w_gradient = _dot_bfloat16(transposed, cotangent, 1, 0)
+    else:
+        w_gradient = _dot_bfloat16(x, cotangent, 0, 0)
+    return _dot_bfloat16(cotangent, w, 1, 1), w_gradient
+
+
+_matmul_bfloat16.defvjp(_matmul_bfloat16_forward, _matmul_bfloat16_backward)

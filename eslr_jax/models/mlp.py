@@ -1,0 +1,87 @@
+"""The multilayer perceptron that every part of the network is made of."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from eslr_jax.models.dense import Precision, add_bias, kernel_spread, layer_norm, matmul
+
+INITIAL_GAIN = 1.5  # variance of a weight times its fan-in
+
+
+class MLP(nn.Module):
+    """Linear-ReLU per hidden layer, Linear, LayerNorm.
+
+    The first layer is kept apart: the product with a concatenation is the sum of the products with its
+    pieces, and a piece that belongs to a vertex is multiplied before it is gathered by the edges.
+
+    Attributes:
+        input_size: Width of the (concatenated) input.
+        hidden_size: Width of the hidden layers.
+        output_size: Width of the output.
+        hidden_layers: Number of hidden layers; 0 is a single linear layer.
+        norm: End with a LayerNorm.
+        output_gain: Factor on the last layer's initial weights.
+        precision: Operands of the products.
+    """
+
+    input_size: int
+    hidden_size: int
+    output_size: int
+    hidden_layers: int = 2
+    norm: bool = True
+    output_gain: float = 1.0
+    precision: Precision = "float32"
+
+    def setup(self) -> None:
+        """Declare the weights."""
+        sizes = [self.input_size, *[self.hidden_size] * self.hidden_layers, self.output_size]
+        last = len(sizes) - 2
+        self.kernels = [
+            self.param(
+                f"kernel_{k}",
+                kernel_spread(INITIAL_GAIN * (self.output_gain**2 if k == last else 1)),
+                (sizes[k], sizes[k + 1]),
+            )
+            for k in range(last + 1)
+        ]
+        self.biases = [
+            self.param(f"bias_{k}", nn.initializers.zeros, (sizes[k + 1],)) for k in range(last + 1)
+        ]
+        if self.norm:
+            self.norm_scale = self.param("norm_scale", nn.initializers.ones, (self.output_size,))
+            self.norm_bias = self.param("norm_bias", nn.initializers.zeros, (self.output_size,))
+
+    def __call__(self, x: Float[Array, "rows inputs"]) -> Float[Array, "rows outputs"]:
+        """Apply all layers to rows of the full input."""
+        return self.finish(self.start(x, 0, bias=True))
+
+    def start(
+        self, x: Float[Array, "rows piece"], offset: int, *, bias: bool = False
+    ) -> Float[Array, "rows hidden"]:
+        """Return a piece's share of the first layer, before its ReLU.
+
+        Args:
+            x: Rows of the piece.
+            offset: Column of the full input at which the piece begins.
+            bias: Add the first layer's bias; exactly one piece has to.
+        """
+        kernel = self.kernels[0][offset : offset + x.shape[1]]
+        hidden = matmul(x, kernel.astype(x.dtype), self.precision)
+        return add_bias(hidden, self.biases[0].astype(x.dtype)) if bias else hidden
+
+    def finish(self, hidden: Float[Array, "rows hidden"]) -> Float[Array, "rows outputs"]:
+        """Apply everything behind the first product.
+
+        Args:
+            hidden: Sum of all pieces' `start`.
+        """
+        for kernel, bias in zip(self.kernels[1:], self.biases[1:], strict=True):
+            product = matmul(jnp.maximum(hidden, 0), kernel.astype(hidden.dtype), self.precision)
+            hidden = add_bias(product, bias.astype(hidden.dtype))
+        if not self.norm:
+            return hidden
+        dtype = hidden.dtype
+        return layer_norm(hidden, self.norm_scale.astype(dtype), self.norm_bias.astype(dtype))
