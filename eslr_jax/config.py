@@ -80,6 +80,7 @@ class SimConfig:
     solver_iterations: int = 100  # L-BFGS iterations of the physics simulator
     solver_memory: int = 8  # pairs kept by L-BFGS
     corrector_steps: int = 0  # L-BFGS iterations behind the network
+    tolerance: float = 0.0  # stop a frame's iterations at this force norm over weight
     self_contact: bool = False
 
 

@@ -111,6 +111,39 @@ def _gather_component_backward(incidence, cotangents):
 _gather_component.defvjp(_gather_component_forward, _gather_component_backward)
 
 
+def sum_incident(
+    values: Float[Array, "items features"], incidence: Int[Array, "rows degree"], *, corners: int
+) -> Float[Array, "rows features"]:
+    """Sum over every row the values of the items (faces, hinges) that name it.
+
+    Args:
+        values: One row per item.
+        incidence: Flat corner positions per row, see `gather_corners`.
+        corners: Corners of an item.
+    """
+    num_items = values.shape[0]
+    items = jnp.where(incidence < corners * num_items, incidence % max(num_items, 1), num_items)
+    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    return sum(padded[items[:, k]] for k in range(items.shape[1]))  # type: ignore[return-value]
+
+
+def vertex_normals(
+    positions: Float[Array, "vertices 3"],
+    faces: Int[Array, "faces 3"],
+    incidence: Int[Array, "vertices degree"],
+) -> Float[Array, "vertices 3"]:
+    """Return unit normals weighted by the areas of the incident faces; zero where there is none.
+
+    Args:
+        positions: Vertex positions [m].
+        faces: Triangles, counter-clockwise seen from outside.
+        incidence: Of the faces, see `gather_corners`.
+    """
+    a, b, c = gather_corners(positions, faces, incidence)
+    normals = jnp.stack(cross3(sub3(b, a), sub3(c, a)), axis=-1)
+    return safe_normalize(sum_incident(normals, incidence, corners=3))
+
+
 @jax.custom_jvp
 def arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the angle of (x, y), with a zero gradient at the origin.

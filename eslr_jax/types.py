@@ -75,6 +75,7 @@ class BodyMotion:
     faces: Int[Array, "body_faces 3"]
     is_obstacle: Bool[Array, " body_faces"]
     timestep: Float[Array, ""]  # seconds between frames
+    rest_positions: Float[Array, "body_vertices 3"]  # in the rest pose that garments are made for [m]
 
 
 @struct.dataclass

@@ -1,1 +1,16 @@
-"""TODO."""
+"""What is in the box: a name, or the path of a file, to a body, garment, motion or model."""
+
+from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits
+from eslr_jax.assets.load import load_body, load_garment, load_model, load_motion
+
+__all__ = [
+    "Asset",
+    "asset_names",
+    "data_folder",
+    "list_assets",
+    "load_body",
+    "load_garment",
+    "load_model",
+    "load_motion",
+    "load_splits",
+]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 SERIES_BELOW = 1e-2  # [rad^2]; there the truncated series below are exact to float32, the closed forms are not
@@ -66,19 +67,13 @@ def joint_transforms(
 
     Source: Loper et al. 2015, equations 2-4.
     """
-    local = jax.vmap(rotation_matrix)(rotations)
-    globals_: list[Array] = []
-    positions: list[Array] = []
-    for joint, parent in enumerate(parents):
-        if parent < 0:
-            globals_.append(local[joint])
-            positions.append(translation)
-            continue
-        bone = joint_rest_positions[joint] - joint_rest_positions[parent]
-        globals_.append(_product(globals_[parent], local[joint]))
-        positions.append(positions[parent] + _product(globals_[parent], bone))
-    turned = jnp.stack(globals_)
-    offsets = jnp.stack(positions) - _product(turned, joint_rest_positions[:, :, None])[:, :, 0]
+    turned = jax.vmap(rotation_matrix)(rotations)
+    posed = jnp.broadcast_to(translation, joint_rest_positions.shape)
+    for joints, above in _generations(parents):
+        bones = joint_rest_positions[joints] - joint_rest_positions[above]
+        posed = posed.at[joints].set(posed[above] + _apply(turned[above], bones))
+        turned = turned.at[joints].set(_product(turned[above], turned[joints]))
+    offsets = posed - _apply(turned, joint_rest_positions)
     return jnp.concatenate([turned, offsets[:, :, None]], axis=2)
 
 
@@ -101,10 +96,28 @@ def skin(
 
     Source: Loper et al. 2015, equation 1.
     """
-    blended = jnp.sum(weights[:, :, None, None] * transforms[indices], axis=1)
-    return jnp.sum(blended[:, :, :3] * positions[:, None, :], axis=2) + blended[:, :, 3]
+    joints = jnp.arange(transforms.shape[0], dtype=indices.dtype)
+    is_joint = indices[:, :, None] == joints[None, None, :]
+    dense = jnp.sum(jnp.where(is_joint, weights[:, :, None], 0.0), axis=1)  # a product beats gathers, on every device
+    blended = _product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
+    return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
+
+
+def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Joints with a parent and those parents, one pair of arrays per depth of the tree, from the root outwards."""
+    depths: list[int] = []
+    for parent in parents:
+        depths.append(0 if parent < 0 else depths[parent] + 1)
+    depth, parent = np.array(depths), np.array(parents)
+    members = [np.flatnonzero(depth == level) for level in range(1, depth.max() + 1)]
+    return [(joints, parent[joints]) for joints in members]
 
 
 def _product(left: Array, right: Array) -> Array:
     """Matrix product in the full precision of its arguments."""
     return jnp.matmul(left, right, precision=jax.lax.Precision.HIGHEST)
+
+
+def _apply(matrices: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Product of each matrix with its vector; elementwise, so never in reduced precision."""
+    return jnp.sum(matrices * vectors[:, None, :], axis=2)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, components, cross3, dot3, gather_corners, safe_normalize, sub3
+from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts
 
 _NEAREST_PATCHES = 4  # patches whose vertices are tried
@@ -22,29 +22,13 @@ class SurfacePoint(NamedTuple):
     squared_distance: Float[Array, " vertices"]  # [m^2]
 
 
-def vertex_normals(
-    positions: Float[Array, "surface_vertices 3"], surface: BodySurface
-) -> Float[Array, "surface_vertices 3"]:
-    """Return area-weighted unit vertex normals of the surface."""
-    a, b, c = gather_corners(positions, surface.faces, surface.face_incidence)
-    normal = cross3(sub3(b, a), sub3(c, a))
-    num_faces = surface.faces.shape[0]
-    # A vertex's incidence entries count corners; all three corners of a face share its normal.
-    face = jnp.where(surface.face_incidence < 3 * num_faces, surface.face_incidence % num_faces, num_faces)
-    sums = []
-    for component in normal:
-        padded = jnp.concatenate([component, jnp.zeros_like(component[:1])])
-        sums.append(sum(padded[face[:, k]] for k in range(face.shape[1])))
-    return safe_normalize(jnp.stack(sums, axis=-1))
-
-
 def nearest_point(
     query: Float[Array, "vertices 3"], positions: Float[Array, "surface_vertices 3"], surface: BodySurface
 ) -> SurfacePoint:
     """Find the nearest surface point of every query point.
 
     Not exact: the faces around the nearest vertex of the four nearest patches are tried. Garment vertices of
-    the bundled assets get a point within 0.1 mm of the nearest in more than 99.9 % of cases.
+    the bundled assets get a point within 0.1 mm of the nearest in more than 99 % of cases.
 
     Args:
         query: Points [m].
@@ -158,8 +142,12 @@ def find_contacts(
     """
     location = nearest_point(position, body, surface)
     points = interpolate(body, location, surface)
-    normals = safe_normalize(interpolate(vertex_normals(body, surface), location, surface))
-    next_normals = safe_normalize(interpolate(vertex_normals(next_body, surface), location, surface))
+    normals, next_normals = (
+        safe_normalize(
+            interpolate(vertex_normals(corners, surface.faces, surface.face_incidence), location, surface)
+        )
+        for corners in (body, next_body)
+    )
     side = jnp.sum((position - points) * normals, axis=-1)
     distance = jnp.sqrt(location.squared_distance)
     return Contacts(

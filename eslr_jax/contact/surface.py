@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.types import BodySurface
 
-_PATCH_SIZE = 14  # vertices per patch; more make the first level cheaper and the second dearer
+_PATCH_SIZE = 16  # most vertices per patch; more make the first level cheaper and the second dearer
 _CANDIDATE_FACES = 20  # faces tried around the nearest vertex: its own and most of its neighbours'
 
 
@@ -34,22 +34,21 @@ def prepare_surface(rest_positions: np.ndarray, faces: np.ndarray) -> BodySurfac
 
 
 def _patches(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split vertices into compact patches by farthest points, then the medoid of each Voronoi cell."""
-    num_patches = max(1, round(len(positions) / _PATCH_SIZE))
-    chosen = np.zeros(num_patches, int)
-    distance = np.full(len(positions), np.inf)
-    for index in range(1, num_patches):
-        distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[index - 1]], axis=1))
-        chosen[index] = np.argmax(distance)
-    owner = cKDTree(positions[chosen]).query(positions)[1]
-    members = [np.flatnonzero(owner == patch) for patch in range(num_patches)]
-    members = [member for member in members if len(member)]
+    """Split vertices into compact patches of nearly equal size; return each one's medoid and its members."""
+    pending, members = [np.arange(len(positions))], []
+    while pending:
+        ids = pending.pop()
+        if len(ids) <= _PATCH_SIZE:
+            members.append(ids)
+            continue
+        axis = np.argmax(np.ptp(positions[ids], axis=0))
+        ordered = ids[np.argsort(positions[ids, axis], kind="stable")]
+        pending += [ordered[: len(ids) // 2], ordered[len(ids) // 2 :]]
     centers = [
-        member[np.argmin(np.linalg.norm(positions[member] - positions[member].mean(0), axis=1))]
-        for member in members
+        ids[np.argmin(np.linalg.norm(positions[ids] - positions[ids].mean(axis=0), axis=1))]
+        for ids in members
     ]
-    width = max(len(member) for member in members)
-    return np.array(centers), np.stack([np.resize(member, width) for member in members])
+    return np.array(centers), np.stack([np.resize(ids, max(map(len, members))) for ids in members])
 
 
 def _corner_incidence(faces: np.ndarray, num_vertices: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.numerics import safe_norm, safe_normalize
+from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.types import Contacts, Garment, Material
 
 LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
@@ -47,43 +47,6 @@ def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.clip(x, -CLIP, CLIP)
 
 
-def cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Cross product written out, which fuses where `jnp.cross` does not."""
-    return jnp.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
-
-
-def sum_incident(
-    values: Float[Array, "items features"], incidence: Int[Array, "rows degree"], corners: int
-) -> Float[Array, "rows features"]:
-    """Sum over every row the values of the items that name it.
-
-    Args:
-        values: One row per item (a face, a hinge).
-        incidence: Flat corner positions per row, padded with the number of corners in all.
-        corners: Corners of an item.
-    """
-    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
-    return jnp.sum(padded[incidence // corners], axis=1)
-
-
-def vertex_normals(garment: Garment, positions: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return unit normals weighted by the areas of the incident faces; zero where there is none.
-
-    Args:
-        garment: Garment whose faces are used.
-        positions: Vertex positions [m], shape [vertices, 3].
-    """
-    a, b, c = (positions[garment.faces[:, k]] for k in range(3))
-    return safe_normalize(sum_incident(cross(b - a, c - a), garment.face_incidence, 3))
-
-
 def to_vertices(
     values: Float[Array, "*shape"],
     garment: Garment,
@@ -103,7 +66,7 @@ def to_vertices(
     num_vertices = garment.vertex_areas.shape[0]
     if values.ndim == 0:
         return jnp.broadcast_to(values, (num_vertices,))
-    sums = sum_incident(jnp.stack([values * weights, weights], axis=1), incidence, corners)
+    sums = sum_incident(jnp.stack([values * weights, weights], axis=1), incidence, corners=corners)
     mean = jnp.sum(values * weights) / jnp.maximum(jnp.sum(weights), 1e-30)
     return jnp.where(sums[:, 1] > 0, sums[:, 0] / jnp.where(sums[:, 1] > 0, sums[:, 1], 1), mean)
 
@@ -172,7 +135,7 @@ def hood_garment_features(
     """
     column = jnp.broadcast_to(timestep, (position.shape[0], 1))
     mass = log_positive(vertex_masses(garment, material))[:, None]
-    normals = vertex_normals(garment, position)
+    normals = vertex_normals(position, garment.faces, garment.face_incidence)
     return jnp.concatenate([velocity, normals, column, mass, material_inputs(garment, material)], axis=1)
 
 
@@ -263,7 +226,7 @@ def frame_node_features(
     return jnp.concatenate(
         [
             clip(velocity / VELOCITY_SCALE),
-            vertex_normals(garment, position),
+            vertex_normals(position, garment.faces, garment.face_incidence),
             jnp.stack(scalars, axis=1),
             material_inputs(garment, material),
         ],

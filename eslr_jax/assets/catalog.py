@@ -1,0 +1,79 @@
+"""The catalogue of bundled files, with licence and checksum."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from eslr_jax.errors import AssetError
+
+
+@dataclasses.dataclass(frozen=True)
+class Asset:
+    """One bundled thing."""
+
+    kind: str  # body, garment, motion or model
+    name: str
+    file: str  # relative to the data folder
+    bytes: int
+    sha256: str
+    licence: str
+    source: str
+    description: str
+
+
+@cache
+def data_folder() -> Path:
+    """Return the folder of the bundled data: inside the installed package, or beside it in a checkout.
+
+    Raises:
+        AssetError: Neither exists.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "data", package.parent / "data"):
+        if (folder / "manifest.json").is_file():
+            return folder
+    raise AssetError("the bundled data is missing; install the package again")
+
+
+@cache
+def list_assets() -> tuple[Asset, ...]:
+    """Return every bundled asset."""
+    entries = json.loads((data_folder() / "manifest.json").read_text())["assets"]
+    return tuple(Asset(**entry) for entry in entries)
+
+
+def asset_names(kind: str) -> tuple[str, ...]:
+    """Return the names of one kind, in the order of the manifest."""
+    return tuple(dict.fromkeys(asset.name for asset in list_assets() if asset.kind == kind))
+
+
+def find_asset(kind: str, name: str) -> Path:
+    """Return the file of a named asset.
+
+    Raises:
+        AssetError: There is no such name; the message lists what exists.
+    """
+    for asset in list_assets():
+        if asset.kind == kind and asset.name == name:
+            return data_folder() / asset.file
+    names = asset_names(kind)
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    raise AssetError(f"no {kind} named {name!r}: {hint}there are {', '.join(names)}; a path to a file works too")
+
+
+def is_intact(asset: Asset) -> bool:
+    """Check a bundled file against its checksum."""
+    return hashlib.sha256((data_folder() / asset.file).read_bytes()).hexdigest() == asset.sha256
+
+
+@cache
+def load_splits() -> dict[str, Any]:
+    """Return the split of clips and garments into train, validation, test and unseen."""
+    return json.loads((data_folder() / "splits.json").read_text())

@@ -1,0 +1,147 @@
+"""Motions on a rig, and bodies posed by them (host)."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eslr_jax.body import lbs
+from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, resample
+from eslr_jax.errors import MotionError
+from eslr_jax.types import Body, BodyMotion
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """Joint rotations over time, for the rig that `joint_names` names."""
+
+    name: str
+    rotations: np.ndarray  # local axis-angle relative to the rest pose [rad], shape [frames, joints, 3]
+    translations: np.ndarray  # position of the root joint [m], shape [frames, 3]
+    fps: float
+    joint_names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check the arrays.
+
+        Raises:
+            MotionError: No frames, mismatched shapes, NaN, or an impossible frame rate.
+        """
+        frames = len(self.translations)
+        if frames == 0:
+            raise MotionError(f"motion {self.name} has no frames; give at least one")
+        expected = (frames, len(self.joint_names), 3)
+        if self.rotations.shape != expected or self.translations.shape != (frames, 3):
+            raise MotionError(
+                f"motion {self.name}: rotations {self.rotations.shape} and translations "
+                f"{self.translations.shape} do not fit {frames} frames of {len(self.joint_names)} joints"
+            )
+        for label, values in (("rotations", self.rotations), ("translations", self.translations)):
+            is_bad = ~np.isfinite(values.reshape(frames, -1)).all(axis=1)
+            if is_bad.any():
+                raise MotionError(
+                    f"motion {self.name}: {label} of frame {np.argmax(is_bad)} are not finite; cut or repair it"
+                )
+        if not 1.0 <= self.fps <= 1000.0:
+            raise MotionError(f"motion {self.name}: {self.fps} frames per second; expected 1 to 1000")
+
+
+def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: float = 0.0) -> Motion:
+    """Return a motion that holds the rest pose.
+
+    Args:
+        body: The rig.
+        num_frames: Frames to hold it for.
+        fps: Frames per second.
+        arm_angle: Degrees by which both arms are lifted from the rest pose (negative lowers them).
+    """
+    rotations = np.zeros((num_frames, len(body.joint_names), 3))
+    if arm_angle:
+        rotations = abduct_arms(rotations, body.joint_names, arm_angle)
+    root = np.asarray(body.joint_rest_positions)[0]
+    return Motion("still", rotations, np.tile(root, (num_frames, 1)), fps, body.joint_names)
+
+
+def pose_body(
+    body: Body,
+    motion: Motion,
+    *,
+    fps: float = 30.0,
+    arm_abduction: float = ARM_ABDUCTION,
+    shape: np.ndarray | None = None,
+    num_frames: int | None = None,
+) -> BodyMotion:
+    """Pose a body along a motion.
+
+    Args:
+        body: A rigged body.
+        motion: A motion for the same rig; other rigs need retargeting first.
+        fps: Frame rate of the simulation; the motion is resampled to it.
+        arm_abduction: Degrees added to both arms, to keep them from pressing into the torso.
+        shape: Body shape in standard deviations, shape [shapes]; None is the average.
+        num_frames: Keep this many frames; None keeps all.
+
+    Raises:
+        MotionError: The motion is for another skeleton or has fewer frames than asked for.
+    """
+    if motion.joint_names != body.joint_names:
+        strangers = [name for name in motion.joint_names if name not in body.joint_names]
+        raise MotionError(
+            f"motion {motion.name} is for another skeleton ({len(motion.joint_names)} joints, "
+            f"unknown: {', '.join(strangers[:4]) or 'order differs'}); retarget it to this body first"
+        )
+    rotations, translations = resample(motion.rotations, motion.translations, motion.fps, fps)
+    if num_frames is not None:
+        if num_frames > len(rotations):
+            raise MotionError(
+                f"motion {motion.name} has {len(rotations)} frames at {fps:g} fps, fewer than the "
+                f"{num_frames} asked for; ask for fewer or choose a longer motion"
+            )
+        rotations, translations = rotations[:num_frames], translations[:num_frames]
+    if arm_abduction:
+        rotations = abduct_arms(rotations, body.joint_names, arm_abduction)
+    rest, joints = shape_body(body, shape)
+    transforms = _transforms(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, body.parents)
+    return BodyMotion(
+        positions=_skin_frames(rest, body.skin_weights, body.skin_indices, transforms),
+        joint_transforms=transforms,
+        faces=body.faces,
+        is_obstacle=body.is_obstacle,
+        timestep=jnp.float32(1.0 / fps),
+        rest_positions=rest,
+    )
+
+
+def shape_body(body: Body, shape: np.ndarray | None) -> tuple[jax.Array, jax.Array]:
+    """Return rest vertices and joints of a body shape [m]."""
+    if shape is None:
+        return body.rest_positions, body.joint_rest_positions
+    coefficients = jnp.asarray(shape, jnp.float32)
+    if coefficients.shape != (body.shape_directions.shape[-1],):
+        raise MotionError(
+            f"shape has {coefficients.size} coefficients; this body takes {body.shape_directions.shape[-1]}"
+        )
+    return (
+        body.rest_positions + body.shape_directions @ coefficients,
+        body.joint_rest_positions + body.joint_shape_directions @ coefficients,
+    )
+
+
+@partial(jax.jit, static_argnames="parents")
+def _transforms(rotations, translations, joints, parents):
+    return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(rotations, translations, joints, parents)
+
+
+@jax.jit
+def _skin_frames(positions, weights, indices, transforms):
+    """Skin frame by frame: a vmap would hold frames x vertices x influences matrices at once."""
+    return jax.lax.map(lambda frame: lbs.skin(positions, weights, indices, frame), transforms)
+
+
+def skin_garment(garment, transforms: jax.Array) -> jax.Array:
+    """Return a garment's skinned positions in every frame [m], shape [frames, vertices, 3]."""
+    return _skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)

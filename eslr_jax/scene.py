@@ -1,0 +1,126 @@
+"""Decide what a scene needs; what it does not need is absent from the compiled step."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from eslr_jax.body.motion import skin_garment
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.errors import MotionError
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.types import BodyMotion, BodySurface, ClothState, Garment, Material, Scene
+
+REACH = 0.12  # [m] that cloth is expected to stray from its skinned position; farther body faces are left out
+_SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
+_PUSH_OUT_STEPS = 8  # tangent-plane projections that take the skinned start out of the body
+_START_CLEARANCE = 2e-3  # [m]; the collision thickness
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOptions:
+    """What to model beyond what is there; host only."""
+
+    reach: float = REACH  # [m]
+    has_body: bool = True
+    start_at_rest: bool = False  # zero initial velocity instead of the body's
+
+
+def prepare_scene(
+    garment: Garment,
+    poses: BodyMotion,
+    *,
+    material: Material = COTTON,
+    options: SceneOptions | None = None,
+) -> Scene:
+    """Collect what a rollout reads, and leave out what it does not need.
+
+    Frame 0 is the garment skinned to the first pose and pushed out of the body.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion.
+        material: Fabric.
+        options: What to leave out or add.
+
+    Raises:
+        MotionError: The motion has fewer than two frames.
+    """
+    options = options or SceneOptions()
+    num_frames = poses.joint_transforms.shape[0]
+    if num_frames < 2:
+        raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
+    skinned = skin_garment(garment, poses.joint_transforms)
+    surface = body_positions = None
+    if options.has_body:
+        faces = reachable_faces(garment, skinned, poses, options.reach)
+        if len(faces):
+            surface = prepare_surface(np.asarray(poses.rest_positions), faces)
+            body_positions = poses.positions[:, surface.vertex_ids]
+    position = skinned[0]
+    if surface is not None:
+        assert body_positions is not None
+        position = _clear_of_body(position, garment, body_positions[0], surface)
+    velocity = (skinned[1] - skinned[0]) / poses.timestep
+    if options.start_at_rest:
+        velocity = jnp.zeros_like(velocity)
+    return Scene(
+        garment=garment,
+        material=material,
+        start=initial_state(position, velocity),
+        timestep=poses.timestep,
+        surface=surface,
+        body_positions=body_positions,
+        pin_targets=skinned if bool(np.any(garment.is_pinned)) else None,
+        num_frames=num_frames,
+    )
+
+
+def initial_state(position: jax.Array, velocity: jax.Array) -> ClothState:
+    """Return a cloth state without history."""
+    return ClothState(
+        position=position,
+        velocity=velocity,
+        friction_load=jnp.zeros(position.shape[0], position.dtype),
+        frame=jnp.int32(0),
+        status=jnp.int32(0),
+        first_bad_frame=jnp.int32(-1),
+    )
+
+
+def reachable_faces(garment: Garment, skinned: jax.Array, poses: BodyMotion, reach: float) -> np.ndarray:
+    """Return the obstacle faces that come within `reach` of the skinned garment in a sample of frames.
+
+    A T-shirt's scene then searches no legs, no head and no feet.
+    """
+    is_real = np.asarray(garment.vertex_mask)
+    frames = np.unique(np.linspace(0, len(skinned) - 1, _SAMPLED_FRAMES).astype(int))
+    is_near = np.zeros(poses.positions.shape[1], bool)
+    for frame in frames:
+        tree = cKDTree(np.asarray(skinned[frame])[is_real])
+        distance, _ = tree.query(np.asarray(poses.positions[frame]), distance_upper_bound=reach)
+        is_near |= np.isfinite(distance)
+    faces = np.asarray(poses.faces)
+    return faces[is_near[faces].any(axis=1) & np.asarray(poses.is_obstacle)]
+
+
+@jax.jit
+def _clear_of_body(
+    position: jax.Array, garment: Garment, body: jax.Array, surface: BodySurface
+) -> jax.Array:
+    """Move vertices that lie within the clearance of the body onto it; pinned ones stay."""
+
+    def project(_, position):
+        contacts = find_contacts(position, body, body, surface)
+        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
+        height = jnp.minimum(height, contacts.distances)
+        lift = jnp.where(contacts.is_near, jnp.maximum(_START_CLEARANCE - height, 0.0), 0.0)
+        lift = jnp.where(garment.is_pinned, 0.0, lift)
+        return position + lift[:, None] * contacts.normals
+
+    return jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)
