@@ -154,12 +154,14 @@ def _pad_incidence(
 ) -> np.ndarray:
     """Return an incidence table grown to `shape` and from items[0] to items[1] items.
 
-    Entry corner * items[0] + item becomes corner * items[1] + item; the padding, corners * items[0], moves to
-    corners * items[1] by the same rule.
+    Entry corner * items[0] + item becomes corner * items[1] + item; the padding moves along.
     """
     corner, item = np.divmod(table, max(items[0], 1))
     padded = np.full(shape, corners * items[1], table.dtype)
-    padded[: table.shape[0], : table.shape[1]] = corner * items[1] + item
+    is_padding = table == corners * items[0]
+    padded[: table.shape[0], : table.shape[1]] = np.where(
+        is_padding, corners * items[1], corner * items[1] + item
+    )
     return padded
 
 

@@ -1,0 +1,147 @@
+"""What an embedding must keep: geodesic distances, and its coordinates under renumbering and remeshing."""
+
+import time
+
+import numpy as np
+import pytest
+
+from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.embedding import geodesic_embedding
+from eslr_jax.geometry.geodesic import geodesic_distances, geodesic_graph
+
+MODES = ["raw", "canonical", "landmarks"]
+
+
+def stress(positions, faces, embedding):
+    """Kruskal's stress-1 over pairs with 100 random vertices."""
+    sources = np.random.default_rng(1).integers(0, len(positions), 100)
+    target = geodesic_distances(geodesic_graph(positions, faces), sources)
+    found = np.linalg.norm(embedding[sources][:, None] - embedding[None], axis=-1)
+    return np.sqrt(np.sum((found - target) ** 2) / np.sum(target**2))
+
+
+def mismatch(fine, coarse, **options):
+    """Distance between the embeddings of two meshes at equal points over the embedding's size, both RMS."""
+    embedding = geodesic_embedding(*fine, **options)
+    other = geodesic_embedding(*coarse, **options)
+    face, barycentric = closest_points(fine[0], *coarse)
+    matched = np.einsum("vc,vce->ve", barycentric, other[coarse[1][face]])
+    size = np.sqrt(np.sum((embedding - embedding.mean(axis=0)) ** 2, axis=1).mean())
+    return np.sqrt(np.sum((embedding - matched) ** 2, axis=1).mean()) / size
+
+
+def load(folder, name):
+    with np.load(folder / f"{name}.npz") as arrays:
+        return arrays["rest_positions"].astype(float), arrays["faces"].astype(int)
+
+
+@pytest.mark.parametrize("mode", ["raw", "canonical"])
+def test_stress_on_a_tube(builders, mode):
+    tube = builders.tube(64, 64)
+    assert stress(*tube, geodesic_embedding(*tube, size=8, mode=mode)) <= 0.08  # measured 0.0716
+
+
+def test_flat_sheet_embeds_isometrically(builders):
+    sheet = builders.sheet(12, 12, jitter=0.02)
+    sheet[0][:, 2] = 0
+    assert stress(*sheet, geodesic_embedding(*sheet, size=8)) < 0.02
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_renumbering_vertices_permutes_rows(builders, mode):
+    positions, faces = builders.tube(20, 15, flare=0.2, depth=0.8, twist=0.3)
+    permuted, permuted_faces, old = builders.permute(positions, faces)
+    embedding = geodesic_embedding(positions, faces, mode=mode)
+    again = geodesic_embedding(permuted, permuted_faces, mode=mode)
+    # ties between equally far landmarks may be broken otherwise; nothing else may change
+    np.testing.assert_allclose(again, embedding[old], atol=0.02 * np.abs(embedding).max())
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_turning_garment_and_body_changes_nothing(builders, mode):
+    positions, faces = builders.tube(20, 15, flare=0.2, depth=0.8)
+    anchors = positions[::40][:8] * 1.05
+    cosine, sine = np.cos(0.7), np.sin(0.7)
+    yaw = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    offset = np.array([0.3, 1.0, -0.2])
+    embedding = geodesic_embedding(positions, faces, mode=mode, anchors=anchors)
+    turned = geodesic_embedding(
+        positions @ yaw.T + offset,
+        faces,
+        mode=mode,
+        anchors=anchors @ yaw.T + offset,
+        body_axes=yaw.T,  # rows are the turned left, up and front
+    )
+    np.testing.assert_allclose(turned, embedding, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])  # rounding alone turns the axes of `raw`
+def test_translation_changes_nothing(builders, mode):
+    positions, faces = builders.tube(20, 15, depth=0.8)
+    moved = geodesic_embedding(positions + np.array([0.1, 1.0, -0.3]), faces, mode=mode)
+    embedding = geodesic_embedding(positions, faces, mode=mode)
+    np.testing.assert_allclose(moved, embedding, atol=0.02 * np.abs(embedding).max())  # ties, as above
+
+
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_two_meshes_of_a_tube_agree(builders, mode):
+    fine = builders.tube(48, 40, flare=0.2, depth=0.8, twist=1.0)
+    coarse = builders.tube(28, 22, flare=0.2, depth=0.8)
+    assert mismatch(fine, coarse, mode=mode) <= 0.08
+
+
+@pytest.mark.parametrize("name", ["tshirt", "dress", "pants"])
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_two_meshes_of_a_garment_agree(garment_folder, name, mode):
+    fine, coarse = load(garment_folder, f"{name}_4k"), load(garment_folder, f"{name}_1k")
+    assert mismatch(fine, coarse, mode=mode) <= 0.08
+
+
+def test_canonical_axes_follow_the_rest_pose(builders):
+    positions, faces = builders.tube(24, 20, flare=0.2, depth=0.8)
+    embedding = geodesic_embedding(positions, faces)
+    for axis in range(3):
+        assert np.corrcoef(embedding[:, axis], positions[:, axis])[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [2, 8, 16])
+def test_any_size_on_a_tiny_mesh(builders, mode, size):
+    embedding = geodesic_embedding(*builders.octahedron(), size=size, mode=mode)
+    assert embedding.shape == (6, size)
+    assert embedding.dtype == np.float64
+    assert np.isfinite(embedding).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_components_get_finite_coordinates(builders, mode):
+    positions, faces = builders.sheet(6, 6)
+    both = np.concatenate([positions, positions + np.array([0.0, 0.0, 0.3])])
+    embedding = geodesic_embedding(both, np.concatenate([faces, faces + 36]), mode=mode)
+    assert np.isfinite(embedding).all()
+
+
+def test_anchor_far_from_the_garment_is_a_column_of_zeros(builders):
+    positions, faces = builders.tube()
+    anchors = np.concatenate([positions[:7], [[0.0, 2.0, 0.0]]])
+    embedding = geodesic_embedding(positions, faces, mode="landmarks", anchors=anchors)
+    assert (embedding[:, 7] == 0).all()
+    assert (embedding[:, :7] > 0).all()
+    assert (np.argmax(embedding[:, :7], axis=0) == np.arange(7)).all()
+
+
+def test_wrong_options_are_named(builders):
+    tube = builders.tube()
+    with pytest.raises(ConfigError, match="'polar' is unknown; use one of raw, canonical, landmarks"):
+        geodesic_embedding(*tube, mode="polar")
+    with pytest.raises(ConfigError, match="3 anchors for an embedding of size 8"):
+        geodesic_embedding(*tube, mode="landmarks", anchors=np.zeros((3, 3)))
+
+
+@pytest.mark.slow
+def test_ten_thousand_vertices_take_seconds(builders):
+    tube = builders.tube(100, 100)
+    start = time.perf_counter()
+    geodesic_embedding(*tube)
+    assert time.perf_counter() - start < 10  # measured 2 s on one core

@@ -1,0 +1,134 @@
+"""Mesh files of every kind come back as written; broken ones are named."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from eslr_jax.errors import AssetError, MeshError
+from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
+from eslr_jax.io.mesh import read_mesh
+
+POSITIONS = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.25], [0, 0.5, 0.125], [0.25, 0.75, 0]])
+FACES = np.array([[0, 1, 2], [2, 3, 0], [3, 2, 4]])
+
+
+def assert_same(found, positions=POSITIONS, faces=FACES):
+    np.testing.assert_allclose(found[0], positions, atol=1e-7)
+    np.testing.assert_array_equal(found[1], faces)
+    assert found[0].dtype == np.float64
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".OBJ"])
+def test_indexed_formats_keep_vertices_and_order(tmp_path, suffix):
+    path = tmp_path / f"scarf{suffix}"
+    path.write_bytes(_export(suffix.lower()[1:]))
+    assert_same(read_mesh(path))
+
+
+def _export(kind):
+    data = trimesh.Trimesh(POSITIONS, FACES, process=False).export(file_type=kind)
+    return data.encode() if isinstance(data, str) else data
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_stl_corners_are_shared(tmp_path, kind):
+    path = tmp_path / "scarf.stl"
+    path.write_bytes(_export(kind))
+    positions, faces = read_mesh(path)
+    assert len(positions) == len(POSITIONS)
+    np.testing.assert_allclose(positions[faces], POSITIONS[FACES], atol=1e-7)
+
+
+@pytest.mark.parametrize("key", ["rest_positions", "positions", "vertices"])
+def test_npz_keys(tmp_path, key):
+    np.savez(tmp_path / "scarf.npz", **{key: POSITIONS.astype(np.float32), "faces": FACES})
+    assert_same(read_mesh(tmp_path / "scarf.npz"))
+
+
+def test_obj_keeps_loose_and_duplicate_vertices_and_ignores_attributes(tmp_path):
+    path = tmp_path / "scarf.obj"
+    path.write_text(
+        "# made by hand\nmtllib a.mtl\no scarf\nv 0 0 0 1 0 0\nv 1 0 0\nv 1 0 0\nv 9 9 9\nv 0 1 0\n"
+        "vt 0 0\nvt 1 0\n"
+        "vn 0 0 1\nusemtl b\ns off\nf 1/1/1 2/2/1 5/1/1 # corner\nf -5//1 3//1 -1//1\nl 1 2\n"
+    )
+    positions, faces = read_mesh(path)
+    assert positions.tolist() == [[0, 0, 0], [1, 0, 0], [1, 0, 0], [9, 9, 9], [0, 1, 0]]
+    assert faces.tolist() == [[0, 1, 4], [0, 2, 4]]
+
+
+def test_glb_scene_transforms_are_applied(tmp_path):
+    scene = trimesh.Scene()
+    offset = np.eye(4)
+    offset[:3, 3] = [0, 1, 0]
+    scene.add_geometry(trimesh.Trimesh(POSITIONS, FACES, process=False), transform=offset)
+    scene.export(tmp_path / "scarf.glb")
+    assert_same(read_mesh(tmp_path / "scarf.glb"), POSITIONS + np.array([0, 1, 0]))
+
+
+def test_quads_are_named(tmp_path):
+    path = tmp_path / "quad.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    with pytest.raises(MeshError, match="line 5: a face of 4 vertices; triangulate"):
+        read_mesh(path)
+    path = tmp_path / "quad.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n"
+    )
+    with pytest.raises(MeshError, match="not all of its 1 faces are triangles"):
+        read_mesh(path)
+
+
+def test_mesh_without_faces_reads_as_empty(tmp_path):
+    path = tmp_path / "points.obj"
+    path.write_text("v 0 0 0\n")
+    assert_same(read_mesh(path), np.zeros((1, 3)), np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb", ".npz"])
+@pytest.mark.parametrize("content", [b"v 0 zero 0\n\x00\xff garbage", b"solid x"])
+def test_damaged_files_are_named(tmp_path, suffix, content):
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(content)
+    if suffix == ".obj" and content == b"solid x":
+        assert len(read_mesh(path)[0]) == 0  # OBJ has no signature; validation calls it empty
+        return
+    with pytest.raises(AssetError, match="bad") as caught:
+        read_mesh(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_unknown_files_are_named(tmp_path):
+    with pytest.raises(AssetError, match="doesn't exist"):
+        read_mesh(tmp_path / "none.obj")
+    (tmp_path / "folder.obj").mkdir()
+    with pytest.raises(AssetError, match="is a folder"):
+        read_mesh(tmp_path / "folder.obj")
+    with pytest.raises(AssetError, match=r"'.fbx'; convert it to one of .obj, .ply, .stl, .glb, .npz"):
+        read_mesh(tmp_path / "none.fbx")
+    np.savez(tmp_path / "other.npz", points=POSITIONS)
+    with pytest.raises(AssetError, match="arrays points; it needs faces and rest_positions or"):
+        read_mesh(tmp_path / "other.npz")
+
+
+def test_garment_file_round_trip(tmp_path):
+    garment = GarmentFile(
+        rest_positions=POSITIONS,
+        faces=FACES,
+        skin_weights=np.full((5, 2), 0.5),
+        skin_indices=np.tile([1, 3], (5, 1)),
+        is_pinned=np.array([True, False, False, False, True]),
+    )
+    write_garment_npz(tmp_path / "scarf.npz", garment)
+    again = read_garment_npz(tmp_path / "scarf.npz")
+    for name in garment.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(again, name), getattr(garment, name))
+        assert getattr(again, name).dtype == getattr(garment, name).dtype
+
+
+def test_garment_file_without_weights_is_named(tmp_path):
+    np.savez(tmp_path / "scarf.npz", rest_positions=POSITIONS, faces=FACES)
+    with pytest.raises(AssetError, match="lacks skin_weights, skin_indices; it has faces, rest_positions"):
+        read_garment_npz(tmp_path / "scarf.npz")
