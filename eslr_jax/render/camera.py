@@ -28,8 +28,8 @@ def parse_angle(camera: str | float) -> float:
     """Turn a camera's name or its angle in degrees into an angle in radians.
 
     Args:
-        camera: "front" (+Z, where a body in rest pose faces), "side" (+X, the body's left), "back", or degrees
-            from the front towards the side.
+        camera: "front" (+Z, where a body in rest pose faces), "side" (+X, its left), "back", or degrees from
+            the front towards the side.
 
     Raises:
         ConfigError: If the name is unknown or the angle is not finite.

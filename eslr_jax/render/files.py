@@ -33,7 +33,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
 
     Args:
         path: The file; its suffix chooses the container.
-        frames: Pictures of one size, uint8, each of shape [height, width, 3]; an odd last row or column is lost.
+        frames: Pictures of one size, uint8, each of shape [height, width, 3]; an odd row or column is cut.
         fps: Frames per second.
 
     Raises:

@@ -13,7 +13,7 @@ from eslr_jax.render.extras import require
 from eslr_jax.render.scene import Surface, trace_picture
 
 GARMENT_COLOR = (0.30, 0.50, 0.70)  # sRGB
-BODY_COLOR = (0.84, 0.68, 0.58)  # sRGB
+BODY_COLOR = (0.88, 0.73, 0.64)  # sRGB
 _PICTURE_SIZE = (480, 640)  # width, height [pixels]
 _SHEET_PICTURE_SIZE = (280, 400)  # width, height [pixels]
 _SAMPLES = 16  # camera rays per pixel: the noise is just not seen

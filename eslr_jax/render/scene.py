@@ -22,6 +22,7 @@ from eslr_jax.render.extras import require
 _VARIANT = "scalar_rgb"
 # Direct light only: at equal time a third of the noise of a path tracer, and folds keep their contrast.
 _LIGHT_SAMPLES = 4  # per camera ray
+_GUIDE_SAMPLES = 4  # camera rays per pixel for the features that guide the denoiser
 _BACKGROUND = (0.86, 0.87, 0.88)  # sRGB; the lit floor has the same colour, so no horizon shows
 _SKY_RADIANCE = np.array([0.20, 0.21, 0.23])  # the fill; radiances are scaled so that 1 is white
 _SKY_SHARE = 0.25  # of the light samples
@@ -48,11 +49,11 @@ _LAMPS = (
     # Warm, from the camera's left, so far to the side that it grazes folds.
     _Lamp("key", math.radians(-58), math.radians(42), math.radians(9), np.array([2.70, 2.60, 2.45]), 0.50),
     # Weak and broad, low on the right, for what a bright floor would throw back.
-    _Lamp("fill", math.radians(35), math.radians(4), math.radians(30), np.array([0.62, 0.61, 0.60]), 0.10),
+    _Lamp("fill", math.radians(35), math.radians(16), math.radians(30), np.array([0.62, 0.61, 0.60]), 0.10),
     # Cool, from behind on the right: the rim that parts the subject from the background.
     _Lamp("rim", math.radians(140), math.radians(35), math.radians(12), np.array([0.70, 0.76, 0.85]), 0.15),
 )
-_LAMP_DISTANCE = 1000.0  # [m]
+_LAMP_DISTANCE = 1e4  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,20 +91,41 @@ def trace_picture(
     """
     mitsuba = require("mitsuba")
     with _variant(mitsuba):
-        description: dict[str, Any] = {
-            "type": "scene",
-            "integrator": _integrator(),
-            "sensor": _sensor(mitsuba, camera, size, samples),
-            "sky": {"type": "constant", "radiance": _rgb(_SKY_RADIANCE), "sampling_weight": _SKY_SHARE},
-            "floor": _floor(mitsuba, camera.target, ground_height),
-        }
-        description |= {lamp.name: _lamp(mitsuba, lamp, camera.target, light_angle) for lamp in _LAMPS}
-        description |= {surface.name: _mesh(mitsuba, surface) for surface in surfaces}
-        pixels = np.array(mitsuba.render(mitsuba.load_dict(description), seed=0))
-    color, opacity, guide = pixels[..., :3], np.clip(pixels[..., 3:4], 0.0, 1.0), pixels[..., 4:]
+        scene = _build_scene(mitsuba, surfaces, camera, light_angle, ground_height, size, samples)
+        # Reflectance and normals tell surfaces apart and need few rays; traced with the light they cost more.
+        guide_integrator = mitsuba.load_dict({"type": "aov", "aovs": "reflectance:albedo,normal:sh_normal"})
+        pixels = np.array(mitsuba.render(scene, seed=0))
+        guide = np.array(mitsuba.render(scene, integrator=guide_integrator, spp=_GUIDE_SAMPLES, seed=0))
+    color, opacity = pixels[..., :3], np.clip(pixels[..., 3:], 0.0, 1.0)
     color = _soft_clip(color) + (1 - opacity) * srgb_to_linear(_BACKGROUND)
-    radiance = smooth_grain(color, guide)
-    return np.round(255 * linear_to_srgb(radiance)).astype(np.uint8)
+    return np.round(255 * linear_to_srgb(smooth_grain(color, guide))).astype(np.uint8)
+
+
+def _build_scene(
+    mitsuba: ModuleType,
+    surfaces: Sequence[Surface],
+    camera: Camera,
+    light_angle: float,
+    ground_height: float,
+    size: tuple[int, int],
+    samples: int,
+):
+    """A Mitsuba scene; see `trace_picture` for the arguments."""
+    description: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {
+            "type": "direct",
+            "emitter_samples": _LIGHT_SAMPLES,
+            "bsdf_samples": 1,
+            "hide_emitters": True,
+        },
+        "sensor": _sensor(mitsuba, camera, size, samples),
+        "sky": {"type": "constant", "radiance": _rgb(_SKY_RADIANCE), "sampling_weight": _SKY_SHARE},
+        "floor": _floor(mitsuba, camera.target, ground_height),
+    }
+    description |= {lamp.name: _lamp(mitsuba, lamp, camera.target, light_angle) for lamp in _LAMPS}
+    description |= {surface.name: _mesh(mitsuba, surface) for surface in surfaces}
+    return mitsuba.load_dict(description)
 
 
 @contextlib.contextmanager
@@ -113,12 +135,6 @@ def _variant(mitsuba: ModuleType) -> Iterator[None]:
         mitsuba.set_variant(_VARIANT)  # variant_context can't return to "none chosen"
     with mitsuba.variant_context(_VARIANT):
         yield
-
-
-def _integrator() -> dict[str, Any]:
-    """Direct light; reflectance and normals beside it, to tell surfaces apart."""
-    light = {"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1, "hide_emitters": True}
-    return {"type": "aov", "aovs": "reflectance:albedo,normal:sh_normal", "light": light}
 
 
 def _sensor(mitsuba: ModuleType, camera: Camera, size: tuple[int, int], samples: int) -> dict[str, Any]:
