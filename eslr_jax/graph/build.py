@@ -95,7 +95,7 @@ def build_frame_graph(
             globals_["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
         if config.update_body:
             signs = reverse_signs(is_hood, world.dtype)
-            edges["world_reverse"] = edges["world"] * signs
+            edges["world_reverse"] = edges["world"] * signs[None]
             senders["world_reverse"], receivers["world_reverse"] = receivers["world"], senders["world"]
     return jraph.GraphsTuple(
         nodes=nodes,

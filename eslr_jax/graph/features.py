@@ -111,7 +111,7 @@ def mean_edge_length(garment: Garment) -> Float[Array, ""]:
     """Return the mean length of the rest mesh's edges [m]."""
     rest = garment.rest_positions[garment.senders] - garment.rest_positions[garment.receivers]
     total = jnp.sum(jnp.where(garment.edge_mask, safe_norm(rest), 0))
-    return total / jnp.maximum(jnp.sum(garment.edge_mask), 1)
+    return total / jnp.maximum(jnp.sum(garment.edge_mask.astype(rest.dtype)), 1)
 
 
 def timestep_input(timestep: Float[Array, ""]) -> Float[Array, ""]:

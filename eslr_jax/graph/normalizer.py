@@ -58,8 +58,8 @@ def update(
     count = jnp.sum(mask).astype(normalizer.count.dtype)
     safe_count = jnp.maximum(count, 1)
     reference = rows[jnp.argmax(mask)]  # makes the mean of a constant feature exact
-    mean = reference + jnp.sum(jnp.where(mask[:, None], rows - reference, 0), axis=0) / safe_count
-    deviations = jnp.sum(jnp.where(mask[:, None], rows - mean, 0) ** 2, axis=0)
+    mean = reference + jnp.sum(jnp.where(mask[:, None], rows - reference[None], 0), axis=0) / safe_count
+    deviations = jnp.sum(jnp.where(mask[:, None], rows - mean[None], 0) ** 2, axis=0)
     total = normalizer.count + count
     fraction = count / jnp.maximum(total, 1)
     delta = mean - normalizer.mean
@@ -85,9 +85,9 @@ def standard_deviation(normalizer: Normalizer) -> Float[Array, " features"]:
 
 def normalize(normalizer: Normalizer, rows: Float[Array, "rows features"]) -> Float[Array, "rows features"]:
     """Return (rows - mean) / deviation."""
-    return (rows - normalizer.mean) / standard_deviation(normalizer)
+    return (rows - normalizer.mean[None]) / standard_deviation(normalizer)[None]
 
 
 def inverse(normalizer: Normalizer, rows: Float[Array, "rows features"]) -> Float[Array, "rows features"]:
     """Return rows * deviation + mean, which undoes `normalize`."""
-    return rows * standard_deviation(normalizer) + normalizer.mean
+    return rows * standard_deviation(normalizer)[None] + normalizer.mean[None]

@@ -1,0 +1,271 @@
+"""Plain builds of graph and network: segment sums, concatenations, no shared sums, no custom derivatives.
+
+`plain_network` runs with NumPy in float64 as the oracle of the tests, and with JAX as the baseline of the
+benchmarks. It reads the same weights and the same graph as the package and shares no code with it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def numpy_segment_sum(rows, segments, num_segments):
+    total = np.zeros((num_segments, *rows.shape[1:]), rows.dtype)
+    np.add.at(total, np.asarray(segments), rows)
+    return total
+
+
+SEGMENT_SUMS = {np: numpy_segment_sum, jnp: jax.ops.segment_sum}
+
+
+def to_float64(tree):
+    """Return a pytree as NumPy arrays, floats in float64."""
+
+    def cast(leaf):
+        leaf = np.asarray(leaf)
+        return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
+
+    return jax.tree.map(cast, tree)
+
+
+def plain_norm(x, weights, prefix, xp):
+    mean = x.mean(axis=-1, keepdims=True)
+    variance = ((x - mean) ** 2).mean(axis=-1, keepdims=True)
+    scale, bias = weights[f"{prefix}_scale"], weights[f"{prefix}_bias"]
+    return (x - mean) / xp.sqrt(variance + 1e-5) * scale + bias
+
+
+def plain_mlp(x, weights, xp):
+    num_layers = sum(name.startswith("kernel") for name in weights)
+    for k in range(num_layers):
+        x = x @ weights[f"kernel_{k}"] + weights[f"bias_{k}"]
+        if k < num_layers - 1:
+            x = xp.maximum(x, 0)
+    return plain_norm(x, weights, "norm", xp) if "norm_scale" in weights else x
+
+
+def plain_layer(latents, graph, weights, config, xp):
+    """Paper, eqs. 1-4, edge set by edge set; `latents` maps names of nodes and edges to rows."""
+    segment_sum = SEGMENT_SUMS[xp]
+    v, b = latents["garment"], latents.get("body")
+    num_vertices = v.shape[0]
+    senders, receivers = graph.senders, graph.receivers
+    has_body = "world" in graph.edges
+    moves_body = has_body and config.update_body
+    concat = lambda *rows: xp.concatenate(rows, axis=1)  # noqa: E731
+    old = latents if config.residual else dict.fromkeys(latents, 0.0)
+    new = dict(latents)
+
+    step = plain_mlp(
+        concat(v[receivers["mesh"]], v[senders["mesh"]], latents["mesh"]), weights["mesh_mlp"], xp
+    )
+    mesh_sum = segment_sum(step, receivers["mesh"], num_vertices)
+    new["mesh"] = old["mesh"] + step
+    world_sum = xp.zeros_like(mesh_sum)
+    if has_body:
+        mask = graph.globals["world_mask"][:, None].astype(v.dtype)
+        step = plain_mlp(
+            concat(v[receivers["world"]], b[senders["world"]], latents["world"]), weights["world_mlp"], xp
+        )
+        world_sum = segment_sum(step * mask, receivers["world"], num_vertices)
+        new["world"] = old["world"] + step
+    new["garment"] = old["garment"] + plain_mlp(concat(v, mesh_sum, world_sum), weights["vertex_mlp"], xp)
+    if moves_body:
+        at_body, at_garment = receivers["world_reverse"], senders["world_reverse"]
+        step = plain_mlp(
+            concat(b[at_body], v[at_garment], latents["world_reverse"]), weights["world_mlp"], xp
+        )
+        new["world_reverse"] = old["world_reverse"] + step
+        body_sum = segment_sum(step, at_body, b.shape[0])
+        new["body"] = old["body"] + plain_mlp(
+            concat(b, xp.zeros_like(b), body_sum), weights["vertex_mlp"], xp
+        )
+    if not config.smoothing_steps:
+        return new
+
+    real_edge = (senders["mesh"] != receivers["mesh"])[:, None].astype(v.dtype)  # padding points at itself
+    degree = segment_sum(real_edge, receivers["mesh"], num_vertices)
+    if has_body and config.smooth_world_edges:
+        degree = degree + segment_sum(mask, receivers["world"], num_vertices)
+    p, q = new["garment"], new.get("body")
+    for k in range(config.smoothing_steps):
+        e, w, r = (
+            new[name] if name in new and (k == 0 or config.readd_edges) else 0.0
+            for name in ("mesh", "world", "world_reverse")
+        )
+        total = segment_sum((p[senders["mesh"]] + e) * real_edge, receivers["mesh"], num_vertices)
+        if has_body and config.smooth_world_edges:
+            total = total + segment_sum((q[senders["world"]] + w) * mask, receivers["world"], num_vertices)
+        if moves_body:
+            q = p[senders["world_reverse"]] + r
+        p = total / xp.maximum(degree, 1)
+    p = xp.where(degree > 0, p, new["garment"])
+    old = new if config.residual else dict.fromkeys(new, 0.0)
+    smoothed = {"garment": old["garment"] + plain_mlp(p, weights["smooth_mlp"], xp)}
+    if moves_body:
+        smoothed["body"] = old["body"] + plain_mlp(q, weights["smooth_mlp"], xp)
+    return {**new, **smoothed}
+
+
+def plain_features(queries, keys, projection, kernel, xp):
+    """Random features of attention, unstabilised: float64 holds the exponentials of the tests' sizes."""
+    if kernel == "relu":
+        return (xp.maximum(x @ projection.T, 0) + 1e-3 for x in (queries, keys))
+    scale = queries.shape[1] ** -0.25
+    queries, keys = queries * scale, keys * scale
+    phi = []
+    for x, top in ((queries, "row"), (keys, "all")):
+        exponents = x @ projection.T - (x**2).sum(axis=1, keepdims=True) / 2
+        largest = exponents.max(axis=1, keepdims=True) if top == "row" else exponents.max()
+        phi.append(xp.exp(exponents - largest) + 1e-6)
+    return phi
+
+
+def plain_block(x, embedding, mask, projection, weights, config, xp):
+    here = plain_norm(x, weights, "attention_norm", xp) if config.attention_norm else x
+    located = xp.concatenate([here, embedding / 0.5], axis=1)
+    queries, keys, values = located @ weights["query"], located @ weights["key"], here @ weights["value"]
+    phi_q, phi_k = plain_features(queries, keys, projection, config.attention_kernel, xp)
+    phi_k = phi_k * mask[:, None]
+    attended = (phi_q @ (phi_k.T @ values)) / (phi_q @ phi_k.sum(axis=0)[:, None])
+    x = x + attended @ weights["output"] + weights["output_bias"]
+    if config.attention_feedforward:
+        x = x + plain_mlp(plain_norm(x, weights, "feedforward_norm", xp), weights["feedforward"], xp)
+    return x
+
+
+def plain_normalize(rows, normalizer, num_static, xp):
+    changing = rows[:, : rows.shape[1] - num_static]
+    deviation = xp.maximum(
+        xp.sqrt(normalizer.squared_deviations / xp.maximum(normalizer.count, 1.0)), 1e-8
+    )
+    deviation = xp.where(normalizer.count > 0, deviation, 1.0)
+    return xp.concatenate([(changing - normalizer.mean) / deviation, rows[:, changing.shape[1] :]], axis=1)
+
+
+def plain_network(config, params, graph, garment, xp=np):
+    """Return the raw output of the network; everything in the floating type of its inputs."""
+    weights, statistics = params["params"], params["statistics"]
+    nodes, edges = dict(graph.nodes), dict(graph.edges)
+    encoders = {name: weights[f"{name}_encoder"] for name in ("garment", "mesh", "world")}
+    encoders["world_reverse"] = encoders["world"]
+    if config.features == "hood":
+        table = weights["type_embedding"]
+        for name, rows in nodes.items():
+            types = table[graph.globals[f"{name}_type"]]
+            rows = xp.concatenate([rows[:, :3], types, rows[:, 3:]], axis=1)
+            nodes[name] = plain_normalize(rows, statistics["garment"], 3, xp)
+        edges["mesh"] = plain_normalize(edges["mesh"], statistics["mesh"], 3, xp)
+        for name in set(edges) & {"world", "world_reverse"}:
+            edges[name] = plain_normalize(edges[name], statistics["world"], 0, xp)
+        encoders["body"] = encoders["garment"]
+    else:
+        encoders["body"] = weights["body_encoder"]
+    latents = {name: plain_mlp(rows, encoders[name], xp) for name, rows in {**nodes, **edges}.items()}
+    encoded = latents["garment"]
+    for layer in range(config.message_passing_steps):
+        latents = plain_layer(latents, graph, layer_weights(weights["layers"], layer), config, xp)
+    features = latents["garment"]
+    if config.attention_blocks:
+        x = encoded
+        for block in range(config.attention_blocks):
+            x = plain_block(
+                x,
+                garment.geodesic_embedding,
+                garment.vertex_mask,
+                params["constants"]["projection"],
+                layer_weights(weights["blocks"], block),
+                config,
+                xp,
+            )
+        features = xp.concatenate([features, x], axis=1)
+    return plain_mlp(features, weights["decoder"], xp)
+
+
+def layer_weights(stacked, layer):
+    """Return one layer of weights that are stacked along their first axis."""
+    return jax.tree.map(lambda leaf: leaf[layer], stacked)
+
+
+# --- scene --------------------------------------------------------------------------------------------------
+
+
+def tube(num_around: int, num_along: int):
+    """Return an open tube about half a metre wide and 0.8 m high, counter-clockwise seen from outside."""
+    row, column = np.meshgrid(np.arange(num_along), np.arange(num_around), indexing="ij")
+    angle = 2 * np.pi * column / num_around
+    radius = 0.25 * (1 + 0.05 * np.sin(3 * angle))
+    height = 0.8 * row / max(num_along - 1, 1)
+    positions = np.stack([radius * np.cos(angle), height, -radius * np.sin(angle)], -1).reshape(-1, 3)
+    lower = row[:-1] * num_around + column[:-1]
+    right = row[:-1] * num_around + (column[:-1] + 1) % num_around
+    upper, upper_right = lower + num_around, right + num_around
+    faces = [np.stack([lower, right, upper], -1), np.stack([right, upper_right, upper], -1)]
+    return positions, np.concatenate([part.reshape(-1, 3) for part in faces])
+
+
+def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool = False, seed: int = 0):
+    """Return a tube, a fabric and random inputs; every tenth vertex is out of the body's reach."""
+    from eslr_jax.geometry.prepare import prepare_garment
+    from eslr_jax.graph.inputs import GraphInputs
+    from eslr_jax.types import Contacts, Material
+
+    positions, faces = tube(num_around, num_along)
+    num_real = len(positions)
+    is_pinned = positions[:, 1] > 0.79
+    garment = prepare_garment(
+        positions,
+        faces,
+        skin_weights=np.ones((num_real, 1)),
+        skin_indices=np.zeros((num_real, 1), int),
+        is_pinned=is_pinned,
+        pad=pad,
+    )
+    garment = jax.tree.map(jnp.asarray, garment)
+    num_vertices = garment.rest_positions.shape[0]
+    generator = np.random.default_rng(seed)
+
+    def noise(scale, *columns):
+        rows = scale * generator.standard_normal((num_real, *columns))
+        return jnp.asarray(np.pad(rows, ((0, num_vertices - num_real), *[(0, 0)] * len(columns))), jnp.float32)
+
+    position = garment.rest_positions + noise(0.003, 3)
+    outward = np.asarray(position) * [1, 0, 1]
+    normals = jnp.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True), jnp.float32)
+    next_normals = normals + noise(0.1, 3)
+    next_normals = next_normals / jnp.linalg.norm(next_normals, axis=1, keepdims=True)
+    distances = jnp.where(jnp.arange(num_vertices) % 10 == 3, 0.05, 0.01 + noise(0.004))
+    points = position - normals * distances[:, None]
+    material = Material(
+        density=jnp.float32(0.20022),
+        lame_mu=jnp.float32(23600.0),
+        lame_lambda=jnp.float32(44400.0),
+        bending_stiffness=jnp.float32(3.9625778e-5),
+        thickness=jnp.float32(4.7e-4),
+    )
+    weight = 9.81 * material.density * garment.vertex_areas
+    contacts = Contacts(
+        points=points,
+        next_points=points + noise(0.01, 3),
+        normals=normals,
+        next_normals=next_normals,
+        distances=distances,
+        is_near=distances < 0.04,
+    )
+    velocity = noise(0.01, 3)
+    inputs = GraphInputs(
+        position=position,
+        velocity=velocity,
+        timestep=jnp.float32(1 / 30),
+        contacts=contacts if body else None,
+        body_velocity=noise(0.01, 3) if body else None,
+        inertial_guess=position + velocity,
+        guess=position + velocity + noise(0.002, 3),
+        gradient=weight[:, None] * noise(1.0, 3),
+        weight=weight,
+        correction=noise(0.002, 3),
+        previous_gradient=weight[:, None] * noise(2.0, 3),
+    )
+    return garment, material, inputs
