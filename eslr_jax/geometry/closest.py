@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 
 def closest_points(
@@ -29,7 +29,7 @@ def closest_points(
     corners = np.asarray(positions, np.float64)[faces]
     centroids = corners.mean(axis=1)
     reach = float(np.sqrt(np.max(np.sum((corners - centroids[:, None]) ** 2, axis=2))))
-    tree = cKDTree(centroids)
+    tree = KDTree(centroids)
     nearest = np.zeros(len(points), np.int64)
     barycentric = np.zeros((len(points), 3))
     open_points = np.arange(len(points))

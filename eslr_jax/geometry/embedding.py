@@ -53,8 +53,9 @@ def geodesic_embedding(
         faces: Triangles, shape [faces, 3].
         size: Coordinates per vertex, k.
         mode: See the module's docstring.
-        anchors: Body points of mode `landmarks` [m], one per coordinate, in the rest pose (joints, say); by
-            default the corners of the garment's bounding box.
+        anchors: Points of mode `landmarks` [m], one per coordinate, in the rest pose; best on the body's skin,
+            since a point deep inside has no one closest point on a garment. By default the corners of the
+            garment's bounding box.
         body_axes: Rows are the rest body's left, up and front; by default x, y and z.
 
     Returns:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from eslr_jax.geometry.topology import (
     half_edges,
@@ -67,10 +67,11 @@ def farthest_point_landmarks(
     Returns:
         Landmark vertices and their distances to every vertex [m].
     """
-    count = min(count, graph.shape[0])
+    num_vertices = graph.indptr.size - 1
+    count = min(count, num_vertices)
     landmarks = np.empty(count, np.int64)
-    distances = np.empty((count, graph.shape[0]))
-    nearest = np.full(graph.shape[0], np.inf)
+    distances = np.empty((count, num_vertices))
+    nearest = np.full(num_vertices, np.inf)
     vertex = first
     for row in range(count):
         landmarks[row] = vertex
@@ -161,7 +162,7 @@ def _bridges(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
     fresh = np.flatnonzero(is_joined)
     for _ in range(num_components - 1):
         outside = np.flatnonzero(~is_joined)
-        distance, index = cKDTree(positions[fresh]).query(positions[outside])
+        distance, index = map(np.asarray, KDTree(positions[fresh]).query(positions[outside]))
         is_closer = distance < best[outside]
         best[outside[is_closer]] = distance[is_closer]
         partner[outside[is_closer]] = fresh[index[is_closer]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -137,7 +138,7 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     padded["hinge_incidence"] = _pad_incidence(
         leaves["hinge_incidence"], 4, (have.hinges, bucket.hinges), (bucket.vertices, bucket.hinge_degree)
     )
-    return garment.replace(**padded)
+    return dataclasses.replace(garment, **padded)
 
 
 def _pad_neighbors(neighbors: np.ndarray, mask: np.ndarray, bucket: Bucket) -> tuple[np.ndarray, np.ndarray]:

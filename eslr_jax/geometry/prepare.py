@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +67,7 @@ def prepare_garment(
     hinges, hinge_faces = topology.find_hinges(faces)
     senders, receivers, reverse = topology.directed_edges(topology.unique_edges(faces))
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
-    garment = Garment(
+    leaves: dict[str, Any] = dict(
         rest_positions=positions,
         faces=faces,
         rest_areas=areas,
@@ -88,6 +90,7 @@ def prepare_garment(
         skin_indices=skin_indices,
         is_pinned=is_pinned,
     )
+    garment = Garment(**leaves)  # NumPy leaves, until the padding is done
     return to_device(pad_garment(garment) if pad else garment)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry.topology import (
@@ -124,7 +124,7 @@ def _check_vertices(positions: np.ndarray, faces: np.ndarray, name: str) -> None
             f"{name}: {np.sum(~is_used)} vertices belong to no face, the first is vertex {vertex}; "
             "delete loose vertices"
         )
-    pairs = cKDTree(positions).query_pairs(DUPLICATE_TOLERANCE * _diagonal(positions), output_type="ndarray")
+    pairs = KDTree(positions).query_pairs(DUPLICATE_TOLERANCE * _diagonal(positions), output_type="ndarray")
     if len(pairs):
         first, second = np.sort(pairs, axis=1)[np.lexsort(np.sort(pairs, axis=1).T[::-1])[0]]
         raise MeshError(
@@ -250,7 +250,7 @@ def _body_agreement(
     crosses = face_cross_products(positions, faces)
     body_crosses = face_cross_products(body_positions, body_faces)
     outward = body_crosses / np.maximum(np.linalg.norm(body_crosses, axis=1, keepdims=True), 1e-30)
-    _, nearest = cKDTree(body_positions[body_faces].mean(axis=1)).query(positions[faces].mean(axis=1))
+    _, nearest = KDTree(body_positions[body_faces].mean(axis=1)).query(positions[faces].mean(axis=1))
     return float(np.sum(crosses * outward[nearest]) / np.sum(np.linalg.norm(crosses, axis=1)))
 
 
