@@ -91,11 +91,20 @@ def test_two_meshes_of_a_tube_agree(builders, mode):
     assert mismatch(fine, coarse, mode=mode) <= 0.08
 
 
-@pytest.mark.parametrize("name", ["tshirt", "dress", "pants"])
+@pytest.mark.parametrize("name", ["tshirt", "dress"])
 @pytest.mark.parametrize("mode", ["canonical", "landmarks"])
 def test_two_meshes_of_a_garment_agree(garment_folder, name, mode):
     fine, coarse = load(garment_folder, f"{name}_4k"), load(garment_folder, f"{name}_1k")
-    assert mismatch(fine, coarse, mode=mode) <= 0.08
+    assert mismatch(fine, coarse, mode=mode) <= 0.08  # measured 0.014 and 0.033
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
+def test_two_meshes_of_every_garment_agree(garment_folder, mode):
+    for path in sorted(garment_folder.glob("*_1k.npz")):
+        name = path.stem.removesuffix("_1k")
+        fine, coarse = load(garment_folder, f"{name}_4k"), load(garment_folder, f"{name}_1k")
+        assert mismatch(fine, coarse, mode=mode) <= 0.08, name
 
 
 def test_canonical_axes_follow_the_rest_pose(builders):
