@@ -14,6 +14,7 @@ import argparse
 import json
 import struct
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body import lbs, retarget
@@ -31,6 +33,7 @@ CMU_FILES = ("mocap_2019.bin", "mocap_2020.bin")
 CMU_MODEL = "humanoid_CMU_V2020.xml"
 ROTATION_STEP = 2.0**-14  # [rad] rounding of stored rotations; float16 would round the root by up to 1e-3 rad
 TRANSLATION_STEP = 2.0**-16  # [m]
+DRIFT_SECONDS = 0.3  # standard deviation of the filter that tells the floor's drift from steps
 GROUND_QUANTILE = 0.05  # of the lowest point of each frame: robust to a toe that dips for a moment
 
 # Rig joint -> body of the CMU humanoid whose rotation it follows; the right side is derived.
@@ -44,6 +47,8 @@ CMU_SIDE = {
     "{i}Thumb": "thumb", "{s}FingerBase": "hand", "{s}HandFinger1": "fingers",
 }  # fmt: skip
 CMU_BONE_ENDS = {"femur": "tibia", "tibia": "foot", "humerus": "radius", "radius": "wrist"}
+CMU_ACTOR_LEG = 0.864  # [m] thigh and shank that make the standing foot slide least, the same in all walks; the XML
+# humanoid has 0.821, the bodies in the 2020 file are 1.2 times as large, and neither fits the root's steps
 CMU_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # Z up -> Y up; its rest pose is Y up
 
 # DeepMimic joints in file order with the number of columns: quaternion (w x y z) or angle about +z.
@@ -238,15 +243,14 @@ def retarget_cmu(source: Path, rig: Rig) -> dict[str, Clip]:
         body = joint_map[start]
         directions[name] = positions[index[body[0] + CMU_BONE_ENDS[body[1:]]]] - positions[index[body]]
     alignments = retarget.rest_alignments(rig.joint_names, rig.joint_rest_positions, directions)
-    source_leg = np.linalg.norm(directions["LeftUpLeg"]) + np.linalg.norm(directions["LeftLeg"])
-    scale = rig.leg_length / source_leg
     clips = {}
     for file in CMU_FILES:
         for name, fields in read_epmocap(source / file).items():
             posed = pose_humanoid(bodies, from_wxyz(fields["quaternion"]), fields["joints"])
             since_rest = CMU_WORLD @ posed @ np.swapaxes(rest, 1, 2)
             rotations = retarget.retarget(since_rest, followed, alignments, rig.parents)
-            clips[name.lower()] = Clip(rotations, scale * fields["position"] @ CMU_WORLD.T, 1 / fields["dt"])
+            translations = rig.leg_length / CMU_ACTOR_LEG * fields["position"] @ CMU_WORLD.T
+            clips[name.lower()] = Clip(rotations, translations, 1 / fields["dt"])
     return clips
 
 
@@ -301,24 +305,35 @@ def _at_uniform_times(rotations: NDArray, translations: NDArray, durations: NDAr
 # ---------------------------------------------------------------- finishing and writing
 
 
-def lowest_points(clip: Clip, rig: Rig) -> NDArray:
-    """Height of the lowest vertex of each frame [m], shape [frames]."""
+def make_lowest_point(rig: Rig) -> Callable[[NDArray, NDArray], jax.Array]:
+    """Return the function from one frame's rotations and root position to the height of its lowest vertex [m]."""
     rest, weights, indices = (jnp.asarray(x) for x in (rig.rest_positions, rig.skin_weights, rig.skin_indices))
     joints = jnp.asarray(rig.joint_rest_positions)
 
-    def lowest(frame):
-        transforms = lbs.joint_transforms(*frame, joints, rig.parents)
+    @jax.jit
+    def lowest_point(rotations, translation):
+        transforms = lbs.joint_transforms(rotations, translation, joints, rig.parents)
         return lbs.skin(rest, weights, indices, transforms)[:, 1].min()
 
-    frames = (jnp.asarray(clip.rotations, jnp.float32), jnp.asarray(clip.translations, jnp.float32))
-    return np.asarray(jax.lax.map(lowest, frames))
+    return lowest_point
 
 
-def finish(clip: Clip, rig: Rig) -> Clip:
-    """Start above the origin facing +Z, and put the floor at y = 0."""
+def finish(clip: Clip, lowest_point: Callable[[NDArray, NDArray], jax.Array], *, keeps_contact: bool) -> Clip:
+    """Start above the origin facing +Z, and put the floor at y = 0.
+
+    Args:
+        clip: A retargeted clip.
+        lowest_point: See `make_lowest_point`.
+        keeps_contact: A foot is always on the floor, so a slow drift of the lowest point is an error of the
+            source's root height; it is taken out.
+    """
     rotations, translations = retarget.start_facing_front(clip.rotations, clip.translations)
-    floor = np.quantile(lowest_points(Clip(rotations, translations, clip.fps), rig), GROUND_QUANTILE)
-    return Clip(rotations, translations - [0.0, floor, 0.0], clip.fps)
+    frames = zip(rotations.astype(np.float32), translations.astype(np.float32), strict=True)
+    lowest = np.array([float(lowest_point(*frame)) for frame in frames])
+    if keeps_contact:
+        drift = gaussian_filter1d(lowest, DRIFT_SECONDS * clip.fps, mode="nearest")
+        lowest, translations = lowest - drift, translations - drift[:, None] * [0.0, 1.0, 0.0]
+    return Clip(rotations, translations - [0.0, np.quantile(lowest, GROUND_QUANTILE), 0.0], clip.fps)
 
 
 def write_clips(path: Path, clips: dict[str, Clip], rig: Rig) -> None:
@@ -345,10 +360,15 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=DATA / "motions")
     options = parser.parse_args()
     rig = Rig.load(options.body)
-    for name, convert in (("cmu", retarget_cmu), ("deepmimic", retarget_deepmimic)):
+    lowest_point = make_lowest_point(rig)
+    sources = (("cmu", retarget_cmu, True), ("deepmimic", retarget_deepmimic, False))
+    for name, convert, keeps_contact in sources:
         source = getattr(options, name)
         if source is not None:
-            clips = {key: finish(clip, rig) for key, clip in sorted(convert(source, rig).items())}
+            clips = {
+                key: finish(clip, lowest_point, keeps_contact=keeps_contact)
+                for key, clip in sorted(convert(source, rig).items())
+            }
             write_clips(options.output / f"{name}.npz", clips, rig)
 
 
