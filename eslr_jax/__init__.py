@@ -1,3 +1,57 @@
-"""Garment simulation in JAX: message passing with Laplacian smoothing, geodesic attention, physics."""
+"""Garment simulation in JAX: message passing with Laplacian smoothing, geodesic attention, physics.
+
+The public names are loaded when they are first used; importing the package does no work.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_PUBLIC = {
+    "ModelConfig": "eslr_jax.config",
+    "SimConfig": "eslr_jax.config",
+    "TrainConfig": "eslr_jax.config",
+    "EslrError": "eslr_jax.errors",
+    "PhysicsParameters": "eslr_jax.physics.problem",
+    "SceneOptions": "eslr_jax.scene",
+    "Material": "eslr_jax.types",
+    "Trajectory": "eslr_jax.types",
+    "load_body": "eslr_jax.assets",
+    "load_garment": "eslr_jax.assets",
+    "load_model": "eslr_jax.assets",
+    "load_motion": "eslr_jax.assets",
+    "pose_body": "eslr_jax.body.motion",
+    "prepare_garment": "eslr_jax.geometry.prepare",
+    "prepare_scene": "eslr_jax.scene",
+    "rollout": "eslr_jax.rollout",
+}
+
+__all__ = ["__version__", *_PUBLIC]
+
+if TYPE_CHECKING:
+    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.config import ModelConfig, SimConfig, TrainConfig
+    from eslr_jax.errors import EslrError
+    from eslr_jax.geometry.prepare import prepare_garment
+    from eslr_jax.physics.problem import PhysicsParameters
+    from eslr_jax.rollout import rollout
+    from eslr_jax.scene import SceneOptions, prepare_scene
+    from eslr_jax.types import Material, Trajectory
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'eslr_jax' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted(__all__)

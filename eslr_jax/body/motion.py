@@ -105,7 +105,7 @@ def pose_body(
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction)
     rest, joints = shape_body(body, shape)
-    transforms = _transforms(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, body.parents)
+    transforms = joint_transforms(rotations, translations, joints, body.parents)
     return BodyMotion(
         positions=_skin_frames(rest, body.skin_weights, body.skin_indices, transforms),
         joint_transforms=transforms,
@@ -132,8 +132,24 @@ def shape_body(body: Body, shape: np.ndarray | None) -> tuple[jax.Array, jax.Arr
 
 
 @partial(jax.jit, static_argnames="parents")
-def _transforms(rotations, translations, joints, parents):
+def _joint_transforms(rotations, translations, joints, parents):
     return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(rotations, translations, joints, parents)
+
+
+def joint_transforms(
+    rotations: np.ndarray, translations: np.ndarray, joints: jax.Array, parents: tuple[int, ...]
+) -> jax.Array:
+    """Return the rest-to-posed maps of every joint in every frame, shape [frames, joints, 3, 4].
+
+    Args:
+        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
+        translations: Root positions [m], shape [frames, 3].
+        joints: Joint rest positions [m], shape [joints, 3].
+        parents: Parent of every joint; -1 is the root.
+    """
+    return _joint_transforms(
+        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, parents
+    )
 
 
 @jax.jit

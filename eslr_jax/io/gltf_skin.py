@@ -101,6 +101,10 @@ def _add_skin(builder: GlbBuilder, body: SkinnedMesh, timestep: float) -> int:
         offsets = np.asarray(body.joint_rest_positions, np.float64)
     parents = [-1] * num_joints if body.parents is None else list(body.parents)
     names = body.joint_names or [f"joint {joint}" for joint in range(num_joints)]
+    if len(names) != num_joints:
+        raise MotionError(
+            f"{body.name} has {len(names)} joint names for {num_joints} joints; they must agree"
+        )
     rotations, translations = _local_motion(body.name, transforms, offsets, parents)
     nodes = _add_joint_nodes(builder, names, parents, rotations[0], translations[0])
     roots = [node for node, parent in zip(nodes, parents, strict=True) if parent < 0]

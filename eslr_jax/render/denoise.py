@@ -13,7 +13,7 @@ _COLOR_SCALE = 0.10  # difference of radiance that is a shadow's edge rather tha
 def smooth_grain(color: np.ndarray, guide: np.ndarray) -> np.ndarray:
     """Average every pixel with the neighbours that show the same surface under the same light.
 
-    The weight of a neighbour is a Gaussian of its distance, its difference in guide and its difference in colour.
+    A neighbour weighs a Gaussian of its distance, its difference in guide and its difference in colour.
 
     Args:
         color: Noisy linear radiance, shape [height, width, channels].

@@ -125,7 +125,8 @@ def _build_scene(
     }
     description |= {lamp.name: _lamp(mitsuba, lamp, camera.target, light_angle) for lamp in _LAMPS}
     description |= {surface.name: _mesh(mitsuba, surface) for surface in surfaces}
-    return mitsuba.load_dict(description)
+    # Loaded in parallel, lights would come in any order, and the grain would change from run to run.
+    return mitsuba.load_dict(description, parallel=False)
 
 
 @contextlib.contextmanager

@@ -1,14 +1,96 @@
-"""The network as a stepper."""
+"""The network as a stepper: from a frame's problem to its answer."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import ModelConfig
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
+from eslr_jax.graph.inputs import GraphInputs, next_pass
+from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
+from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.problem import FrameProblem, pin, start_guess
 from eslr_jax.types import ClothState, Garment, Material
+
+
+def graph_inputs(
+    problem: FrameProblem, garment: Garment, material: Material, state: ClothState
+) -> GraphInputs:
+    """Return what the graph is built from; pinned vertices already carry their next target (HOOD)."""
+    contacts = problem.contacts
+    position = pin(problem, garment, state.position)
+    velocity = state.velocity * problem.timestep
+    if problem.pin_targets is not None:
+        velocity = jnp.where(garment.is_pinned[:, None], position - state.position, velocity)
+    return GraphInputs(
+        position=position,
+        velocity=velocity,
+        timestep=problem.timestep,
+        contacts=contacts,
+        body_velocity=None if contacts is None else contacts.next_points - contacts.points,
+        inertial_guess=problem.inertial_guess,
+        weight=problem.parameters.gravity * vertex_masses(garment, material),
+    )
+
+
+def predict_acceleration(
+    params: Any, garment: Garment, problem: FrameProblem, inputs: GraphInputs, material: Material, config: ModelConfig
+) -> tuple[Float[Array, "vertices 3"], Int[Array, ""]]:
+    """Integrate the network's acceleration, as the paper does, and return positions and status bits.
+
+    Source: the paper's method section, Q' = Q + A dt and X' = X + Q' dt, in HOOD's per-frame units.
+    """
+    graph = build_graph(garment, material, inputs, config)
+    output = apply_model(config, params, graph, garment)
+    velocity = inputs.velocity + scale_output(config, params, output)
+    return pin(problem, garment, inputs.position + velocity), graph.globals["status"]
+
+
+def correction_passes(
+    params: Any,
+    garment: Garment,
+    material: Material,
+    problem: FrameProblem,
+    inputs: GraphInputs,
+    config: ModelConfig,
+    *,
+    detach: bool = False,
+) -> tuple[Float[Array, "passes vertices 3"], Int[Array, ""]]:
+    """Correct the pushed-out inertial guess, pass by pass, and return every answer and status bits.
+
+    Before each pass the potential's gradient is taken at the last answer.
+
+    Args:
+        params: Weights.
+        garment: Rest mesh.
+        material: Fabric.
+        problem: The frame's problem.
+        inputs: Of `graph_inputs`.
+        config: With `output` "correction"; static.
+        detach: Stop gradients between passes, so that each is trained to do its best from where it starts.
+    """
+    graph = build_frame_graph(garment, material, inputs, config)
+    guess = start_guess(problem, garment)
+    zeros = jnp.zeros_like(guess)
+    inputs = inputs.replace(guess=guess, gradient=zeros, correction=zeros, previous_gradient=zeros)
+    encoded = encode_frame(config, params, graph, garment)
+
+    def one_pass(carry: GraphInputs, _):
+        gradient = jax.grad(potential)(carry.guess, problem, garment, material)
+        inputs = carry.replace(gradient=gradient)
+        changing = build_pass_graph(garment, material, inputs, graph)
+        output = apply_pass(config, params, encoded, changing, garment)
+        answer = pin(problem, garment, inputs.guess + scale_output(config, params, output))
+        onward = jax.lax.stop_gradient(answer) if detach else answer
+        return next_pass(inputs, onward, gradient), answer
+
+    _, answers = jax.lax.scan(one_pass, inputs, None, length=config.passes)
+    return answers, graph.globals["status"]
 
 
 def network_step(
@@ -18,6 +100,19 @@ def network_step(
     problem: FrameProblem,
     state: ClothState,
     config: ModelConfig,
-) -> Float[Array, "vertices 3"]:
-    """TODO."""
-    raise NotImplementedError
+) -> tuple[Float[Array, "vertices 3"], Int[Array, ""]]:
+    """Return the network's positions at t + 1 [m] and status bits.
+
+    Args:
+        params: Weights.
+        garment: Rest mesh.
+        material: Fabric.
+        problem: The frame's problem.
+        state: Cloth at t.
+        config: Architecture; static.
+    """
+    inputs = graph_inputs(problem, garment, material, state)
+    if config.output == "acceleration":
+        return predict_acceleration(params, garment, problem, inputs, material, config)
+    answers, status = correction_passes(params, garment, material, problem, inputs, config)
+    return answers[-1], status

@@ -91,11 +91,12 @@ def step(
         state: Cloth at t.
         config: Choice of simulator; static.
     """
+    status = jnp.int32(Status.OK)
     if config.simulator == "physics":
         start, iterations = start_guess(problem, garment), config.solver_iterations
     else:
         assert config.model is not None
-        start = network_step(params, garment, material, problem, state, config.model)
+        start, status = network_step(params, garment, material, problem, state, config.model)
         iterations = config.corrector_steps
     minimum = solve(
         problem,
@@ -109,18 +110,22 @@ def step(
     position = pin(problem, garment, minimum.position)
     weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
     report = StepReport(safe_norm(minimum.gradient.reshape(-1)) / weight, minimum.iterations)
-    return _next_state(position, problem, garment, state), report
+    return next_state(position, problem, garment, state, status), report
 
 
-def _next_state(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, state: ClothState
+def next_state(
+    position: Float[Array, "vertices 3"],
+    problem: FrameProblem,
+    garment: Garment,
+    state: ClothState,
+    status: Int[Array, ""],
 ) -> ClothState:
     """Semi-implicit Euler: the velocity that brought the cloth to `position`, and what the frame left behind."""
     load = state.friction_load
     if problem.contacts is not None:
         load = next_friction_load(position, problem, garment)
     is_finite = jnp.all(jnp.isfinite(position))
-    status = state.status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
+    status = state.status | status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
     return ClothState(
         position=position,
         velocity=(position - problem.position) / problem.timestep,

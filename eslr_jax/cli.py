@@ -1,0 +1,296 @@
+"""The command line: `eslr simulate`, `eslr assets`, `eslr info`.
+
+Results go to stdout (as JSON with `--json`), progress and messages to stderr. Exit codes: 0 done, 1 a bug, 2
+something that the user can put right.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from eslr_jax.errors import AssetError, EslrError
+
+app = tyro.extras.SubcommandApp()
+_stderr = Console(stderr=True)
+
+
+@contextlib.contextmanager
+def _progress(label: str, total: int) -> Iterator[Any]:
+    """Show a progress bar on stderr; yields a function of (done, total)."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=_stderr, transient=False) as progress:
+        task = progress.add_task(label, total=total)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _use_compile_cache() -> None:
+    """Keep compiled programs between runs: the second run of the same command starts at once."""
+    import jax
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax" / "compiled"
+    with contextlib.suppress(OSError):
+        cache.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@app.command
+def simulate(
+    garment: str = "tshirt",
+    motion: str = "cmu_016_22",
+    body: str = "anny",
+    simulator: Literal["network", "physics"] = "network",
+    model: str | None = None,
+    vertices: Literal["1k", "4k", "10k"] = "1k",
+    frames: int | None = None,
+    iterations: int = 100,
+    corrector_steps: int = 0,
+    out: Path = Path("out"),
+    pictures: bool = True,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
+
+    Args:
+        garment: Name of a bundled garment (see `eslr assets`), or a mesh file in the body's rest pose.
+        motion: Name of a bundled motion, or a motion file.
+        body: Name of a bundled body, or a body file.
+        simulator: The trained network, or the physics solver.
+        model: Name of a bundled network or an exported file; the default network if not given.
+        vertices: Resolution of a bundled garment.
+        frames: Simulate this many frames, the start included; all if not given.
+        iterations: Solver iterations per frame of the physics simulator.
+        corrector_steps: Solver iterations behind the network.
+        out: Folder to write to.
+        pictures: Render the contact sheet.
+        json_: Print the report as JSON.
+    """
+    from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+
+    out = ensure_output_dir(out)
+    _use_compile_cache()
+    if frames is not None and frames < 2:
+        raise AssetError(f"--frames {frames}: a simulation needs two frames or more")
+
+    import numpy as np
+
+    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.config import SimConfig
+    from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.rollout import raise_for_status, rollout_in_chunks
+    from eslr_jax.scene import prepare_scene
+
+    with _stderr.status("loading garment, body and motion"):
+        rig = load_body(body)
+        clip = load_motion(motion)
+        params, architecture = None, None
+        options: dict[str, Any] = {}
+        if simulator == "network":
+            model = model or default_model()
+            params, architecture = load_model(model)
+            options = {
+                "embedding_size": architecture.embedding_size,
+                "embedding_mode": architecture.embedding_mode,
+            }
+        cloth = load_garment(garment, vertices=vertices, body=rig, **options)
+        poses = pose_body(rig, clip, num_frames=frames)
+        scene = prepare_scene(cloth, poses)
+    config = SimConfig(
+        simulator=simulator,
+        model=architecture,
+        solver_iterations=iterations,
+        corrector_steps=corrector_steps,
+    )
+    with _progress("simulating", scene.num_frames - 1) as advance:
+        trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
+    raise_for_status(trajectory)
+    with _stderr.status("measuring"):
+        report = {
+            "garment": garment,
+            "motion": motion,
+            "simulator": simulator,
+            "model": model,
+            **trajectory_report(trajectory, scene),
+            "frame_ms": timing.frame_ms,
+            "compile_s": timing.compile_s,
+            **environment(),
+        }
+    positions = np.asarray(trajectory.positions)
+    with _stderr.status("writing files"):
+        _write_motion(out, positions, np.asarray(trajectory.velocities), cloth, rig, poses, report)
+    if pictures:
+        _write_sheet(out, positions, cloth, poses)
+    with atomic_write(out / "report.json") as temporary:
+        temporary.write_text(json.dumps(report, indent=2))
+    if json_:
+        print(json.dumps(report, indent=2))
+    else:
+        _print_report(report, out)
+
+
+def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: dict[str, Any]) -> None:
+    """Write the trajectory and the animated GLB."""
+    import numpy as np
+
+    from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
+    from eslr_jax.io.gltf_skin import SkinnedMesh
+    from eslr_jax.io.trajectory import write_trajectory
+
+    faces = np.asarray(cloth.faces)
+    timestep = float(poses.timestep)
+    write_trajectory(
+        out / "trajectory.npz",
+        positions=positions,
+        velocities=velocities,
+        faces=faces,
+        timestep=timestep,
+        body_positions=np.asarray(poses.positions),
+        body_faces=np.asarray(poses.faces),
+        metadata=report,
+    )
+    skinned = SkinnedMesh(
+        rest_positions=np.asarray(poses.rest_positions),
+        faces=np.asarray(poses.faces),
+        skin_weights=np.asarray(rig.skin_weights),
+        skin_indices=np.asarray(rig.skin_indices),
+        joint_transforms=np.asarray(poses.joint_transforms),
+    )
+    garment = AnimatedMesh("garment", positions, faces)
+    write_animated_glb(out / "animation.glb", [garment], timestep, skinned_body=skinned)
+
+
+def _write_sheet(out: Path, positions, cloth, poses) -> None:
+    """Render the contact sheet; without the extra `render` say so and go on."""
+    import numpy as np
+
+    from eslr_jax.errors import MissingExtraError
+    from eslr_jax.render import contact_sheet, write_png
+
+    try:
+        with _progress("rendering", 8) as advance:
+            sheet = contact_sheet(
+                np.asarray(poses.positions),
+                np.asarray(poses.faces),
+                positions,
+                np.asarray(cloth.faces),
+                on_picture=advance,
+            )
+    except MissingExtraError as error:
+        _stderr.print(f"no pictures: {error}", markup=False, highlight=False)
+        return
+    write_png(out / "sheet.png", sheet)
+
+
+def _print_report(report: dict[str, Any], out: Path) -> None:
+    """Print what a person wants to know first."""
+    table = Table(show_header=False, box=None)
+    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items())
+    rows = {
+        "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
+        "time": f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation",
+        "energy": f"{report['total']:.4f} J a frame ({terms})",
+        "stretch": f"{report['max_principal_stretch']:.3f} at most",
+    }
+    if report["penetration_max_mm"] is not None:
+        rows["penetration"] = (
+            f"{report['penetration_p999_mm']:.2f} mm (99.9 %), {report['penetration_max_mm']:.2f} mm at most, "
+            f"{report['penetrating_share'] * 100:.2f} % of vertices"
+        )
+    rows["files"] = ", ".join(str(path) for path in sorted(out.iterdir()) if path.is_file())
+    for label, text in rows.items():
+        table.add_row(label, text)
+    Console().print(table, markup=False, highlight=False)
+
+
+@app.command
+def assets(
+    kind: Literal["all", "body", "garment", "motion", "model"] = "all",
+    verify: bool = False,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """List what is in the box.
+
+    Args:
+        kind: Only this kind.
+        verify: Compare every file with its checksum.
+        json_: Print as JSON.
+    """
+    import dataclasses
+
+    from eslr_jax.assets.catalog import is_intact, list_assets
+
+    chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
+    if verify:
+        damaged = [asset.file for asset in chosen if not is_intact(asset)]
+        if damaged:
+            raise AssetError(f"damaged: {', '.join(sorted(set(damaged)))}; install the package again")
+    if json_:
+        print(json.dumps([dataclasses.asdict(asset) for asset in chosen], indent=2))
+        return
+    table = Table("kind", "name", "what", "licence", box=None)
+    for asset in chosen:
+        table.add_row(asset.kind, asset.name, asset.description, asset.licence)
+    Console().print(table, markup=False)
+
+
+@app.command
+def info(
+    model: str = "eslr-15",
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Show an architecture and its number of parameters.
+
+    Args:
+        model: Name of an architecture, or of a bundled network, or an exported file.
+        json_: Print as JSON.
+    """
+    from eslr_jax.assets import asset_names, load_model
+    from eslr_jax.config import to_dict
+    from eslr_jax.models.registry import MODELS, count_parameters, init_model
+
+    if model in MODELS:
+        config = MODELS[model]
+        params = init_model(config)
+    elif model in asset_names("model") or Path(model).suffix:
+        params, config = load_model(model)
+    else:
+        known = ", ".join([*MODELS, *asset_names("model")])
+        raise AssetError(f"no model named {model!r}: there are {known}; a path to a file works too")
+    values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
+    if json_:
+        print(json.dumps(values, indent=2))
+        return
+    print(f"{model}: {values['parameters']:,} parameters")
+    for name, value in values["config"].items():
+        print(f"  {name} = {value}")
+
+
+def main() -> None:
+    """Run the command line."""
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    try:
+        app.cli(prog="eslr")
+    except EslrError as error:
+        _stderr.print(f"eslr: {error}", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        _stderr.print("eslr: interrupted", markup=False)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

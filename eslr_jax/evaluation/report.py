@@ -1,0 +1,68 @@
+"""The report of a simulation, as plain values."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.evaluation.metrics import FrameMeasures, measure_frames
+from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.types import Scene, Trajectory
+
+_PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
+
+
+def trajectory_report(
+    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters | None = None
+) -> dict[str, Any]:
+    """Measure a trajectory.
+
+    Returns:
+        Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
+        vertices that penetrate; without a body the penetration values are None.
+    """
+    measures: FrameMeasures = jax.device_get(
+        measure_frames(trajectory, scene, parameters or PhysicsParameters())
+    )
+    is_real = np.asarray(scene.garment.vertex_mask)
+    positions = np.asarray(trajectory.positions)[:, is_real]
+    terms = {name: float(np.mean(values)) for name, values in measures.terms._asdict().items()}
+    report: dict[str, Any] = {
+        "finite": bool(np.isfinite(positions).all()),
+        "num_frames": trajectory.num_frames,
+        "num_vertices": int(is_real.sum()),
+        "terms": terms,
+        "total": sum(terms.values()),
+        "max_principal_stretch": float(measures.max_stretch.max()),
+        "start_principal_stretch": float(
+            np.max(principal_stretches(trajectory.positions[0], scene.garment)[0])
+        ),
+        "penetration_p999_mm": None,
+        "penetration_max_mm": None,
+        "penetrating_share": None,
+        "rms_speed_m_s": float(measures.speed.mean()),
+        "residual_median": float(np.median(trajectory.residuals[1:])),
+        "iterations_mean": float(np.mean(trajectory.iterations[1:])),
+    }
+    if measures.distances is not None:
+        depth = -measures.distances[:, is_real]
+        report["penetration_p999_mm"] = float(max(np.quantile(depth, 0.999), 0.0) * 1e3)
+        report["penetration_max_mm"] = float(max(depth.max(), 0.0) * 1e3)
+        report["penetrating_share"] = float((depth > 0).mean())
+    return report
+
+
+def environment() -> dict[str, Any]:
+    """Return the device and the versions that a figure was measured with."""
+    device = jax.devices()[0]
+    kind = device.device_kind if device.platform != "cpu" else f"{platform.machine()} CPU"
+    return {
+        "device": f"{device.platform}: {kind}",
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
+        | {"python": platform.python_version()},
+    }

@@ -1,0 +1,123 @@
+"""What training samples from: garments in one bucket, and every frame of a split's clips."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.body import lbs
+from eslr_jax.body.motion import Motion, joint_transforms
+from eslr_jax.body.retarget import abduct_arms, resample
+from eslr_jax.config import TrainConfig
+from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.padding import common_bucket, garment_bucket, pad_garment
+from eslr_jax.geometry.prepare import to_device
+from eslr_jax.types import Body, BodySurface, Garment
+
+_FPS = 30.0
+_REACH = 0.15  # [m] of rest-pose body faces around the rest garments
+
+
+@struct.dataclass
+class TrainingData:
+    """Constant arrays of a training run; garments are stacked along a leading axis."""
+
+    garments: Garment
+    surface: BodySurface  # body faces that any of the garments can touch
+    surface_rest: Float[Array, "surface_vertices 3"]  # [m]
+    surface_skin_weights: Float[Array, "surface_vertices influences"]
+    surface_skin_indices: Int[Array, "surface_vertices influences"]
+    joint_transforms: Float[Array, "frames joints 3 4"]  # all clips, end to end
+    frames_left: Int[Array, " frames"]  # frames of the same clip after this one
+    start_frames: Int[Array, " starts"]  # frames that another one follows
+
+    @property
+    def num_garments(self) -> int:
+        """Number of stacked garments."""
+        return self.garments.faces.shape[0]
+
+    def garment(self, index: Int[Array, ""]) -> Garment:
+        """Return one of the garments."""
+        return jax.tree.map(lambda leaf: leaf[index], self.garments)
+
+    def transforms(self, frame: Int[Array, ""], yaw: Float[Array, ""]) -> Float[Array, "joints 3 4"]:
+        """Return joint transforms of a frame, the whole scene turned about the vertical axis by `yaw` [rad]."""
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
+        turn = jnp.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
+        return turn @ self.joint_transforms[frame]
+
+    def body(self, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "surface_vertices 3"]:
+        """Return the posed body surface [m]."""
+        return lbs.skin(
+            self.surface_rest, self.surface_skin_weights, self.surface_skin_indices, transforms
+        )
+
+
+def clips_of(split: str) -> list[str]:
+    """Return the clips of a split.
+
+    Raises:
+        ConfigError: There is no such split, or it is empty.
+    """
+    clips = load_splits()["clips"]
+    if split not in clips or not clips[split]:
+        raise ConfigError(f"no clips in split {split!r}; there are {', '.join(name for name in clips if clips[name])}")
+    return clips[split]
+
+
+def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
+    """Load the garments at one resolution and the clips of a training run.
+
+    Raises:
+        ConfigError: The split is unknown or empty, or no clip has two frames.
+        AssetError: A garment does not exist.
+    """
+    body = load_body()
+    options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
+    garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
+    bucket = common_bucket([garment_bucket(garment) for garment in garments])
+    stacked = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *[to_device(pad_garment(garment, bucket)) for garment in garments]
+    )
+    surface = prepare_surface(np.asarray(body.rest_positions), _faces_near(body, garments))
+    motions = [load_motion(clip) for clip in clips_of(config.split)]
+    rotations, translations, frames_left = _join_clips(motions)
+    return TrainingData(
+        garments=stacked,
+        surface=surface,
+        surface_rest=body.rest_positions[surface.vertex_ids],
+        surface_skin_weights=body.skin_weights[surface.vertex_ids],
+        surface_skin_indices=body.skin_indices[surface.vertex_ids],
+        joint_transforms=joint_transforms(
+            rotations, translations, body.joint_rest_positions, body.parents
+        ),
+        frames_left=jnp.asarray(frames_left, jnp.int32),
+        start_frames=jnp.asarray(np.flatnonzero(frames_left), jnp.int32),
+    )
+
+
+def _faces_near(body: Body, garments: list[Garment]) -> np.ndarray:
+    """Return the obstacle faces near any garment in the rest pose."""
+    points = np.concatenate([np.asarray(g.rest_positions)[np.asarray(g.vertex_mask)] for g in garments])
+    distance, _ = cKDTree(points).query(np.asarray(body.rest_positions), distance_upper_bound=_REACH)
+    faces = np.asarray(body.faces)
+    return faces[np.isfinite(distance)[faces].any(axis=1) & np.asarray(body.is_obstacle)]
+
+
+def _join_clips(motions: list[Motion]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Resample clips and put them end to end."""
+    rotations, translations, frames_left = [], [], []
+    for motion in motions:
+        turned, moved = resample(motion.rotations, motion.translations, motion.fps, _FPS)
+        rotations.append(abduct_arms(turned, motion.joint_names))
+        # Each clip starts above the origin: far from it float32 positions lose digits.
+        translations.append(moved - moved[:1] * [1.0, 0.0, 1.0])
+        frames_left.append(np.arange(len(turned))[::-1])
+    return np.concatenate(rotations), np.concatenate(translations), np.concatenate(frames_left)

@@ -1,0 +1,60 @@
+"""The physics loss: the incremental potential of what the network answers."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from eslr_jax.config import TrainConfig
+from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.potential import PotentialTerms, potential_terms
+from eslr_jax.physics.problem import FrameProblem, start_guess
+from eslr_jax.simulate.network import correction_passes, graph_inputs, predict_acceleration
+from eslr_jax.types import ClothState, Garment, Material
+
+_FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by this
+
+
+class LossReport(NamedTuple):
+    """What one evaluation of the loss shows."""
+
+    answer: Float[Array, "vertices 3"]  # positions at t + 1 [m]
+    terms: PotentialTerms  # at the answer [J]
+    start: Float[Array, ""]  # potential at the pushed-out inertial guess [J]
+
+
+def physics_loss(
+    params: Any,
+    garment: Garment,
+    material: Material,
+    problem: FrameProblem,
+    state: ClothState,
+    config: TrainConfig,
+) -> tuple[Float[Array, ""], LossReport]:
+    """Return the loss, without unit, and its report.
+
+    Args:
+        params: Weights.
+        garment: Rest mesh.
+        material: Fabric.
+        problem: The frame's problem.
+        state: Cloth at t.
+        config: Architecture and which passes count; static.
+    """
+    model = config.model
+    inputs = graph_inputs(problem, garment, material, state)
+    if model.output == "acceleration":
+        answer, _ = predict_acceleration(params, garment, problem, inputs, material, model)
+        answers = answer[None]
+    else:
+        answers, _ = correction_passes(params, garment, material, problem, inputs, model, detach=True)
+    terms = jax.vmap(potential_terms, in_axes=(0, None, None, None))(answers, problem, garment, material)
+    energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
+    energy = energies[-1] if config.pass_weights == "last" else jnp.mean(energies)
+    scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
+    start = sum(potential_terms(start_guess(problem, garment), problem, garment, material))
+    last = PotentialTerms(*(jnp.broadcast_to(term, answers.shape[:1])[-1] for term in terms))
+    return energy / scale, LossReport(answers[-1], last, start)  # type: ignore[arg-type]

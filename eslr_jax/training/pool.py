@@ -1,0 +1,120 @@
+"""A pool of trajectories that training keeps alive: the network learns on the states it makes itself."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.body import lbs
+from eslr_jax.config import TrainConfig
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.training.data import TrainingData
+from eslr_jax.types import ClothState, Garment, Material
+
+_DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD)
+_PUSH_OUT_STEPS = 3
+_CLEARANCE = 2e-3  # [m], the collision thickness
+
+
+@struct.dataclass
+class Slot:
+    """One live trajectory; stacked along a leading axis in the pool."""
+
+    state: ClothState
+    frame: Int[Array, ""]  # index into the joined clips
+    yaw: Float[Array, ""]  # turn of the whole scene [rad]
+    age: Int[Array, ""]  # frames since the start
+    material: Material
+    is_done: Bool[Array, ""]  # start anew before the next use
+
+
+def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
+    """Return a pool whose slots all start anew at their first use."""
+    count = data.num_garments * slots_per_garment
+    vertices = data.garments.rest_positions.shape[1]
+    zeros = jnp.zeros((count, vertices, 3))
+    return Slot(
+        state=ClothState(
+            position=zeros,
+            velocity=jnp.zeros_like(zeros),  # every leaf its own buffer: the state is donated
+            friction_load=jnp.zeros((count, vertices)),
+            frame=jnp.zeros(count, jnp.int32),
+            status=jnp.zeros(count, jnp.int32),
+            first_bad_frame=jnp.full(count, -1, jnp.int32),
+        ),
+        frame=jnp.zeros(count, jnp.int32),
+        yaw=jnp.zeros(count),
+        age=jnp.zeros(count, jnp.int32),
+        material=jax.tree.map(lambda leaf: jnp.full(count, leaf, jnp.float32), COTTON),
+        is_done=jnp.ones(count, bool),
+    )
+
+
+def start_trajectory(
+    key: Array, data: TrainingData, garment: Garment, config: TrainConfig
+) -> Slot:
+    """Start at a random frame of a random clip: skinned, noisy, pushed out of the body.
+
+    Args:
+        key: Random key.
+        data: Clips and body.
+        garment: Whose trajectory it is.
+        config: Noise and materials; static.
+    """
+    keys = jax.random.split(key, 4)
+    frame = data.start_frames[jax.random.randint(keys[0], (), 0, data.start_frames.shape[0])]
+    yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
+    transforms, later = data.transforms(frame, yaw), data.transforms(frame + 1, yaw)
+    skinned = skin(garment, transforms)
+    velocity = (skin(garment, later) - skinned) * 30.0
+    noise = config.noise * jax.random.normal(keys[2], skinned.shape)
+    position = skinned + jnp.where(garment.is_pinned[:, None], 0.0, noise)
+    body = data.body(transforms)
+
+    def project(_, position):
+        contacts = find_contacts(position, body, body, data.surface)
+        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
+        lift = jnp.where(contacts.is_near & ~garment.is_pinned, jnp.maximum(_CLEARANCE - height, 0.0), 0.0)
+        return position + lift[:, None] * contacts.normals
+
+    position = jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)
+    state = ClothState(
+        position=position,
+        velocity=velocity,
+        friction_load=jnp.zeros(position.shape[0]),
+        frame=jnp.int32(0),
+        status=jnp.int32(0),
+        first_bad_frame=jnp.int32(-1),
+    )
+    material = sample_material(keys[3], config.material_probability)
+    return Slot(state, frame.astype(jnp.int32), yaw, jnp.int32(0), material, jnp.zeros((), bool))
+
+
+def skin(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
+    """Return the garment carried by the joints [m]."""
+    return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
+
+
+def sample_material(key: Array, probability: float) -> Material:
+    """Return a random fabric from HOOD's training ranges with `probability`, else cotton."""
+    keys = jax.random.split(key, 5)
+
+    def uniform(k, bounds):
+        return jax.random.uniform(k, minval=bounds[0], maxval=bounds[1])
+
+    def log_uniform(k, bounds):
+        return jnp.exp(uniform(k, (jnp.log(bounds[0]), jnp.log(bounds[1]))))
+
+    drawn = Material(
+        density=uniform(keys[0], _DENSITY_RANGE),
+        lame_mu=log_uniform(keys[1], LAME_MU_RANGE),
+        lame_lambda=uniform(keys[2], LAME_LAMBDA_RANGE),
+        bending_stiffness=log_uniform(keys[3], BENDING_RANGE),
+        thickness=jnp.float32(COTTON.thickness),
+    )
+    is_random = jax.random.uniform(keys[4]) < probability
+    return jax.tree.map(lambda new, old: jnp.where(is_random, new, old).astype(jnp.float32), drawn, COTTON)
