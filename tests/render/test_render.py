@@ -1,0 +1,185 @@
+"""Pictures: what is where, what is refused; looks are judged by eye."""
+
+import os
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from eslr_jax.errors import AssetError, ConfigError, MeshError, MissingExtraError, NonFiniteError
+from eslr_jax.render import contact_sheet, render_frame, render_frames, write_png, write_video
+from eslr_jax.render.camera import parse_angle, place_camera
+from eslr_jax.render.denoise import smooth_grain
+
+SMALL = {"size": (48, 64), "samples": 4}
+
+
+@pytest.fixture
+def scene():
+    """A ball as body and a smaller one as cloth on its +X side, three frames moving along +Z."""
+    body = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    cloth = trimesh.creation.icosphere(subdivisions=2, radius=0.2)
+    steps = np.arange(3)[:, None, None] * np.array([0.0, 0.0, 0.5])
+    return {
+        "body_positions": np.asarray(body.vertices) + steps,
+        "body_faces": np.asarray(body.faces),
+        "garment_positions": np.asarray(cloth.vertices) + np.array([0.5, 0.0, 0.0]) + steps,
+        "garment_faces": np.asarray(cloth.faces),
+    }
+
+
+def first_frame(scene):
+    return {name: value[0] if name.endswith("positions") else value for name, value in scene.items()}
+
+
+def blue_columns(picture):
+    """Mean column of the pixels where the blue cloth is, relative to the picture's width."""
+    pixels = picture.astype(int)
+    is_blue = pixels[..., 2] - pixels[..., 0] > 25
+    return np.nonzero(is_blue)[1].mean() / picture.shape[1]
+
+
+def test_render_frame_shows_the_cloth_on_the_right_side_of_the_body(scene):
+    pytest.importorskip("mitsuba")
+    front = render_frame(**first_frame(scene), camera="front", **SMALL)
+    back = render_frame(**first_frame(scene), camera="back", **SMALL)
+    assert front.shape == (64, 48, 3)
+    assert front.dtype == np.uint8
+    # Seen from +Z with Y up, +X is on the right; seen from -Z it is on the left.
+    assert blue_columns(front) > 0.6
+    assert blue_columns(back) < 0.4
+
+
+def test_render_frame_is_the_same_on_every_run_and_without_a_body(scene):
+    pytest.importorskip("mitsuba")
+    arguments = first_frame(scene) | {"body_positions": None, "body_faces": None}
+    np.testing.assert_array_equal(render_frame(**arguments, **SMALL), render_frame(**arguments, **SMALL))
+
+
+def test_render_frame_paints_vertex_colors(scene):
+    pytest.importorskip("mitsuba")
+    arguments = first_frame(scene)
+    colors = np.tile([0.1, 0.8, 0.1], (len(arguments["garment_positions"]), 1))
+    picture = render_frame(**arguments, vertex_colors=colors, **SMALL).astype(int)
+    assert ((picture[..., 1] - picture[..., 0] > 40) & (picture[..., 1] - picture[..., 2] > 40)).sum() > 20
+
+
+def test_render_frames_follow_the_body(scene):
+    pytest.importorskip("mitsuba")
+    first, last = render_frames(**scene, frame_indices=[0, 2], **SMALL)
+    # The subject moves as a whole, so the camera sees the same picture but for noise of the light.
+    assert np.abs(first.astype(int) - last).mean() < 3
+
+
+def test_contact_sheet_tiles_frames_and_reports_progress(scene):
+    pytest.importorskip("mitsuba")
+    done = []
+    sheet = contact_sheet(
+        **scene, num_frames=8, columns=2, on_picture=lambda *counts: done.append(counts), **SMALL
+    )
+    assert sheet.shape == (2 * 64 + 4, 2 * 48 + 4, 3)  # three frames exist
+    assert done == [(1, 3), (2, 3), (3, 3)]
+    assert (sheet[68:, 52:] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"camera": "top"}, ConfigError),
+        ({"camera": float("nan")}, ConfigError),
+        ({"size": (0, 10)}, ConfigError),
+        ({"samples": 0}, ConfigError),
+        ({"garment_positions": np.full((162, 3), np.nan)}, NonFiniteError),
+        ({"garment_faces": np.array([[0, 1, 999]])}, MeshError),
+        ({"garment_faces": np.zeros((0, 3), int)}, MeshError),
+        ({"body_faces": None}, MeshError),
+        ({"vertex_colors": np.zeros((3, 3))}, MeshError),
+    ],
+)
+def test_render_frame_names_what_is_wrong(scene, change, error):
+    pytest.importorskip("mitsuba")
+    with pytest.raises(error):
+        render_frame(**(first_frame(scene) | SMALL | change))
+
+
+def test_contact_sheet_refuses_to_be_empty(scene):
+    with pytest.raises(ConfigError, match="empty"):
+        contact_sheet(**scene, num_frames=0)
+
+
+def test_rendering_without_the_extra_names_it(scene, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(MissingExtraError, match=r'pip install "eslr-jax\[render\]"'):
+        render_frame(**first_frame(scene))
+
+
+def test_camera_sees_the_whole_cylinder_from_anywhere():
+    for angle in (0.0, 1.0, 4.0):
+        for half_height, radius, aspect in ((0.9, 0.4, 0.7), (0.1, 1.0, 1.0), (0.5, 0.5, 2.0)):
+            camera = place_camera(np.array([1.0, 2.0, 3.0]), half_height, radius, angle, aspect)
+            forward = (camera.target - camera.origin) / np.linalg.norm(camera.target - camera.origin)
+            right = np.cross(forward, [0.0, 1.0, 0.0])
+            right /= np.linalg.norm(right)
+            turns = np.linspace(0, 2 * np.pi, 60)
+            for height in (-half_height, half_height):
+                ring = np.stack([radius * np.cos(turns), np.full(60, height), radius * np.sin(turns)], 1)
+                ray = ring + camera.target - camera.origin
+                depth = ray @ forward
+                limit = np.tan(camera.view_angle / 2)
+                assert (np.abs(ray @ np.cross(right, forward)) < depth * limit).all()
+                assert (np.abs(ray @ right) < depth * limit * aspect).all()
+
+
+def test_camera_names_stand_where_documented():
+    assert parse_angle("front") == 0.0
+    assert parse_angle("side") == pytest.approx(parse_angle(90.0))
+    side = place_camera(np.zeros(3), 1.0, 0.5, parse_angle("side"), 1.0)
+    assert side.origin[0] > 2.0
+    assert abs(side.origin[2]) < 1e-9
+
+
+def test_smooth_grain_keeps_constants_and_edges_and_removes_noise():
+    rng = np.random.default_rng(0)
+    guide = np.zeros((32, 32, 3), np.float32)
+    guide[:, 16:] = 1.0
+    clean = np.where(guide > 0, 0.7, 0.3).astype(np.float32)
+    np.testing.assert_allclose(smooth_grain(clean, guide), clean, atol=1e-6)
+    noisy = clean + rng.normal(scale=0.03, size=clean.shape).astype(np.float32)
+    assert np.std(smooth_grain(noisy, guide) - clean) < 0.4 * np.std(noisy - clean)
+
+
+def test_write_png_round_trips(tmp_path):
+    image_module = pytest.importorskip("PIL.Image")
+    picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    write_png(tmp_path / "a.png", picture)
+    with image_module.open(tmp_path / "a.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), picture)
+
+
+@pytest.mark.parametrize(
+    "picture", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)]
+)
+def test_write_png_refuses_what_is_no_picture(tmp_path, picture):
+    pytest.importorskip("PIL")
+    with pytest.raises(AssetError, match="not uint8"):
+        write_png(tmp_path / "a.png", picture)
+    assert not os.listdir(tmp_path)
+
+
+def test_write_video_holds_every_frame(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    frames = [np.full((49, 65, 3), value, np.uint8) for value in (0, 80, 160, 240)]
+    write_video(tmp_path / "a.mp4", frames, fps=10)
+    num_frames, seconds = ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4"))
+    assert num_frames == 4
+    assert seconds == pytest.approx(0.4, abs=0.05)
+    assert os.listdir(tmp_path) == ["a.mp4"]
+
+
+@pytest.mark.parametrize("frames", [[], [np.zeros((4, 4, 3), np.uint8), np.zeros((6, 4, 3), np.uint8)]])
+def test_write_video_refuses_no_frames_and_mixed_sizes(tmp_path, frames):
+    pytest.importorskip("imageio_ffmpeg")
+    with pytest.raises(AssetError):
+        write_video(tmp_path / "a.mp4", frames, fps=10)
+    assert not os.listdir(tmp_path)
