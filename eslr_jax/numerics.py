@@ -111,6 +111,19 @@ def _gather_component_backward(incidence, cotangents):
 _gather_component.defvjp(_gather_component_forward, _gather_component_backward)
 
 
+def scatter_corners(
+    values: Float[Array, "items corners"], incidence: Int[Array, "rows degree"]
+) -> Float[Array, " rows"]:
+    """Sum over every row the values of the corners that name it; the transpose of `gather_corners`.
+
+    Args:
+        values: One value per corner of every item.
+        incidence: Flat corner positions per row, see `gather_corners`.
+    """
+    padded = jnp.concatenate([values.T.ravel(), jnp.zeros(1, values.dtype)])
+    return sum(padded[incidence[:, k]] for k in range(incidence.shape[1]))  # type: ignore[return-value]
+
+
 def sum_incident(
     values: Float[Array, "items features"], incidence: Int[Array, "rows degree"], *, corners: int
 ) -> Float[Array, "rows features"]:

@@ -1,8 +1,8 @@
 """Linear blend skinning: joint rotations to posed points, with gradients that exist at zero rotation.
 
-Rotations are local axis-angle vectors in world-aligned rest axes: with all of them zero the body is in its rest
-pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some GPUs keeps
-ten bits and moves a hand by millimetres.
+Rotations are local axis-angle vectors in world-aligned rest axes: with all of them zero the body is in its
+rest pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some GPUs
+keeps ten bits, which moves a hand by millimetres.
 
 Source: Loper et al. 2015 (doi:10.1145/2816795.2818013), section 3, without pose blend shapes.
 """
@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-SERIES_BELOW = 1e-2  # [rad^2]; there the truncated series below are exact to float32, the closed forms are not
+SERIES_BELOW = (
+    1e-2  # [rad^2]; there the truncated series below are exact to float32, the closed forms are not
+)
 
 
-def rotation_matrix(rotation: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def rotation_matrix(rotation: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """Return the matrix I + a K + b K^2 of an axis-angle vector, smooth at zero.
 
     K is the cross-product matrix of `rotation`, a = sin(t)/t, b = (1 - cos(t))/t^2, t = |rotation|.
@@ -47,14 +49,14 @@ def rotation_matrix(rotation: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 def joint_transforms(
     rotations: Float[Array, "joints 3"],
-    translation: Float[Array, "3"],
+    translation: Float[Array, " 3"],
     joint_rest_positions: Float[Array, "joints 3"],
     parents: tuple[int, ...],
 ) -> Float[Array, "joints 3 4"]:
     """Return the affine map of every joint from rest points to posed points.
 
-    With parent p, local rotation R_j and rest position r_j: G_j = G_p R_j, x_j = x_p + G_p (r_j - r_p), and the
-    map is p -> G_j p + (x_j - G_j r_j); the root has G = R, x = `translation`.
+    With parent p, local rotation R_j and rest position r_j: G_j = G_p R_j, x_j = x_p + G_p (r_j - r_p), and
+    the map of a point q is G_j q + (x_j - G_j r_j); the root has G = R, x = `translation`.
 
     Args:
         rotations: Local axis-angle rotations relative to the rest pose [rad], shape [joints, 3].
@@ -98,13 +100,15 @@ def skin(
     """
     joints = jnp.arange(transforms.shape[0], dtype=indices.dtype)
     is_joint = indices[:, :, None] == joints[None, None, :]
-    dense = jnp.sum(jnp.where(is_joint, weights[:, :, None], 0.0), axis=1)  # a product beats gathers, on every device
+    dense = jnp.sum(
+        jnp.where(is_joint, weights[:, :, None], 0.0), axis=1
+    )  # a product beats gathers, on every device
     blended = _product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
 
 def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Joints with a parent and those parents, one pair of arrays per depth of the tree, from the root outwards."""
+    """Joints that have a parent, and those parents: one pair of arrays per depth, from the root outwards."""
     depths: list[int] = []
     for parent in parents:
         depths.append(0 if parent < 0 else depths[parent] + 1)

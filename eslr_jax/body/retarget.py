@@ -81,9 +81,9 @@ def retarget(
 ) -> NDArray:
     """Return the rig's local rotations that follow a source skeleton's global ones.
 
-    Joint j of the rig turns by G_j = D_s A_j: first from its own rest bone onto the source's (A_j), then as the
-    source joint s turned since its rest pose (D_s). So limbs point where the source's point, whatever the two
-    rest poses.
+    Joint j of the rig turns by G_j = D_s A_j: first from its own rest bone onto the source's (A_j), then as
+    the source joint s turned since its rest pose (D_s). So limbs point where the source's point, whatever the
+    two rest poses.
 
     Args:
         source_rotations: Global rotation of each source joint since its rest pose, in the rig's axes, shape
@@ -123,13 +123,11 @@ def leg_length(joint_names: Sequence[str], joint_rest_positions: NDArray) -> flo
     return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
-def abduct_arms(
-    rotations: NDArray, joint_names: Sequence[str], degrees: float = ARM_ABDUCTION
-) -> NDArray:
+def abduct_arms(rotations: NDArray, joint_names: Sequence[str], degrees: float = ARM_ABDUCTION) -> NDArray:
     """Return the motion with both arms lifted sideways about the chest's front axis.
 
-    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits open
-    for a garment.
+    Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
+    open for a garment.
 
     Args:
         rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
@@ -207,9 +205,7 @@ def interpolate(
     return turned, CubicSpline(times, translations)(new_times)
 
 
-def start_facing_front(
-    rotations: NDArray, translations: NDArray
-) -> tuple[NDArray, NDArray]:
+def start_facing_front(rotations: NDArray, translations: NDArray) -> tuple[NDArray, NDArray]:
     """Return the motion moved so that the root starts above the origin and faces +Z.
 
     Args:

@@ -38,7 +38,7 @@ def measure_frames(trajectory: Trajectory, scene: Scene, parameters: PhysicsPara
     def measure(load, frame):
         position, velocity, answer, inputs = frame
         state = scene.start.replace(position=position, velocity=velocity, friction_load=load)
-        problem = frame_problem(state, inputs, scene.surface, scene.timestep, parameters)
+        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
         terms = potential_terms(answer, problem, garment, scene.material)
         terms = PotentialTerms(*(jnp.asarray(term, answer.dtype) for term in terms))
         stretch = jnp.max(principal_stretches(answer, garment)[0])

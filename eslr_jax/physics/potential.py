@@ -48,7 +48,7 @@ def potential_terms(
     if contacts is not None:
         assert problem.friction_load is not None
         collision = collision_energy(
-            position, contacts, garment, parameters.collision_stiffness, parameters.collision_thickness
+            position, contacts, garment, parameters.collision_stiffness, problem.collision_thickness
         )
         friction = friction_energy(
             position,
@@ -82,7 +82,7 @@ def next_friction_load(
     assert problem.contacts is not None
     parameters = problem.parameters
     return contact_forces(
-        position, problem.contacts, garment, parameters.collision_stiffness, parameters.collision_thickness
+        position, problem.contacts, garment, parameters.collision_stiffness, problem.collision_thickness
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.collision import penetration
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import FrameProblem
@@ -23,7 +24,7 @@ def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " ver
     modulus = material.thickness * (material.lame_lambda + 2.0 * material.lame_mu)
     is_real = garment.rest_areas > 0
     scale = jnp.where(is_real, modulus / (4.0 * jnp.where(is_real, garment.rest_areas, 1.0)), 0.0)
-    return jnp.zeros(garment.vertex_areas.shape, squared.dtype).at[garment.faces].add(scale[:, None] * squared)
+    return scatter_corners(scale[:, None] * squared, garment.face_incidence)
 
 
 def hessian_diagonal(
@@ -38,7 +39,7 @@ def hessian_diagonal(
     if problem.contacts is not None:
         assert problem.friction_load is not None
         parameters = problem.parameters
-        depth = penetration(position, problem.contacts, parameters.collision_thickness)
+        depth = penetration(position, problem.contacts, problem.collision_thickness)
         slip = parameters.friction_speed * problem.timestep
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * parameters.collision_stiffness * garment.vertex_areas * depth

@@ -8,6 +8,8 @@ from jaxtyping import Array, Float
 
 from eslr_jax.types import ClothState, Contacts, Garment
 
+_LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
+
 
 @struct.dataclass
 class PhysicsParameters:
@@ -16,7 +18,7 @@ class PhysicsParameters:
     gravity: Float[Array, ""] | float = 9.81  # [m/s^2], along -y
     collision_stiffness: Float[Array, ""] | float = 3.5e7
     """[J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt."""
-    collision_thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD)
+    collision_thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD), see `contact_thickness`
     friction_coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
     friction_speed: Float[Array, ""] | float = 9e-4
     """[m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5."""
@@ -32,10 +34,23 @@ class FrameProblem:
     pin_targets: Float[Array, "vertices 3"] | None  # positions of pinned vertices at t + 1; None: no pins
     contacts: Contacts | None  # None: no body in the scene
     friction_load: Float[Array, " vertices"] | None  # normal force at t [N]
+    collision_thickness: Float[Array, ""] | None  # of `contact_thickness` [m]
     parameters: PhysicsParameters
 
 
+def contact_thickness(garment: Garment, parameters: PhysicsParameters) -> Float[Array, ""]:
+    """Return the distance that vertices keep from the body [m].
+
+    Only vertices collide. Between two of them a straight edge of length l dips l^2 / (8 r) towards a limb of
+    radius r, so that much is added to the thickness: at 27 mm spacing (1k vertices) 1.8 mm, at 13 mm 0.4 mm.
+    """
+    mean_area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
+    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_area  # of equilateral triangles, two per vertex
+    return parameters.collision_thickness + squared_edge / (8.0 * _LIMB_RADIUS)
+
+
 def make_problem(
+    garment: Garment,
     state: ClothState,
     contacts: Contacts | None,
     pin_targets: Float[Array, "vertices 3"] | None,
@@ -45,6 +60,7 @@ def make_problem(
     """Collect what one frame's potential depends on.
 
     Args:
+        garment: Rest mesh.
         state: Cloth at time t.
         contacts: Nearest body points of every vertex, or None without a body.
         pin_targets: Where pinned vertices are at t + 1, or None without pins.
@@ -58,6 +74,7 @@ def make_problem(
         pin_targets=pin_targets,
         contacts=contacts,
         friction_load=None if contacts is None else state.friction_load,
+        collision_thickness=None if contacts is None else contact_thickness(garment, parameters),
         parameters=parameters,
     )
 
@@ -82,7 +99,7 @@ def push_out(
     if contacts is None:
         return position
     height = jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=-1)
-    lift = jnp.maximum(problem.parameters.collision_thickness - height, 0.0)
+    lift = jnp.maximum(problem.collision_thickness - height, 0.0)
     lift = jnp.where(contacts.is_near, lift, 0.0)
     return pin(problem, garment, position + lift[:, None] * contacts.next_normals)
 

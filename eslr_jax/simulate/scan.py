@@ -56,7 +56,7 @@ def scan_frames(
     """
 
     def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
-        problem = frame_problem(state, frame, scene.surface, scene.timestep, parameters)
+        problem = frame_problem(scene.garment, state, frame, scene.surface, scene.timestep, parameters)
         report: StepReport
         state, report = step(params, scene.garment, scene.material, problem, state, config)
         return state, Frames(state.position, state.velocity, report.residual, report.iterations)

@@ -36,6 +36,7 @@ class StepReport(NamedTuple):
 
 
 def frame_problem(
+    garment: Garment,
     state: ClothState,
     frame: FrameInput,
     surface: BodySurface | None,
@@ -48,7 +49,7 @@ def frame_problem(
         assert frame.body is not None
         assert frame.next_body is not None
         contacts = find_contacts(state.position, frame.body, frame.next_body, surface)
-    return make_problem(state, contacts, frame.pin_targets, timestep, parameters)
+    return make_problem(garment, state, contacts, frame.pin_targets, timestep, parameters)
 
 
 def solve(

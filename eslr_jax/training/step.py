@@ -133,7 +133,7 @@ def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConf
     transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
     frame = FrameInput(data.body(transforms), data.body(later), skin(garment, later))
     parameters = PhysicsParameters(collision_stiffness=config.collision_stiffness)
-    problem = frame_problem(slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters)
+    problem = frame_problem(garment, slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters)
     return jax.lax.stop_gradient(problem)
 
 
