@@ -29,11 +29,13 @@ NUM_SHAPES = 10  # as in SMPL
 HAND_JOINTS = ("Hand", "Thumb", "Finger")
 Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # (x, y, z) -> (x, z, -y)
 
-# Arms as low as walking brings them once `retarget.abduct_arms` has lifted them by its default: about the front
-# axis from the 45 degrees of the rest pose, each with a forward and backward swing about the sideways axis.
+# Arms as low as walking brings them once `retarget.abduct_arms` has lifted them by its default: turned about
+# the front axis from the rest pose's 45 degrees, each with swings about the sideways axis.
 ARM_LOWERING = (-10.0, -20.0, -30.0)  # [degrees]
 ARM_SWINGS = (-30.0, -15.0, 0.0, 15.0, 30.0)  # [degrees]
-ARMPIT_RADIUS = 0.20  # [m] around the shoulder joint; farther intersections are real contacts of arm and flank
+ARMPIT_RADIUS = (
+    0.20  # [m] around the shoulder joint; farther intersections are real contacts of arm and flank
+)
 
 
 def to_y_up(points: NDArray) -> NDArray:
@@ -55,7 +57,7 @@ def evaluate(model, phenotypes: NDArray, rotations: NDArray | None = None) -> di
     Args:
         model: The Anny model.
         phenotypes: Values in [0, 1], shape [batch, labels].
-        rotations: Rotation of each bone in its own rest frame, shape [batch, joints, 3, 3]; none is the rest pose.
+        rotations: Rotation of each bone in its rest frame, shape [batch, joints, 3, 3]; None: rest pose.
 
     Returns:
         Anny's output as NumPy arrays, Z up.
@@ -107,8 +109,8 @@ def principal_directions(samples: NDArray, count: int) -> tuple[NDArray, NDArray
         count: Number of directions.
 
     Returns:
-        Directions [m], shape [points, 3, count], the largest entry of each positive so that the result does not
-        depend on the linear algebra library; and the share of the variance explained by the first 1..count.
+        Directions [m], shape [points, 3, count], the largest entry of each positive so that no linear algebra
+        library decides the sign; and the share of the variance explained by the first 1..count.
     """
     flat = samples.reshape(len(samples), -1)
     _, singular, rows = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
@@ -225,7 +227,7 @@ def self_intersecting_faces(positions: NDArray, faces: NDArray) -> NDArray:
 
 
 def is_armpit_face(body: dict[str, NDArray]) -> NDArray:
-    """Faces near the shoulder joints that intersect others when the arms hang, and their ring; shape [faces]."""
+    """Faces near the shoulders that intersect others when the arms hang, and their ring; shape [faces]."""
     names = [str(name) for name in body["joint_names"]]
     shoulders = body["joint_rest_positions"][[names.index("LeftArm"), names.index("RightArm")]]
     centres = body["rest_positions"][body["faces"]].mean(axis=1)
@@ -242,7 +244,7 @@ def is_armpit_face(body: dict[str, NDArray]) -> NDArray:
 
 
 def add_obstacle_faces(body: dict[str, NDArray]) -> None:
-    """Mark the faces that cloth may touch: all but the hands and the armpits, where the posed body self-intersects."""
+    """Mark the faces that cloth may touch: all but hands and armpits, where the posed body cuts itself."""
     hands, armpits = is_hand_face(body), is_armpit_face(body)
     body["obstacle_faces"] = ~(hands | armpits)
     print(f"faces {len(hands)}: hands {hands.sum()}, armpits {armpits.sum()} left out")
@@ -255,8 +257,12 @@ def main() -> None:
     parser.add_argument(
         "--golden", type=Path, default=DATA.parent / "tests" / "fixtures" / "anny_lbs_golden.npz"
     )
-    parser.add_argument("--num-phenotypes", type=int, default=240, help="random adults behind the shape space")
-    parser.add_argument("--mask-only", action="store_true", help="recompute obstacle_faces of an existing file")
+    parser.add_argument(
+        "--num-phenotypes", type=int, default=240, help="random adults behind the shape space"
+    )
+    parser.add_argument(
+        "--mask-only", action="store_true", help="recompute obstacle_faces of an existing file"
+    )
     options = parser.parse_args()
     if options.mask_only:
         with np.load(options.output) as file:

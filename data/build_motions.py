@@ -3,9 +3,9 @@
     pip download --no-deps "envpool-assets==0.4.1" "pybullet==3.2.7"     # and unzip both wheels
     python data/build_motions.py --cmu DIR --deepmimic DIR
 
-The CMU folder holds EnvPool's `mocap_2019.bin`, `mocap_2020.bin` and `humanoid_CMU_V2020.xml`; the other one holds
-DeepMimic's `humanoid3d_*.txt`. Needs `data/body/anny_cmu.npz`. Clips keep their own frame rate; every clip starts
-above the origin, facing +Z, with its feet on y = 0.
+The CMU folder holds EnvPool's `mocap_2019.bin`, `mocap_2020.bin` and `humanoid_CMU_V2020.xml`; the other one
+holds DeepMimic's `humanoid3d_*.txt`. Needs `data/body/anny_cmu.npz`. Clips keep their own frame rate; every
+clip starts above the origin, facing +Z, with the floor at y = 0.
 """
 
 from __future__ import annotations
@@ -42,14 +42,18 @@ CMU_CENTRE = {
     "Neck": "lowerneck", "Neck1": "upperneck", "Head": "head",
 }  # fmt: skip
 CMU_SIDE = {
-    "{i}HipJoint": "hipjoint", "{s}UpLeg": "femur", "{s}Leg": "tibia", "{s}Foot": "foot", "{s}ToeBase": "toes",
-    "{s}Shoulder": "clavicle", "{s}Arm": "humerus", "{s}ForeArm": "radius", "{s}Hand": "hand",
-    "{i}Thumb": "thumb", "{s}FingerBase": "hand", "{s}HandFinger1": "fingers",
+    "{i}HipJoint": "hipjoint", "{s}UpLeg": "femur", "{s}Leg": "tibia", "{s}Foot": "foot",
+    "{s}ToeBase": "toes", "{s}Shoulder": "clavicle", "{s}Arm": "humerus", "{s}ForeArm": "radius",
+    "{s}Hand": "hand", "{i}Thumb": "thumb", "{s}FingerBase": "hand", "{s}HandFinger1": "fingers",
 }  # fmt: skip
 CMU_BONE_ENDS = {"femur": "tibia", "tibia": "foot", "humerus": "radius", "radius": "wrist"}
-CMU_ACTOR_LEG = 0.864  # [m] thigh and shank that make the standing foot slide least, the same in all walks; the XML
+CMU_ACTOR_LEG = (
+    0.864  # [m] thigh and shank that make the standing foot slide least, the same in all walks; the XML
+)
 # humanoid has 0.821, the bodies in the 2020 file are 1.2 times as large, and neither fits the root's steps
-CMU_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # Z up -> Y up; its rest pose is Y up
+CMU_WORLD = np.array(
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+)  # Z up -> Y up; its rest pose is Y up
 
 # DeepMimic joints in file order with the number of columns: quaternion (w x y z) or angle about +z.
 DEEPMIMIC_JOINTS = (
@@ -61,8 +65,8 @@ DEEPMIMIC_PARENTS = {
     "elbow": "shoulder",
 }  # fmt: skip
 DEEPMIMIC_CENTRE = {
-    "Hips": "root", "LowerBack": "waist", "Spine": "chest", "Spine1": "chest", "Neck": "neck", "Neck1": "neck",
-    "Head": "neck",
+    "Hips": "root", "LowerBack": "waist", "Spine": "chest", "Spine1": "chest", "Neck": "neck",
+    "Neck1": "neck", "Head": "neck",
 }  # fmt: skip
 DEEPMIMIC_SIDE = {
     "{s}UpLeg": "hip", "{s}Leg": "knee", "{s}Foot": "ankle", "{s}ToeBase": "ankle", "{s}Arm": "shoulder",
@@ -70,7 +74,9 @@ DEEPMIMIC_SIDE = {
     "{s}HandFinger1": "elbow",
 }  # fmt: skip
 DEEPMIMIC_UNSIDED = {"{i}HipJoint": "root", "{s}Shoulder": "chest"}
-DEEPMIMIC_AXES = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x front, y up, z right -> ours
+DEEPMIMIC_AXES = np.array(
+    [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+)  # x front, y up, z right -> ours
 DEEPMIMIC_LEG = 0.421546 + 0.40987  # [m] thigh and shank of DeepMimic's humanoid3d.txt
 
 
@@ -92,7 +98,10 @@ class Rig:
             return cls(
                 tuple(str(name) for name in file["joint_names"]),
                 tuple(int(parent) for parent in file["parents"]),
-                *(file[key] for key in ("joint_rest_positions", "rest_positions", "skin_weights", "skin_indices")),
+                *(
+                    file[key]
+                    for key in ("joint_rest_positions", "rest_positions", "skin_weights", "skin_indices")
+                ),
             )
 
     @property
@@ -122,7 +131,7 @@ class SourceBody:
 
 
 def both_sides(names: dict[str, str], *, is_sided: bool = True) -> dict[str, str]:
-    """Fill `{s}` with Left, Right and `{i}` with L, R; the source names get l, r in front where they have sides."""
+    """Fill `{s}` with Left, Right and `{i}` with L, R; put l, r before source names that have sides."""
     return {
         rig_name.format(s=side, i=side[0]): (side[0].lower() if is_sided else "") + source_name
         for side in ("Left", "Right")
@@ -288,12 +297,14 @@ def retarget_deepmimic(source: Path, rig: Rig) -> dict[str, Clip]:
         followed = [names.index(joint_map[name]) for name in rig.joint_names]
         rotations = retarget.retarget(stacked, followed, alignments, rig.parents)
         translations = scale * frames[:, 1:4] @ DEEPMIMIC_AXES.T
-        clips[path.stem.replace("humanoid3d", "deepmimic")] = _at_uniform_times(rotations, translations, frames[:, 0])
+        clips[path.stem.replace("humanoid3d", "deepmimic")] = _at_uniform_times(
+            rotations, translations, frames[:, 0]
+        )
     return clips
 
 
 def _at_uniform_times(rotations: NDArray, translations: NDArray, durations: NDArray) -> Clip:
-    """Put frames of varying duration [s] on a uniform clock; the last duration closes the loop and is not used."""
+    """Put frames of varying duration [s] on a uniform clock; the last duration only closes the loop."""
     timestep = float(np.median(durations[:-1]))
     times = np.concatenate([[0.0], np.cumsum(durations[:-1])])
     if np.ptp(durations[:-1]) > 1e-4:
@@ -306,8 +317,10 @@ def _at_uniform_times(rotations: NDArray, translations: NDArray, durations: NDAr
 
 
 def make_lowest_point(rig: Rig) -> Callable[[NDArray, NDArray], jax.Array]:
-    """Return the function from one frame's rotations and root position to the height of its lowest vertex [m]."""
-    rest, weights, indices = (jnp.asarray(x) for x in (rig.rest_positions, rig.skin_weights, rig.skin_indices))
+    """Return the function from one frame's rotations and root position to its lowest vertex's height [m]."""
+    rest, weights, indices = (
+        jnp.asarray(x) for x in (rig.rest_positions, rig.skin_weights, rig.skin_indices)
+    )
     joints = jnp.asarray(rig.joint_rest_positions)
 
     @jax.jit

@@ -1,8 +1,8 @@
 """Linear blend skinning: joint rotations to posed points, with gradients that exist at zero rotation.
 
 Rotations are local axis-angle vectors in world-aligned rest axes: with all of them zero the body is in its
-rest pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some GPUs
-keeps ten bits, which moves a hand by millimetres.
+rest pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some
+GPUs keeps ten bits, which moves a hand by millimetres.
 
 Source: Loper et al. 2015 (doi:10.1145/2816795.2818013), section 3, without pose blend shapes.
 """

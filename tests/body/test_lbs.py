@@ -1,0 +1,167 @@
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body import lbs, retarget
+
+ROOT = Path(__file__).resolve().parents[2]
+TREE = (-1, 0, 1, 0)  # a chain of three joints and a branch
+
+
+@pytest.fixture(scope="module")
+def body():
+    with np.load(ROOT / "data" / "body" / "anny_cmu.npz") as file:
+        return dict(file)
+
+
+@pytest.fixture(scope="module")
+def golden():
+    with np.load(ROOT / "tests" / "fixtures" / "anny_lbs_golden.npz") as file:
+        return dict(file)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def random_tree(rng):
+    rotations = rng.normal(0.0, 0.7, (len(TREE), 3)).astype(np.float32)
+    joints = rng.normal(0.0, 0.5, (len(TREE), 3)).astype(np.float32)
+    translation = rng.normal(0.0, 1.0, 3).astype(np.float32)
+    return jnp.asarray(rotations), jnp.asarray(translation), jnp.asarray(joints)
+
+
+def random_skin(rng, vertices=20):
+    positions = rng.normal(0.0, 0.5, (vertices, 3)).astype(np.float32)
+    weights = rng.dirichlet(np.ones(3), vertices).astype(np.float32)
+    indices = rng.integers(0, len(TREE), (vertices, 3)).astype(np.int16)
+    return jnp.asarray(positions), jnp.asarray(weights), jnp.asarray(indices)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-3, 0.0999, 0.1001, 1.0, 3.1, np.pi, 7.0])
+def test_rotation_matrix_equals_scipy(angle, rng):
+    axis = rng.normal(size=3)
+    vector = angle * axis / np.linalg.norm(axis)
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(lbs.rotation_matrix(jnp.float32(vector)), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-20, 1e-4, 0.1])
+def test_rotation_matrix_gradient_near_zero_is_the_generator(scale):
+    jacobian = jax.jacobian(lbs.rotation_matrix)(jnp.float32([scale, 0.0, 0.0]))
+    generator = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    assert np.isfinite(jacobian).all()
+    np.testing.assert_allclose(jacobian[..., 0], generator, atol=1.01 * scale + 1e-6)
+
+
+def test_rotation_matrix_gradient_is_continuous_where_the_series_ends():
+    below, above = (jnp.float32([np.sqrt(lbs.SERIES_BELOW * f), 0.0, 0.0]) for f in (0.9999, 1.0001))
+    jacobian = jax.jacobian(lbs.rotation_matrix)
+    np.testing.assert_allclose(jacobian(below), jacobian(above), atol=2e-5)
+
+
+def test_skin_reproduces_golden_poses(body, golden):
+    parents = tuple(int(p) for p in body["parents"])
+    local = retarget.local_rotations(golden["global_rotations"], parents)
+    joints = jnp.asarray(body["joint_rest_positions"])
+    for rotations, positions, vertices in zip(
+        local, golden["joint_positions"], golden["vertices"], strict=True
+    ):
+        transforms = lbs.joint_transforms(jnp.float32(rotations), jnp.float32(positions[0]), joints, parents)
+        posed_joints = jnp.sum(transforms[:, :, :3] * joints[:, None, :], axis=2) + transforms[:, :, 3]
+        rows = golden["vertex_index"]
+        posed = lbs.skin(
+            jnp.asarray(body["rest_positions"][rows]),
+            jnp.asarray(body["skin_weights"][rows]),
+            jnp.asarray(body["skin_indices"][rows]),
+            transforms,
+        )
+        np.testing.assert_allclose(posed_joints, positions, atol=1e-5)  # [m]
+        np.testing.assert_allclose(posed, vertices, atol=1e-5)  # [m]
+
+
+def test_rest_pose_leaves_points_where_they_are(rng):
+    _, _, joints = random_tree(rng)
+    positions, weights, indices = random_skin(rng)
+    transforms = lbs.joint_transforms(jnp.zeros((len(TREE), 3)), joints[0], joints, TREE)
+    np.testing.assert_allclose(lbs.skin(positions, weights, indices, transforms), positions, atol=1e-6)
+
+
+def test_joint_transforms_equal_a_float64_chain(rng):
+    rotations, translation, joints = random_tree(rng)
+    matrices = Rotation.from_rotvec(np.asarray(rotations, np.float64)).as_matrix()
+    rest = np.asarray(joints, np.float64)
+    turned, posed = [matrices[0]], [np.asarray(translation, np.float64)]
+    for joint in range(1, len(TREE)):
+        parent = TREE[joint]
+        turned.append(turned[parent] @ matrices[joint])
+        posed.append(posed[parent] + turned[parent] @ (rest[joint] - rest[parent]))
+    result = np.asarray(lbs.joint_transforms(rotations, translation, joints, TREE))
+    np.testing.assert_allclose(result[:, :, :3], turned, atol=1e-6)
+    np.testing.assert_allclose(result[:, :, 3] + np.einsum("jab,jb->ja", turned, rest), posed, atol=2e-6)
+
+
+def test_skin_is_equivariant_to_translation(rng):
+    rotations, translation, joints = random_tree(rng)
+    skin = random_skin(rng)
+    offset = jnp.float32([0.5, -0.25, 2.0])
+    here = lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))
+    there = lbs.skin(*skin, lbs.joint_transforms(rotations, translation + offset, joints, TREE))
+    np.testing.assert_allclose(there, here + offset[None, :], atol=2e-6)
+
+
+def test_skin_is_equivariant_to_rotation_of_the_root(rng):
+    rotations, _, joints = random_tree(rng)
+    skin = random_skin(rng)
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.4])
+    root = (turn * Rotation.from_rotvec(np.asarray(rotations[0]))).as_rotvec()
+    turned = rotations.at[0].set(jnp.float32(root))
+    zero = jnp.zeros(3)
+    here = lbs.skin(*skin, lbs.joint_transforms(rotations, zero, joints, TREE))
+    there = lbs.skin(*skin, lbs.joint_transforms(turned, zero, joints, TREE))
+    np.testing.assert_allclose(there, turn.apply(np.asarray(here)), atol=3e-6)
+
+
+def test_whole_turns_change_nothing(rng):
+    rotations, translation, joints = random_tree(rng)
+    lengths = jnp.linalg.norm(rotations, axis=1, keepdims=True)
+    further = rotations * (1.0 + 2.0 * jnp.pi / lengths)
+    one = lbs.joint_transforms(rotations, translation, joints, TREE)
+    other = lbs.joint_transforms(further, translation, joints, TREE)
+    np.testing.assert_allclose(other, one, atol=1e-5)
+
+
+def test_gradients_are_finite_at_the_rest_pose(rng):
+    _, translation, joints = random_tree(rng)
+    skin = random_skin(rng)
+
+    @jax.jit
+    def height(rotations):
+        return lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))[:, 1].sum()
+
+    zero = jnp.zeros((len(TREE), 3))
+    gradient = np.asarray(jax.grad(height)(zero))
+    assert np.isfinite(gradient).all()
+    step = 1e-2
+    for joint in range(len(TREE)):
+        above, below = (float(height(zero.at[joint, 0].set(sign * step))) for sign in (1, -1))
+        assert gradient[joint, 0] == pytest.approx((above - below) / (2 * step), abs=2e-3)
+
+
+def test_vmap_equals_loop_under_jit(rng):
+    rotations, translation, joints = random_tree(rng)
+    skin = random_skin(rng)
+    frames = jnp.stack([rotations, 0.5 * rotations, 0.0 * rotations])
+    roots = jnp.stack([translation, -translation, 0.0 * translation])
+
+    def pose(rotations, translation):
+        return lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))
+
+    together = jax.jit(jax.vmap(pose))(frames, roots)
+    apart = np.stack([pose(r, t) for r, t in zip(frames, roots, strict=True)])
+    np.testing.assert_allclose(together, apart, atol=1e-6)

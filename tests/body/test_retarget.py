@@ -1,0 +1,158 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body import retarget
+from eslr_jax.errors import MotionError
+
+NAMES = ("Hips", "LeftArm", "LeftForeArm", "LeftHand", "RightArm")
+PARENTS = (-1, 0, 1, 2, 0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def random_motion(rng, frames=12):
+    return rng.normal(0.0, 0.5, (frames, len(NAMES), 3)), rng.normal(0.0, 1.0, (frames, 3))
+
+
+def angles_between(one, other):
+    one, other = (Rotation.from_rotvec(np.reshape(x, (-1, 3))) for x in (one, other))
+    return (one.inv() * other).magnitude()
+
+
+def test_local_and_global_rotations_are_inverse(rng):
+    rotations, _ = random_motion(rng)
+    back = retarget.local_rotations(retarget.global_rotations(rotations, PARENTS), PARENTS)
+    assert angles_between(back, rotations).max() < 1e-7
+
+
+@pytest.mark.parametrize("end", [[1, 0, 0], [-1, 0, 0], [0.2, -0.4, 1.3], [1, 1e-10, 0]])
+def test_minimal_rotation_turns_start_onto_end(end):
+    end = np.array(end, float)
+    matrix = retarget.minimal_rotation(np.array([2.0, 0.0, 0.0]), end)
+    np.testing.assert_allclose(matrix[:, 0], end / np.linalg.norm(end), atol=1e-9)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+
+
+def test_minimal_rotation_is_minimal(rng):
+    start, end = rng.normal(size=(2, 3))
+    angle = Rotation.from_matrix(retarget.minimal_rotation(start, end)).magnitude()
+    cosine = start @ end / np.linalg.norm(start) / np.linalg.norm(end)
+    assert angle == pytest.approx(np.arccos(cosine))
+
+
+def test_retarget_makes_limbs_point_where_the_source_points(rng):
+    rest = rng.normal(0.0, 0.5, (len(NAMES), 3))
+    directions = {"LeftArm": np.array([1.0, 0.0, 0.0]), "LeftForeArm": np.array([0.0, -1.0, 0.0])}
+    alignments = retarget.rest_alignments(NAMES, rest, directions)
+    source = Rotation.random(6, rng=rng).as_matrix().reshape(3, 2, 3, 3)
+    joints = [0, 0, 1, 1, 0]
+    turned = retarget.global_rotations(retarget.retarget(source, joints, alignments, PARENTS), PARENTS)
+    for joint, child, direction in ((1, 2, directions["LeftArm"]), (2, 3, directions["LeftForeArm"])):
+        bone = (rest[child] - rest[joint]) / np.linalg.norm(rest[child] - rest[joint])
+        np.testing.assert_allclose(turned[:, joint] @ bone, source[:, joints[joint]] @ direction, atol=1e-9)
+
+
+def test_retarget_to_the_same_rig_changes_nothing(rng):
+    rotations, _ = random_motion(rng)
+    source = retarget.global_rotations(rotations, PARENTS)
+    identity = retarget.rest_alignments(NAMES, rng.normal(size=(len(NAMES), 3)), {})
+    result = retarget.retarget(source, range(len(NAMES)), identity, PARENTS)
+    assert angles_between(result, rotations).max() < 1e-7
+
+
+def test_limb_bones_leaves_out_absent_joints():
+    assert retarget.limb_bones(NAMES) == {
+        "LeftArm": ("LeftArm", "LeftForeArm"),
+        "LeftForeArm": ("LeftForeArm", "LeftHand"),
+        "LeftHand": ("LeftForeArm", "LeftHand"),
+    }
+
+
+def test_abduct_arms_lifts_hanging_arms_outwards():
+    rotations = np.zeros((2, len(NAMES), 3))
+    lifted = retarget.abduct_arms(rotations, NAMES, 90.0)
+    down = [0.0, -1.0, 0.0]
+    left, right = (
+        Rotation.from_rotvec(lifted[0, NAMES.index(n)]).apply(down) for n in ("LeftArm", "RightArm")
+    )
+    np.testing.assert_allclose(left, [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(right, [-1.0, 0.0, 0.0], atol=1e-12)
+    assert not lifted[:, [0, 2, 3]].any()
+    assert not rotations.any()  # the input is left alone
+
+
+def test_abduct_arms_there_and_back_is_nothing(rng):
+    rotations, _ = random_motion(rng)
+    back = retarget.abduct_arms(retarget.abduct_arms(rotations, NAMES, 12.0), NAMES, -12.0)
+    assert angles_between(back, rotations).max() < 1e-7
+
+
+def test_abduct_arms_names_the_missing_joint():
+    with pytest.raises(MotionError, match="LeftArm"):
+        retarget.abduct_arms(np.zeros((1, 1, 3)), ("Hips",))
+
+
+def test_resample_at_the_same_rate_changes_nothing(rng):
+    rotations, translations = random_motion(rng)
+    new_rotations, new_translations = retarget.resample(rotations, translations, 30.0, 30.0)
+    assert angles_between(new_rotations, rotations).max() < 1e-7
+    np.testing.assert_allclose(new_translations, translations, atol=1e-12)
+
+
+def test_resample_keeps_endpoints(rng):
+    rotations, translations = random_motion(rng, frames=13)  # 12 intervals at 60 are 6 at 30
+    new_rotations, new_translations = retarget.resample(rotations, translations, 60.0, 30.0)
+    assert len(new_rotations) == len(new_translations) == 7
+    assert angles_between(new_rotations[[0, -1]], rotations[[0, -1]]).max() < 1e-7
+    np.testing.assert_allclose(new_translations[[0, -1]], translations[[0, -1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("fps_out", [30.0, 24.0, 120.0])
+def test_resample_is_exact_for_uniform_motion(fps_out):
+    spin, speed, fps_in = np.array([0.4, 2.0, -1.0]), np.array([1.0, 0.0, -0.5]), 100.0 / 3.0
+    times = np.arange(40) / fps_in
+    turns = np.tile((times[:, None] * spin)[:, None], (1, 2, 1))
+    rotations, translations = retarget.resample(turns, times[:, None] * speed, fps_in, fps_out)
+    new_times = np.arange(len(rotations)) / fps_out
+    assert new_times[-1] <= times[-1] + 1e-9 < new_times[-1] + 1 / fps_out
+    assert angles_between(rotations[:, 1], new_times[:, None] * spin).max() < 1e-7
+    np.testing.assert_allclose(translations, new_times[:, None] * speed, atol=1e-12)
+
+
+def test_resample_takes_the_short_way_through_a_half_turn():
+    before, after = np.pi - 0.1, -(np.pi - 0.1)  # the same axis-angle chart wraps here
+    turns = np.array([[[0.0, before, 0.0]], [[0.0, after, 0.0]]])
+    rotations, _ = retarget.resample(turns, np.zeros((2, 3)), 15.0, 30.0)
+    assert np.linalg.norm(rotations[1, 0]) == pytest.approx(np.pi)
+
+
+def test_resample_keeps_a_single_frame(rng):
+    rotations, translations = random_motion(rng, frames=1)
+    new_rotations, new_translations = retarget.resample(rotations, translations, 60.0)
+    np.testing.assert_array_equal(new_rotations, rotations)
+    np.testing.assert_array_equal(new_translations, translations)
+
+
+@pytest.mark.parametrize(("frames", "fps"), [(0, 30.0), (3, 0.0), (3, -1.0), (3, np.nan)])
+def test_resample_refuses_nonsense(frames, fps):
+    with pytest.raises(MotionError):
+        retarget.resample(np.zeros((frames, 1, 3)), np.zeros((frames, 3)), fps)
+
+
+def test_start_facing_front_moves_rigidly(rng):
+    rotations, translations = random_motion(rng)
+    new_rotations, new_translations = retarget.start_facing_front(rotations, translations)
+    front = Rotation.from_rotvec(new_rotations[0, 0]).apply([0.0, 0.0, 1.0])
+    assert front[0] == pytest.approx(0.0, abs=1e-12)
+    assert front[2] > 0
+    np.testing.assert_allclose(new_translations[0, [0, 2]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(new_translations[:, 1], translations[:, 1], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(new_translations, axis=0), axis=1),
+        np.linalg.norm(np.diff(translations, axis=0), axis=1),
+    )
