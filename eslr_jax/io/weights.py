@@ -18,7 +18,9 @@ from eslr_jax.io.npz import read_arrays, write_arrays
 FORMAT = 1  # raise when a reader of today could not read the file
 
 
-def write_weights(path: str | Path, params: Mapping[str, Any], config: ModelConfig, training: dict[str, Any]) -> None:
+def write_weights(
+    path: str | Path, params: Mapping[str, Any], config: ModelConfig, training: dict[str, Any]
+) -> None:
     """Write a network: `path` (npz) and the same name with suffix .json.
 
     Args:

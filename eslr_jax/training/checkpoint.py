@@ -1,0 +1,110 @@
+"""Checkpoints of a training run: asynchronous, rotated, never half-written (the only room that imports orbax)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from eslr_jax.config import TrainConfig, from_dict, to_dict
+from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.training.step import TrainState
+
+FORMAT = 1
+_KEPT = 3
+
+
+class Checkpoints:
+    """The checkpoints of one output folder."""
+
+    def __init__(self, folder: Path):
+        """Open the folder; it is created on the first save."""
+        options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, create=True, enable_async_checkpointing=True)
+        self._manager = ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
+
+    def save(self, state: TrainState) -> None:
+        """Start writing a checkpoint; the state may be donated as soon as this returns.
+
+        Source: orbax copies to the host before it returns, and renames the folder when it is whole.
+        """
+        self._manager.save(int(state.iteration), args=ocp.args.StandardSave(_plain(state)))
+
+    def wait(self) -> None:
+        """Wait for what is being written, and raise its error.
+
+        Raises:
+            CheckpointError: The checkpoint could not be written, as on a full disk.
+        """
+        try:
+            self._manager.wait_until_finished()
+        except (OSError, ValueError) as error:
+            text = str(error).splitlines()[0]
+            raise CheckpointError(f"a checkpoint could not be written: {text}; free some space and resume") from error
+
+    def latest(self) -> int | None:
+        """Return the iteration of the newest whole checkpoint."""
+        return self._manager.latest_step()
+
+    def restore(self, example: TrainState) -> TrainState:
+        """Return the newest checkpoint.
+
+        Args:
+            example: A state of the same run: its shapes and types.
+
+        Raises:
+            CheckpointError: There is none, or it is for another model.
+        """
+        step = self.latest()
+        if step is None:
+            raise CheckpointError("there is no checkpoint to resume from; start without --resume")
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain(example))
+        try:
+            plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+        except (ValueError, KeyError, TypeError) as error:
+            text = str(error).splitlines()[0]
+            raise CheckpointError(f"checkpoint {step} is for another run: {text}; choose another --out") from error
+        leaves = jax.tree.leaves(plain)
+        return jax.tree.unflatten(jax.tree.structure(example), leaves)
+
+    def close(self) -> None:
+        """Finish writing and release the folder."""
+        self.wait()
+        self._manager.close()
+
+
+def _plain(state: TrainState) -> dict[str, Any]:
+    """Return the state's leaves by number: a layout that no library's class names can break."""
+    return {f"{number:05d}": leaf for number, leaf in enumerate(jax.tree.leaves(state))}
+
+
+def write_run_config(folder: Path, config: TrainConfig) -> None:
+    """Keep a run's configuration beside its checkpoints."""
+    record = {"format": FORMAT, "train": to_dict(config)}
+    with atomic_write(folder / "config.json") as temporary:
+        temporary.write_text(json.dumps(record, indent=2))
+
+
+def read_run_config(folder: Path) -> TrainConfig:
+    """Return the configuration of a run.
+
+    Raises:
+        CheckpointError: The folder holds no run, or one of a newer format.
+    """
+    path = folder / "config.json"
+    try:
+        record = json.loads(path.read_text())
+        version, values = record["format"], record["train"]
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{folder} holds no training run; start one without --resume") from error
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged; start the run again in another folder") from error
+    if version > FORMAT:
+        raise CheckpointError(f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax")
+    try:
+        return from_dict(TrainConfig, values)
+    except ConfigError as error:
+        raise CheckpointError(f"{path} is for another version: {error}") from error

@@ -1,0 +1,143 @@
+"""The training loop: steps, metrics, checkpoints, and what happens when something goes wrong (host)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.config import TrainConfig
+from eslr_jax.errors import CheckpointError, NonFiniteError
+from eslr_jax.io.atomic import ensure_output_dir
+from eslr_jax.io.weights import write_weights
+from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
+from eslr_jax.training.data import load_training_data
+from eslr_jax.training.step import TrainState, init_train_state, make_train_step
+
+Progress = Callable[[int, int, dict[str, float]], None]
+
+
+def train(
+    config: TrainConfig,
+    out: Path,
+    *,
+    resume: bool = False,
+    initial_params: Any = None,
+    on_progress: Progress = lambda done, total, metrics: None,
+) -> TrainState:
+    """Train a network, or go on with a run.
+
+    Args:
+        config: The run.
+        out: Folder of metrics, checkpoints and, at the end, the exported model.
+        resume: Go on from the newest checkpoint of `out`.
+        initial_params: Weights to start from instead of random ones.
+        on_progress: Called with iterations done, iterations in all, and the latest means.
+
+    Raises:
+        CheckpointError: `out` holds another run, or none to resume.
+        NonFiniteError: Too many updates had to be skipped; the last good checkpoint is kept.
+    """
+    checkpoints = _open_run(config, ensure_output_dir(out), resume)
+    datasets = tuple(load_training_data(config, vertices) for vertices in config.vertices)
+    state = init_train_state(config, datasets)
+    if initial_params is not None:
+        state = state.replace(params=jax.tree.map(jax.numpy.array, initial_params))
+    if resume:
+        state = checkpoints.restore(state)
+    steps = [make_train_step(config, resolution) for resolution in range(len(datasets))]
+    window: list[dict[str, jax.Array]] = []
+    began, first = time.perf_counter(), int(state.iteration)
+    with (out / "metrics.jsonl").open("a") as log, _stop_requested() as is_stopping:
+        for iteration in range(first, config.iterations):
+            resolution = iteration % len(steps)
+            state, metrics = steps[resolution](state, datasets[resolution])
+            window.append(metrics)
+            done = iteration + 1
+            if done % config.log_every == 0 or done == config.iterations:
+                means = _means(window)
+                window = []
+                speed = (done - first) / (time.perf_counter() - began)
+                record = {"iteration": done, "seconds": time.perf_counter() - began, "its": speed, **means}
+                log.write(json.dumps(record) + "\n")
+                log.flush()
+                on_progress(done, config.iterations, record)
+                _check_skipped(state, config, checkpoints, out)
+            if done % config.checkpoint_every == 0 or done == config.iterations:
+                checkpoints.save(state)
+            if is_stopping():
+                if done % config.checkpoint_every:
+                    checkpoints.save(state)
+                break
+    checkpoints.close()
+    if int(state.iteration) >= config.iterations:
+        export(state, config, out)
+    return state
+
+
+def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
+    """Write the network of a run as npz and JSON, and return the npz file."""
+    path = out / "model.npz"
+    training = {"iterations": int(state.iteration), "garments": config.garments, "vertices": config.vertices}
+    write_weights(path, jax.device_get(state.params), config.model, training)
+    return path
+
+
+def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
+    """Create or reopen the run's folder, without touching another run's."""
+    if resume:
+        before = read_run_config(out)
+        if before != config:
+            raise CheckpointError(f"{out} holds a run with another configuration; resume it with its own")
+    elif (out / "config.json").exists():
+        raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
+    else:
+        write_run_config(out, config)
+    return Checkpoints(out)
+
+
+def _means(window: list[dict[str, jax.Array]]) -> dict[str, float]:
+    """Return the medians of a window: single resets have energies a hundred times the usual."""
+    fetched = jax.device_get(window)
+    return {name: float(np.median([float(entry[name]) for entry in fetched])) for name in fetched[0]}
+
+
+def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:
+    """Stop a run that produces nothing but NaN."""
+    skipped = int(state.skipped)
+    if skipped > config.max_skipped:
+        checkpoints.wait()
+        last = checkpoints.latest()
+        np.savez(out / "offending_state.npz", **{str(i): leaf for i, leaf in enumerate(jax.tree.leaves(jax.device_get(state.pools)))})
+        raise NonFiniteError(
+            f"{skipped} updates were not finite by iteration {int(state.iteration)}; the last good checkpoint is "
+            f"{last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
+        )
+
+
+@contextlib.contextmanager
+def _stop_requested() -> Iterator[Callable[[], bool]]:
+    """Turn SIGTERM and Ctrl-C into a question that the loop asks; a second signal acts at once."""
+    received: list[int] = []
+    before = {}
+
+    def remember(number, frame):
+        received.append(number)
+        for which, handler in before.items():
+            signal.signal(which, handler)
+
+    with contextlib.suppress(ValueError):  # not in the main thread: leave signals alone
+        for which in (signal.SIGTERM, signal.SIGINT):
+            before[which] = signal.signal(which, remember)
+    try:
+        yield lambda: bool(received)
+    finally:
+        for which, handler in before.items():
+            signal.signal(which, handler)
