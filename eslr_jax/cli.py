@@ -17,7 +17,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from eslr_jax.errors import AssetError, EslrError
@@ -49,7 +56,7 @@ def _use_compile_cache() -> None:
 @app.command
 def simulate(
     garment: str = "tshirt",
-    motion: str = "cmu_016_22",
+    motion: str = "cmu_016_32",
     body: str = "anny",
     simulator: Literal["network", "physics"] = "network",
     model: str | None = None,
@@ -277,6 +284,138 @@ def info(
     print(f"{model}: {values['parameters']:,} parameters")
     for name, value in values["config"].items():
         print(f"  {name} = {value}")
+
+
+@app.command
+def train(
+    out: Path,
+    config: Path | None = None,
+    set_: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = (),
+    resume: bool = False,
+) -> None:
+    """Train a network on the physics loss; Ctrl-C or SIGTERM writes a checkpoint first.
+
+    Args:
+        out: Folder of metrics, checkpoints and the exported model.
+        config: TOML file of a training configuration; not needed with --resume.
+        set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
+        resume: Go on from the newest checkpoint of the folder.
+    """
+    from eslr_jax.config import TrainConfig, load_toml, parse_override
+    from eslr_jax.errors import ConfigError
+    from eslr_jax.training.checkpoint import read_run_config
+    from eslr_jax.training.loop import train as run
+    from eslr_jax.training.plot import plot_curves
+
+    if resume:
+        chosen = read_run_config(out)
+    elif config is None:
+        raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
+    else:
+        chosen = load_toml(TrainConfig, config, dict(parse_override(text) for text in set_))
+    _use_compile_cache()
+    with _training_progress(chosen.iterations) as show:
+        state = run(chosen, out, resume=resume, on_progress=show)
+    plot_curves(out)
+    done = int(state.iteration)
+    if done < chosen.iterations:
+        _stderr.print(
+            f"stopped at iteration {done} of {chosen.iterations}; go on with: eslr train --out {out} --resume",
+            markup=False,
+        )
+    else:
+        print(out / "model.npz")
+
+
+@contextlib.contextmanager
+def _training_progress(total: int) -> Iterator[Any]:
+    """Show iterations per second, the loss and the time left."""
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=_stderr) as progress:
+        task = progress.add_task("training", total=total, text="compiling")
+
+        def show(done: int, total: int, metrics: dict[str, float]) -> None:
+            text = f"{metrics['its']:.1f} it/s, loss {metrics['loss']:.4f}"
+            progress.update(task, completed=done, total=total, text=text)
+
+        yield show
+
+
+@app.command
+def evaluate(
+    model: str,
+    split: str = "test",
+    vertices: Literal["1k", "4k", "10k"] = "1k",
+    garments: tuple[str, ...] = (),
+    clips: tuple[str, ...] = (),
+    corrector_steps: int = 0,
+    excess_frames: int = 40,
+    every: int = 4,
+    rollout_frames: int = 300,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Evaluate a network on a split: excess over the optimum, and free rollouts.
+
+    Args:
+        model: Name of a bundled network, or an exported file.
+        split: train, validation, test or unseen_motion.
+        vertices: Resolution of the garments.
+        garments: Only these; the training garments if not given.
+        clips: Only these; all of the split if not given.
+        corrector_steps: Solver iterations behind the network.
+        excess_frames: Frames of each clip from which the excess is measured.
+        every: Of those, measure one in so many.
+        rollout_frames: Length of the free rollouts; clips are played back and forth.
+        json_: Print as JSON.
+    """
+    from eslr_jax.assets import load_model
+    from eslr_jax.evaluation.evaluate import EvaluationOptions
+    from eslr_jax.evaluation.evaluate import evaluate as run
+    from eslr_jax.evaluation.report import environment
+
+    params, architecture = load_model(model)
+    options = EvaluationOptions(
+        split=split,
+        garments=garments,
+        clips=clips,
+        vertices=vertices,
+        excess_frames=excess_frames,
+        every=every,
+        rollout_frames=rollout_frames,
+    )
+    _use_compile_cache()
+    with _progress("evaluating", 1) as advance:
+        result = run(
+            params,
+            architecture,
+            options,
+            corrector_steps=corrector_steps,
+            on_scene=lambda done, total, label: advance(done, total),
+        )
+    result = {"model": model, "corrector_steps": corrector_steps, **result, **environment()}
+    if json_:
+        print(json.dumps(result, indent=2))
+        return
+    table = Table("", "excess, median [mJ]", "relative to the drop", "on the model's own states [mJ]", box=None)
+    own = result["on_policy"]
+    rows = {model: (result, own)}
+    rows |= {f"L-BFGS {count}": (result["lbfgs"][count], own["lbfgs"][count]) for count in result["lbfgs"]}
+    for label, (forced, policy) in rows.items():
+        table.add_row(
+            label,
+            f"{forced['excess_median_j'] * 1e3:.3f}",
+            f"{forced['excess_relative_median']:.4f}",
+            f"{policy['excess_median_j'] * 1e3:.3f}",
+        )
+    Console().print(table, markup=False)
+    print(json.dumps(result["rollout"], indent=2))
 
 
 def main() -> None:

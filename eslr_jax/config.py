@@ -210,3 +210,18 @@ def load_toml(cls: type[Config], path: str | Path, overrides: dict[str, Any] | N
             target = target.setdefault(table, {})
         target[key] = value
     return from_dict(cls, values)
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Split `key=value`; the value is read as TOML, or taken as a word.
+
+    Raises:
+        ConfigError: There is no equals sign.
+    """
+    key, separator, value = text.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"--set {text}: write key=value")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value

@@ -106,7 +106,7 @@ def _motion_archive(path: Path, modified: float):
     return read_motion_archive(path)
 
 
-def load_motion(name: str | Path = "cmu_016_22") -> Motion:
+def load_motion(name: str | Path = "cmu_016_32") -> Motion:
     """Load a motion.
 
     Args:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.body import lbs
-from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, resample
+from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, leg_length, resample
 from eslr_jax.errors import MotionError
 from eslr_jax.types import Body, BodyMotion
 
@@ -62,7 +62,8 @@ def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: f
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
         rotations = abduct_arms(rotations, body.joint_names, arm_angle)
-    root = np.asarray(body.joint_rest_positions)[0]
+    root = np.asarray(body.joint_rest_positions)[0].copy()
+    root[1] -= float(np.asarray(body.rest_positions)[:, 1].min())  # soles on the floor
     return Motion("still", rotations, np.tile(root, (num_frames, 1)), fps, body.joint_names)
 
 
@@ -105,6 +106,10 @@ def pose_body(
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction)
     rest, joints = shape_body(body, shape)
+    if shape is not None:
+        # Longer legs take longer steps and carry the root higher, so that the soles stay on the floor.
+        before, after = (leg_length(body.joint_names, np.asarray(j)) for j in (body.joint_rest_positions, joints))
+        translations = translations * (after / before)
     transforms = joint_transforms(rotations, translations, joints, body.parents)
     return BodyMotion(
         positions=_skin_frames(rest, body.skin_weights, body.skin_indices, transforms),

@@ -66,7 +66,7 @@ def clips_of(split: str) -> list[str]:
     Raises:
         ConfigError: There is no such split, or it is empty.
     """
-    clips = load_splits()["clips"]
+    clips = load_splits()["motions"]
     if split not in clips or not clips[split]:
         raise ConfigError(f"no clips in split {split!r}; there are {', '.join(name for name in clips if clips[name])}")
     return clips[split]

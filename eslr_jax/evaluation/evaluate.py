@@ -1,0 +1,193 @@
+"""Evaluate a model on a split: excess over the optimum, and free rollouts (host)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.body.motion import Motion, pose_body
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
+from eslr_jax.evaluation.metrics import measure_frames
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.scene import prepare_scene
+from eslr_jax.simulate.scan import simulate_scene
+
+_TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationOptions:
+    """What to evaluate, and how densely."""
+
+    split: str = "test"
+    garments: tuple[str, ...] = ()  # empty: the training garments
+    clips: tuple[str, ...] = ()  # empty: all of the split
+    vertices: str = "1k"
+    excess_frames: int = 40  # frames of each clip for the excess
+    every: int = 4  # of those, measure one in so many
+    rollout_frames: int = 300  # of the free rollout; clips are played back and forth
+
+
+def evaluate(
+    params: Any,
+    model: ModelConfig,
+    options: EvaluationOptions,
+    *,
+    corrector_steps: int = 0,
+    on_scene: Callable[[int, int, str], None] = lambda done, total, label: None,
+) -> dict[str, Any]:
+    """Evaluate a model.
+
+    Args:
+        params: Weights.
+        model: Architecture.
+        options: Split, garments, clips and lengths.
+        corrector_steps: Solver iterations behind the network.
+        on_scene: Called after each garment and clip with the count, the total and a label.
+
+    Returns:
+        Plain values: teacher-forced and on-policy excess [J] beside that of L-BFGS from the same states, and
+        the measures of free rollouts; per garment and clip under `scenes`.
+
+    Raises:
+        ConfigError: There is no such split, or it is empty.
+    """
+    garments = options.garments or tuple(load_splits()["garments"]["train"])
+    clips = options.clips or split_clips(options.split)
+    config = SimConfig(simulator="network", model=model, corrector_steps=corrector_steps)
+    body = load_body()
+    scenes, forced, policy = [], [], []
+    total = len(garments) * len(clips)
+    for garment in garments:
+        cloth = load_garment(
+            garment,
+            vertices=options.vertices,  # type: ignore[arg-type]
+            embedding_size=model.embedding_size,
+            embedding_mode=model.embedding_mode,
+            pad=True,
+        )
+        for clip in clips:
+            motion = load_motion(clip)
+            scene = prepare_scene(cloth, pose_body(body, back_and_forth(motion, options.excess_frames)))
+            long = prepare_scene(cloth, pose_body(body, back_and_forth(motion, options.rollout_frames)))
+            on_truth, on_policy = _excesses(params, scene, config, options.every)
+            forced.append(on_truth)
+            policy.append(on_policy)
+            scenes.append({"garment": garment, "clip": clip, **_free_rollout(params, long, config)})
+            on_scene(len(scenes), total, f"{garment} {clip}")
+    return {
+        "split": options.split,
+        "vertices": options.vertices,
+        "garments": list(garments),
+        "clips": list(clips),
+        **_summarize(forced),
+        "on_policy": _summarize(policy),
+        "rollout": _pool_rollouts(scenes),
+        "scenes": scenes,
+    }
+
+
+def split_clips(split: str) -> tuple[str, ...]:
+    """Return the clips of a split.
+
+    Raises:
+        ConfigError: There is no such split, or it is empty.
+    """
+    motions = load_splits()["motions"]
+    if not motions.get(split):
+        raise ConfigError(f"no clips in split {split!r}; there are {', '.join(name for name in motions if motions[name])}")
+    return tuple(motions[split])
+
+
+def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion:
+    """Return a motion of at least `num_frames` frames at `fps`, played forwards and backwards by turns."""
+    needed = int(np.ceil(num_frames * motion.fps / fps)) + 1
+    count = len(motion.translations)
+    period = max(2 * (count - 1), 1)
+    phase = np.arange(needed) % period
+    index = np.where(phase < count, phase, period - phase)
+    return dataclasses.replace(
+        motion, rotations=motion.rotations[index], translations=motion.translations[index]
+    )
+
+
+def _excesses(params: Any, scene, config: SimConfig, every: int) -> tuple[Excess, Excess]:
+    """Return the excess from the optimum's states and from those of the model's own rollout."""
+    parameters = PhysicsParameters()
+    truth = SimConfig(simulator="physics", solver_iterations=_TRUTH_ITERATIONS)
+    measured = []
+    for weights, simulator in ((None, truth), (params, config)):
+        trajectory = simulate_scene(weights, scene, parameters, simulator)
+        measured.append(
+            jax.device_get(measure_excess(params, trajectory, scene, parameters, config, every=every))
+        )
+    return measured[0], measured[1]
+
+
+def _summarize(measured: list[Excess]) -> dict[str, Any]:
+    """Return medians over all frames of all scenes: joules, and relative to the frame's own drop."""
+
+    def join(pick: Callable[[Excess], Any]) -> np.ndarray:
+        return np.concatenate([np.asarray(pick(entry)) for entry in measured])
+
+    optimum = join(lambda entry: entry.optimum)
+    drop = np.maximum(join(lambda entry: entry.start) - optimum, 1e-9)
+
+    def medians(energy: np.ndarray) -> dict[str, float]:
+        excess = energy - optimum
+        return {
+            "excess_median_j": float(np.median(excess)),
+            "excess_relative_median": float(np.median(excess / drop)),
+            "excess_mean_j": float(np.mean(excess)),
+            "excess_p90_j": float(np.quantile(excess, 0.9)),
+        }
+
+    lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}
+    return {"frames": len(optimum), **medians(join(lambda entry: entry.model)), "lbfgs": lbfgs}
+
+
+def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:
+    """Return the measures of one free rollout."""
+    parameters = PhysicsParameters()
+    trajectory = simulate_scene(params, scene, parameters, config)
+    measures = jax.device_get(measure_frames(trajectory, scene, parameters))
+    is_real = np.asarray(scene.garment.vertex_mask)
+    positions = np.asarray(trajectory.positions)[:, is_real]
+    terms = {name: float(np.mean(values)) for name, values in measures.terms._asdict().items()}
+    depth = -np.asarray(measures.distances)[:, is_real]
+    return {
+        "finite": bool(np.isfinite(positions).all()),
+        "num_frames": int(scene.num_frames),
+        "terms": terms,
+        "total": sum(terms.values()),
+        "stretch_p99": float(np.quantile(measures.max_stretch, 0.99)),
+        "penetration_p999_mm": float(max(np.quantile(depth, 0.999), 0.0) * 1e3),
+        "coverage": _coverage(positions[-1], np.asarray(scene.body_positions)[-1]),
+    }
+
+
+def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float:
+    """Return the share of the reachable body vertices that lie within `reach` [m] of the cloth."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(cloth).query(body, distance_upper_bound=reach)
+    return float(np.isfinite(distance).mean())
+
+
+def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return means, and the worst where a bar is on the worst."""
+    names = scenes[0]["terms"]
+    return {
+        "finite": all(scene["finite"] for scene in scenes),
+        "total": float(np.mean([scene["total"] for scene in scenes])),
+        "terms": {name: float(np.mean([scene["terms"][name] for scene in scenes])) for name in names},
+        "stretch_p99": float(np.max([scene["stretch_p99"] for scene in scenes])),
+        "penetration_p999_mm": float(np.max([scene["penetration_p999_mm"] for scene in scenes])),
+    }

@@ -1,0 +1,102 @@
+"""Excess over the optimum: how much potential a stepper leaves on the table, frame by frame."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from eslr_jax.config import SimConfig
+from eslr_jax.physics.potential import next_friction_load, potential
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
+from eslr_jax.simulate.network import network_step
+from eslr_jax.simulate.scan import frame_inputs
+from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from eslr_jax.types import ClothState, Scene, Trajectory
+
+ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
+_OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
+_MEMORY = 8
+
+
+class Excess(NamedTuple):
+    """Potentials from the same states, one per frame [J]."""
+
+    start: Float[Array, " frames"]  # at the pushed-out inertial guess
+    optimum: Float[Array, " frames"]
+    model: Float[Array, " frames"] | None
+    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations
+
+
+def trajectory_states(
+    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters
+) -> tuple[ClothState, FrameInput]:
+    """Return the state before every frame of a trajectory, with its friction load, and the frame's input."""
+    inputs = frame_inputs(scene)
+    garment = scene.garment
+
+    def advance(load, frame):
+        position, velocity, answer, inputs = frame
+        state = scene.start.replace(position=position, velocity=velocity, friction_load=load)
+        if scene.surface is not None:
+            problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
+            load = next_friction_load(answer, problem, garment)
+        return load, state
+
+    frames = (trajectory.positions[:-1], trajectory.velocities[:-1], trajectory.positions[1:], inputs)
+    _, states = jax.lax.scan(advance, scene.start.friction_load, frames)
+    return states, inputs
+
+
+@partial(jax.jit, static_argnames=("config", "every", "iterations"))
+def measure_excess(
+    params: Any,
+    trajectory: Trajectory,
+    scene: Scene,
+    parameters: PhysicsParameters,
+    config: SimConfig,
+    *,
+    every: int = 1,
+    iterations: tuple[int, ...] = ITERATIONS,
+) -> Excess:
+    """Compare a model, the solver after few iterations, and the optimum, from the states of a trajectory.
+
+    Teacher-forced where the trajectory is the optimum's own, on-policy where it is the model's.
+
+    Args:
+        params: Weights; None leaves the model out.
+        trajectory: Supplies the states.
+        scene: The same scene.
+        parameters: Physical constants.
+        config: With the model's architecture, and its corrector; static.
+        every: Take every so many frames, from the second on; static.
+        iterations: L-BFGS iterations to compare with; static.
+    """
+    states, inputs = trajectory_states(trajectory, scene, parameters)
+    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
+    garment, material = scene.garment, scene.material
+
+    def energy(position: Array, problem: FrameProblem) -> Array:
+        return potential(position, problem, garment, material)
+
+    def measure(frame):
+        state, inputs = frame
+        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
+        start = start_guess(problem, garment)
+        run = partial(solve, problem, garment, material, memory=_MEMORY, tolerance=0.0)
+        model = None
+        if params is not None:
+            assert config.model is not None
+            answer, _ = network_step(params, garment, material, problem, state, config.model)
+            model = run(answer, iterations=config.corrector_steps).value
+        solver = {count: run(start, iterations=count).value for count in iterations}
+        optimum = run(start, iterations=_OPTIMUM_ITERATIONS).value
+        if model is not None:
+            # The network may start in the basin of a deeper minimum than the solver finds.
+            optimum = jnp.minimum(optimum, run(answer, iterations=_OPTIMUM_ITERATIONS).value)
+        return Excess(energy(start, problem), optimum, model, solver)
+
+    return jax.lax.map(measure, taken)

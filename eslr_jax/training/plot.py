@@ -1,0 +1,36 @@
+"""Training curves (extra `plot`)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from eslr_jax.io.atomic import atomic_write
+
+_TERMS = ("stretch", "bending", "inertia", "collision", "friction")
+
+
+def plot_curves(folder: Path) -> Path | None:
+    """Draw the curves of a run's `metrics.jsonl` into `curves.png`; None without matplotlib or metrics."""
+    try:
+        import matplotlib
+    except ImportError:
+        return None
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    if not records:
+        return None
+    iterations = [record["iteration"] for record in records]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    left.plot(iterations, [record["loss"] for record in records], label="loss")
+    left.set(xlabel="iteration", ylabel="loss, in units of lifting the garment by 1 cm", yscale="symlog")
+    for term in _TERMS:
+        right.plot(iterations, [max(record[term], 1e-7) for record in records], label=term)
+    right.set(xlabel="iteration", ylabel="energy at the answer, median [J]", yscale="log")
+    right.legend()
+    with atomic_write(folder / "curves.png") as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
+    plt.close(figure)
+    return folder / "curves.png"
