@@ -42,10 +42,10 @@ def nearest_point(
     corners = [tuple(c[surface.faces[:, k]] for c in body) for k in range(3)]
     triangles = [tuple(c[candidates] for c in corner) for corner in corners]
     expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
-    squared, u, v = _point_triangle(expanded, triangles[0], triangles[1], triangles[2])
+    squared, u, v = point_triangle(expanded, triangles[0], triangles[1], triangles[2])
     best = jnp.min(squared, axis=1)
     slot = _first_true(squared <= best[:, None])
-    picked = jnp.arange(candidates.shape[1]) == slot[:, None]
+    picked = jnp.arange(candidates.shape[1])[None] == slot[:, None]
     u = jnp.sum(jnp.where(picked, u, 0.0), axis=1)
     v = jnp.sum(jnp.where(picked, v, 0.0), axis=1)
     face = jnp.sum(jnp.where(picked, candidates, 0), axis=1)
@@ -59,7 +59,7 @@ def _nearest_vertex(point: Vector3, body: Vector3, surface: BodySurface) -> Int[
     for _ in range(min(_NEAREST_PATCHES, squared.shape[1])):
         patch = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
         members.append(surface.patch_vertices[patch])
-        squared = jnp.where(jnp.arange(squared.shape[1]) == patch[:, None], jnp.inf, squared)
+        squared = jnp.where(jnp.arange(squared.shape[1])[None] == patch[:, None], jnp.inf, squared)
     candidates = jnp.concatenate(members, axis=1)
     squared = sum((c[candidates] - p[:, None]) ** 2 for c, p in zip(body, point, strict=True))
     slot = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
@@ -74,11 +74,11 @@ def _squared_distances(a: Vector3, b: Vector3) -> Float[Array, "rows columns"]:
 def _first_true(mask: Bool[Array, "rows columns"]) -> Int[Array, " rows"]:
     """Return the first true column of each row (zero if none); argmin is slow on XLA's CPU backend."""
     width = mask.shape[1]
-    index = jnp.min(jnp.where(mask, jnp.arange(width, dtype=jnp.int32), width), axis=1)
+    index = jnp.min(jnp.where(mask, jnp.arange(width, dtype=jnp.int32)[None], width), axis=1)
     return jnp.minimum(index, width - 1)
 
 
-def _point_triangle(point: Vector3, a: Vector3, b: Vector3, c: Vector3):
+def point_triangle(point: Vector3, a: Vector3, b: Vector3, c: Vector3):
     """Return the squared distance to a triangle and the weights of b and c at the closest point.
 
     The closest of: the plane's foot point if inside, and the three edges. Degenerate triangles fall back to

@@ -1,0 +1,224 @@
+"""Where cloth comes close to itself: vertex-face pairs of fixed capacity, found in sorted cells."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.contact.nearest import point_triangle
+from eslr_jax.errors import Status
+from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3
+from eslr_jax.types import Garment
+
+SEARCH_RADIUS = 0.02  # [m] within which layers see each other: they may approach by this much in a frame
+_NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to approach (ContourCraft)
+_MIN_COSINE = 0.5  # between a pair's direction and the face normal; beside a hem there is nothing to hit
+_REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
+_CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
+_CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
+_PAIRS_PER_VERTEX = 4  # default capacity, a mean over vertices
+
+
+@struct.dataclass
+class SelfContacts:
+    """Pairs of a vertex and a face of the same cloth that are close at t.
+
+    A row that is not used has `side` zero and names the last vertex.
+    """
+
+    vertices: Int[Array, " pairs"]
+    corners: Int[Array, "pairs 3"]  # vertices of the face
+    weights: Float[Array, "pairs 3"]  # barycentric, of the point of the face nearest to the vertex at t
+    side: Float[Array, " pairs"]  # 1 where the vertex is on the side of the face's normal at t, -1 behind
+    count: Int[Array, ""]  # pairs found, which may be more than there are rows
+
+
+class _Grid(NamedTuple):
+    """Faces sorted by the cell of their centroid."""
+
+    keys: Int[Array, " faces"]  # ascending
+    faces: Int[Array, " faces"]
+    origin: Float[Array, " axes"]  # [m], shape [3]
+    cell_size: Float[Array, ""]  # [m]
+
+
+def find_self_contacts(
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    garment: Garment,
+    *,
+    radius: Float[Array, ""] | float = SEARCH_RADIUS,
+    capacity: int | None = None,
+    cell_capacity: int = _CELL_CAPACITY,
+) -> tuple[SelfContacts, Int[Array, ""]]:
+    """Pair every vertex with the faces of the same cloth that it could touch during the frame.
+
+    A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
+    must stand over the face rather than beside it. Which side it is on is decided at t, where layers are
+    taken to be in order. Faces around the vertex are no pairs: those that hold it, and those within two edges
+    of it that are also within 2 cm in the rest mesh.
+
+    Args:
+        position: Vertices at t [m].
+        predicted: A guess of the vertices at t + 1 [m], such as the inertial one.
+        garment: Rest mesh.
+        radius: Of the search [m].
+        capacity: Rows for pairs; four per vertex by default. Static.
+        cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
+            centroid is close; static.
+
+    Returns:
+        The pairs, and status bits: SELF_CONTACT_OVERFLOW if a capacity was too small.
+    """
+    num_vertices = position.shape[0]
+    capacity = _PAIRS_PER_VERTEX * num_vertices if capacity is None else capacity
+    corners = [_gather(position, garment.faces[:, k]) for k in range(3)]
+    centroid = _mean(corners)
+    reach = _largest_reach(corners, centroid, garment.rest_areas > 0)
+    grid = _sort_faces(centroid, garment.rest_areas > 0, radius + reach)
+    faces, is_listed, most = _listed_faces(position, grid, cell_capacity)
+    # First by distance of centroids, which is cheap, then exactly.
+    x, y, z = components(position)
+    listed = (centroid[0][faces], centroid[1][faces], centroid[2][faces])
+    squared = _squared_distance((x[:, None], y[:, None], z[:, None]), listed)
+    is_close = is_listed & garment.vertex_mask[:, None] & (squared < grid.cell_size**2)
+    limit = cell_capacity * num_vertices
+    rows, num_close = _compact(is_close.ravel(), limit)
+    vertex = jnp.minimum(rows // faces.shape[1], num_vertices - 1)
+    face = faces.ravel()[jnp.minimum(rows, faces.size - 1)]
+    is_pair, weights, side = _is_pair(vertex, face, position, predicted, garment, radius)
+    rows, count = _compact(is_pair & (jnp.arange(limit) < num_close), capacity)
+    is_used = jnp.arange(capacity) < count
+    rows = jnp.minimum(rows, limit - 1)
+    vertex = jnp.where(is_used, vertex[rows], num_vertices - 1)
+    corner = jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1)
+    is_used = is_used & ~_is_around(vertex, corner, garment)
+    contacts = SelfContacts(
+        vertices=vertex,
+        corners=corner,
+        weights=weights[rows],
+        side=jnp.where(is_used, side[rows], 0.0),
+        count=count,
+    )
+    is_full = (most > cell_capacity) | (num_close > limit) | (count > capacity)
+    return contacts, jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
+
+
+def _mean(points: list[Vector3]) -> Vector3:
+    """Return the mean of points given by components."""
+    x, y, z = (sum(point[k] for point in points) / len(points) for k in range(3))
+    return x, y, z  # type: ignore[return-value]
+
+
+def _largest_reach(corners: list[Vector3], centroid: Vector3, is_real: Bool[Array, " faces"]) -> Array:
+    """Return the largest distance from a face's centroid to its corners [m]."""
+    squared = [jnp.max(jnp.where(is_real, _squared_distance(corner, centroid), 0.0)) for corner in corners]
+    return jnp.sqrt(jnp.max(jnp.stack(squared)))
+
+
+def _squared_distance(a: Vector3, b: Vector3) -> Array:
+    """Return squared distances between points given by components."""
+    difference = sub3(a, b)
+    return dot3(difference, difference)
+
+
+def _cell_key(cell: Int[Array, "... 3"]) -> Int[Array, ...]:
+    """Return one number per cell; cells that differ in the last coordinate alone are in sequence."""
+    cell = jnp.clip(cell, 0, _CELLS_PER_SIDE - 1)
+    return (cell[..., 0] * _CELLS_PER_SIDE + cell[..., 1]) * _CELLS_PER_SIDE + cell[..., 2]
+
+
+def _sort_faces(centroid: Vector3, is_real: Bool[Array, " faces"], cell_size: Array) -> _Grid:
+    """Sort faces by cell; padded faces come last, in a cell of their own."""
+    points = jnp.stack(centroid, axis=-1)
+    origin = jnp.min(jnp.where(is_real[:, None], points, jnp.inf), axis=0)
+    cell = jnp.floor((points - origin[None]) / cell_size).astype(jnp.int32) + 1
+    key = jnp.where(is_real, _cell_key(cell), _CELLS_PER_SIDE**3)
+    order = jnp.argsort(key)
+    return _Grid(key[order], order, origin, cell_size)
+
+
+def _listed_faces(
+    position: Float[Array, "vertices 3"], grid: _Grid, capacity: int
+) -> tuple[Int[Array, "vertices listed"], Bool[Array, "vertices listed"], Int[Array, ""]]:
+    """Return the faces in the 27 cells around every vertex, which slots are real, and the longest column."""
+    cell = jnp.floor((position - grid.origin[None]) / grid.cell_size).astype(jnp.int32) + 1
+    steps = jnp.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], jnp.int32)
+    columns = cell[:, None, :] + jnp.pad(steps, ((0, 0), (0, 1)))[None]  # [vertices, 9, 3]
+    up = jnp.array([[[0, 0, 1]]], jnp.int32)
+    first = jnp.searchsorted(grid.keys, _cell_key(columns - up), side="left")
+    last = jnp.searchsorted(grid.keys, _cell_key(columns + up), side="right")
+    slot = first[..., None] + jnp.arange(capacity, dtype=first.dtype)[None, None]  # [vertices, 9, capacity]
+    is_listed = slot < last[..., None]
+    faces = grid.faces[jnp.minimum(slot, grid.faces.shape[0] - 1)]
+    num_vertices = position.shape[0]
+    return (
+        faces.reshape(num_vertices, -1),
+        is_listed.reshape(num_vertices, -1),
+        jnp.max(last - first),
+    )
+
+
+def _compact(mask: Bool[Array, " rows"], capacity: int) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
+    """Return the first `capacity` rows where `mask` holds (the rest is past the end), and how many hold.
+
+    A binary search in the running count: `jnp.nonzero` scatters, one element at a time on a CPU.
+    """
+    running = jnp.cumsum(mask, dtype=jnp.int32)
+    rows = jnp.searchsorted(running, jnp.arange(1, capacity + 1, dtype=jnp.int32), side="left")
+    return rows, running[-1]
+
+
+def _is_pair(
+    vertex: Int[Array, " rows"],
+    face: Int[Array, " rows"],
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    garment: Garment,
+    radius: Float[Array, ""] | float,
+) -> tuple[Bool[Array, " rows"], Float[Array, "rows 3"], Float[Array, " rows"]]:
+    """Return which rows are pairs, the barycentric weights of the nearest point, and the vertex's side."""
+    corner = garment.faces[face]
+    point, a, b, c = (_gather(position, ids) for ids in (vertex, corner[:, 0], corner[:, 1], corner[:, 2]))
+    squared, u, v = point_triangle(point, a, b, c)
+    weights = (1.0 - u - v, u, v)
+    height, slope = _height(point, (a, b, c), weights)
+    moved = [_gather(predicted, ids) for ids in (vertex, corner[:, 0], corner[:, 1], corner[:, 2])]
+    predicted_height, _ = _height(moved[0], moved[1:], weights)
+    side = jnp.where(height < 0, -1.0, 1.0).astype(position.dtype)
+    is_over = jnp.abs(height) >= _MIN_COSINE * jnp.sqrt(squared)
+    is_reached = (squared < _NEAR**2) | (side * predicted_height < _NEAR)
+    holds = jnp.any(corner == vertex[:, None], axis=1)
+    is_pair = (squared < jnp.square(radius)) & is_over & is_reached & ~holds & (slope > 0)
+    return is_pair, jnp.stack(weights, axis=-1), side
+
+
+def _gather(x: Float[Array, "vertices 3"], rows: Int[Array, " rows"]) -> Vector3:
+    """Return rows of `x` by components."""
+    return x[rows, 0], x[rows, 1], x[rows, 2]
+
+
+def _height(point: Vector3, corners, weights) -> tuple[Array, Array]:
+    """Return a point's height over its foot on a face, along the normal [m], and twice the area [m^2]."""
+    normal = cross3(sub3(corners[1], corners[0]), sub3(corners[2], corners[0]))
+    size = safe_norm(jnp.stack(normal, axis=-1))
+    foot = tuple(sum(w * corner[k] for w, corner in zip(weights, corners, strict=True)) for k in range(3))
+    offset = dot3(sub3(point, foot), normal)  # type: ignore[arg-type]
+    return offset / jnp.where(size > 0, size, 1.0), size
+
+
+def _is_around(
+    vertex: Int[Array, " pairs"], corner: Int[Array, "pairs 3"], garment: Garment
+) -> Bool[Array, " pairs"]:
+    """Return which faces lie within two edges of their vertex, and near it in the rest mesh."""
+    ring = garment.neighbors[vertex]  # [pairs, degree], padded with the vertex itself
+    outer = garment.neighbors[ring].reshape(ring.shape[0], -1)  # of the second ring
+    reached = jnp.concatenate([ring, outer], axis=1)
+    is_linked = jnp.any(reached[:, :, None] == corner[:, None, :], axis=(1, 2))
+    rest = garment.rest_positions
+    offset = rest[corner] - rest[vertex][:, None, :]
+    nearest = jnp.min(jnp.sum(offset * offset, axis=-1), axis=1)
+    return is_linked & (nearest < _REST_RADIUS**2)

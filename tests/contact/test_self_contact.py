@@ -1,0 +1,276 @@
+"""Self-contact pairs against brute force in float64, and the energy on them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eslr_jax.contact import self_contact
+from eslr_jax.contact.self_contact import SelfContacts
+from eslr_jax.errors import Status
+from eslr_jax.geometry.padding import pad_garment
+from eslr_jax.geometry.prepare import prepare_garment, to_device
+from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
+from eslr_jax.types import tree_cast
+
+NEAR, RADIUS, COSINE = 0.01, 0.02, 0.5
+STIFFNESS, THICKNESS = 3.5e7, 3e-3
+_find = jax.jit(self_contact.find_self_contacts, static_argnames=("capacity", "cell_capacity"))
+
+
+def find_self_contacts(position, predicted, garment, **options):
+    return _find(position, predicted, garment, **{"capacity": 8000, "cell_capacity": 400, **options})
+
+
+def make_sheet(rows, columns, spacing):
+    index = np.arange(rows * columns).reshape(rows, columns)
+    x, z = np.meshgrid(np.arange(rows) * spacing, np.arange(columns) * spacing, indexing="ij")
+    positions = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    return positions, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+
+
+def make_cloth(rows=30, columns=10, spacing=0.012):
+    positions, faces = make_sheet(rows, columns, spacing)
+    ones = np.ones((len(positions), 1))
+    return prepare_garment(positions, faces, skin_weights=ones, skin_indices=np.zeros_like(ones, int))
+
+
+def roll_up(garment, gap=0.008, noise=1e-3, seed=0):
+    """A spiral whose layers are `gap` apart."""
+    rest = np.asarray(garment.rest_positions, np.float64)
+    s = rest[:, 0] - rest[:, 0].min()
+    a = gap / (2 * np.pi)
+    angle = np.sqrt(2 * s / a + (0.02 / a) ** 2)  # arc length of the Archimedean spiral from radius 2 cm on
+    radius = a * angle
+    noise = noise * np.random.default_rng(seed).normal(size=rest.shape)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), rest[:, 2]], axis=1) + noise
+
+
+@pytest.fixture(scope="module")
+def cloth():
+    return make_cloth()
+
+
+@pytest.fixture(scope="module")
+def spiral_contacts(cloth):
+    position = jnp.asarray(roll_up(cloth), jnp.float32)
+    return find_self_contacts(position, position, cloth)[0]
+
+
+def closest_on_triangle(p, a, b, c):
+    """Ericson, Real-Time Collision Detection, section 5.1.5; barycentric weights."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = ab @ ap, ac @ ap
+    if d1 <= 0 and d2 <= 0:
+        return np.array([1.0, 0, 0])
+    bp = p - b
+    d3, d4 = ab @ bp, ac @ bp
+    if d3 >= 0 and d4 <= d3:
+        return np.array([0, 1.0, 0])
+    if d1 * d4 - d3 * d2 <= 0 and d1 >= 0 and d3 <= 0:
+        v = d1 / (d1 - d3)
+        return np.array([1 - v, v, 0])
+    cp = p - c
+    d5, d6 = ab @ cp, ac @ cp
+    if d6 >= 0 and d5 <= d6:
+        return np.array([0, 0, 1.0])
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0 and d2 >= 0 and d6 <= 0:
+        w = d2 / (d2 - d6)
+        return np.array([1 - w, 0, w])
+    va = d3 * d6 - d5 * d4
+    if va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return np.array([0, 1 - w, w])
+    vc = d1 * d4 - d3 * d2
+    total = va + vb + vc
+    return np.array([va, vb, vc]) / total
+
+
+def brute_force(garment, position, predicted):
+    """The pairs by definition: vertex -> face -> (side, margin to the nearest decision)."""
+    rest, faces = np.asarray(garment.rest_positions, np.float64), np.asarray(garment.faces)
+    rings = {v: {v} for v in range(len(rest))}
+    for face in faces:
+        for v in face:
+            rings[v] |= set(face.tolist())
+    second = {v: set().union(*(rings[n] for n in rings[v])) for v in rings}
+    found, unsure = {}, set()
+    lowest, highest = position[faces].min(axis=1) - RADIUS, position[faces].max(axis=1) + RADIUS
+    for v, p in enumerate(position):
+        for f in np.flatnonzero(np.all((lowest <= p) & (p <= highest), axis=1)):
+            corners = faces[f]
+            if v in corners:
+                continue
+            weights = closest_on_triangle(p, *position[corners])
+            normal = np.cross(*(position[corners[1:]] - position[corners[0]]))
+            normal /= np.linalg.norm(normal)
+            distance = np.linalg.norm(p - weights @ position[corners])
+            height = (p - weights @ position[corners]) @ normal
+            moved = predicted[corners]
+            turned = np.cross(moved[1] - moved[0], moved[2] - moved[0])
+            turned /= np.linalg.norm(turned)
+            side = -1.0 if height < 0 else 1.0
+            ahead = side * (predicted[v] - weights @ moved) @ turned
+            near_rest = np.min(np.linalg.norm(rest[corners] - rest[v], axis=1)) < 0.02
+            if near_rest and second[v] & set(corners.tolist()):
+                continue
+            tests = [RADIUS - distance, abs(height) - COSINE * distance, max(NEAR - distance, NEAR - ahead)]
+            if all(t > 0 for t in tests):
+                found[v, f] = side
+            if any(abs(t) < 1e-6 for t in tests):
+                unsure.add((v, f))
+    return found, unsure
+
+
+def found_pairs(garment, contacts):
+    """Vertex, face -> side, from the rows in use."""
+    table = {tuple(sorted(face)): f for f, face in enumerate(np.asarray(garment.faces).tolist())}
+    used = np.asarray(contacts.side) != 0
+    rows = zip(
+        np.asarray(contacts.vertices)[used].tolist(),
+        np.asarray(contacts.corners)[used].tolist(),
+        np.asarray(contacts.side)[used].tolist(),
+        strict=True,
+    )
+    return {(v, table[tuple(sorted(c))]): side for v, c, side in rows}
+
+
+@pytest.mark.parametrize("gap", [0.006, 0.012])
+def test_pairs_equal_brute_force(cloth, gap):
+    position = roll_up(cloth, gap)
+    velocity = np.random.default_rng(1).normal(scale=5e-3, size=position.shape)
+    predicted = position + velocity
+    contacts, status = find_self_contacts(
+        jnp.asarray(position, jnp.float32), jnp.asarray(predicted, jnp.float32), cloth
+    )
+    expected, unsure = brute_force(cloth, position, predicted)
+    found = found_pairs(cloth, contacts)
+    assert int(status) == Status.OK
+    assert len(found) > 100
+    assert set(found) ^ set(expected) <= unsure
+    assert all(found[pair] == expected[pair] for pair in set(found) & set(expected))
+
+
+def test_flat_cloth_has_no_pairs(cloth):
+    contacts, status = find_self_contacts(cloth.rest_positions, cloth.rest_positions, cloth)
+    assert int(contacts.count) == 0
+    assert int(status) == Status.OK
+    assert not np.any(contacts.side)
+
+
+@pytest.mark.parametrize("options", [{"capacity": 50}, {"cell_capacity": 4}])
+def test_too_small_a_capacity_sets_the_bit(cloth, options):
+    position = jnp.asarray(roll_up(cloth), jnp.float32)
+    contacts, status = find_self_contacts(position, position, cloth, **options)
+    assert int(status) == Status.SELF_CONTACT_OVERFLOW
+    if "capacity" in options:
+        assert int(contacts.count) > 50  # names the capacity needed
+
+
+def test_padding_changes_no_pair(cloth):
+    position = jnp.asarray(roll_up(cloth), jnp.float32)
+    padded = to_device(pad_garment(cloth))
+    extra = padded.vertex_mask.shape[0] - position.shape[0]
+    grown = jnp.concatenate([position, jnp.zeros((extra, 3))])
+    plain, _ = find_self_contacts(position, position, cloth)
+    other, _ = find_self_contacts(grown, grown, padded)
+    assert found_pairs(cloth, plain) == found_pairs(padded, other)
+    energies = [
+        repulsion_energy(x, pairs, mesh, STIFFNESS, 0.02)
+        for x, pairs, mesh in ((position, plain, cloth), (grown, other, padded))
+    ]
+    np.testing.assert_allclose(*energies, rtol=1e-6)
+
+
+def pair_of(height, side=1.0, dtype=jnp.float32):
+    """One vertex over one triangle, in a garment of four vertices."""
+    garment = make_cloth(2, 2, 0.1)
+    position = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, -0.1], [0.03, height, -0.04]])
+    contacts = SelfContacts(
+        vertices=jnp.array([3]),
+        corners=jnp.array([[0, 1, 2]]),
+        weights=jnp.array([[0.3, 0.3, 0.4]], dtype),
+        side=jnp.array([side], dtype),
+        count=jnp.int32(1),
+    )
+    return garment, jnp.asarray(position, dtype), contacts
+
+
+def test_energy_of_one_pair_is_the_formula():
+    garment, position, contacts = pair_of(0.001)
+    height, direction = pair_heights(position, contacts)
+    assert float(height[0]) == pytest.approx(1e-3, rel=1e-5)
+    np.testing.assert_allclose([float(c[0]) for c in direction], [0, 1, 0], atol=1e-7)
+    expected = STIFFNESS * float(garment.vertex_areas[3]) * 2e-3**3
+    assert float(repulsion_energy(position, contacts, garment, STIFFNESS, THICKNESS)) == pytest.approx(
+        expected, rel=1e-4
+    )
+    behind = contacts.replace(side=-contacts.side)  # kept below: 4 mm too high
+    assert float(repulsion_energy(position, behind, garment, STIFFNESS, THICKNESS)) == pytest.approx(
+        STIFFNESS * float(garment.vertex_areas[3]) * 4e-3**3, rel=1e-4
+    )
+
+
+@pytest.mark.numerics
+def test_gradient_equals_central_differences_and_closed_form():
+    with jax.enable_x64(True):
+        garment, position, contacts = pair_of(0.001, dtype=jnp.float64)
+
+        def energy(x):
+            return repulsion_energy(x, contacts, garment, STIFFNESS, THICKNESS)
+
+        gradient = np.asarray(jax.grad(energy)(position))
+        step = 1e-6
+        offsets = step * jnp.eye(12).reshape(12, 4, 3)
+        energies = jax.vmap(energy)
+        difference = energies(position[None] + offsets) - energies(position[None] - offsets)
+        np.testing.assert_allclose(gradient.ravel(), difference / (2 * step), rtol=1e-5, atol=1e-9)
+        force = 3 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3**2
+        np.testing.assert_allclose(gradient[3], [0, -force, 0], rtol=1e-6, atol=1e-9 * force)
+
+
+@pytest.mark.numerics
+def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
+    with jax.enable_x64(True):
+        contacts = tree_cast(spiral_contacts, jnp.float64)
+        u, v = contacts.weights[:, 1], contacts.weights[:, 2]
+        contacts = contacts.replace(weights=jnp.stack([1 - u - v, u, v], axis=-1))
+        x = jnp.asarray(roll_up(cloth, seed=3), jnp.float64)
+        forces = -np.asarray(jax.grad(repulsion_energy)(x, contacts, cloth, STIFFNESS, 0.01))
+        size = np.abs(forces).sum()
+        assert size > 0
+        np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-12 * size)
+        np.testing.assert_allclose(np.cross(np.asarray(x), forces).sum(axis=0), 0.0, atol=1e-12 * size)
+
+
+def test_energy_is_finite_on_degenerate_faces_and_coincident_vertices(cloth, spiral_contacts):
+    position, contacts = jnp.asarray(roll_up(cloth), jnp.float32), spiral_contacts
+    flat = position * jnp.array([[1.0, 0.0, 0.0]])
+    for x in (flat, jnp.zeros_like(position)):
+        value, gradient = jax.value_and_grad(repulsion_energy)(x, contacts, cloth, STIFFNESS, THICKNESS)
+        assert np.isfinite(value)
+        assert np.isfinite(gradient).all()
+        pairs, _ = find_self_contacts(x, x, cloth)
+        assert np.isfinite(pairs.weights).all()
+
+
+def test_push_apart_ends_the_overlap():
+    _, position, contacts = pair_of(-0.004)
+    apart = push_apart(position, contacts, THICKNESS)
+    height, _ = pair_heights(apart, contacts)
+    assert float(height[0]) == pytest.approx(THICKNESS, abs=1e-4)
+
+
+def test_push_apart_leaves_separate_layers_alone(cloth):
+    position = jnp.asarray(roll_up(cloth, 0.012, noise=0), jnp.float32)
+    contacts, _ = find_self_contacts(position, position, cloth)
+    np.testing.assert_array_equal(push_apart(position, contacts, THICKNESS), position)
+
+
+def test_diagonal_bounds_a_third_of_the_curvature():
+    garment, position, contacts = pair_of(0.001)
+    diagonal = repulsion_diagonal(position, contacts, garment, STIFFNESS, THICKNESS)
+    curvature = 6 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3
+    np.testing.assert_allclose(diagonal, curvature / 3 * np.array([0.09, 0.09, 0.16, 1.0]), rtol=1e-4)
