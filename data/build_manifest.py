@@ -13,7 +13,10 @@ DATA = Path(__file__).parent
 SOURCES = {
     "body": ("Apache-2.0 (code), CC0 (assets)", "Anny 0.6.2, rig cmu_mb, topology notoes"),
     "garment": ("Apache-2.0", "built around the body by build_garments.py"),
-    "cmu": ("CMU mocap terms; packaging Apache-2.0", "CMU Graphics Lab motion capture, via envpool-assets 0.4.1"),
+    "cmu": (
+        "CMU mocap terms; packaging Apache-2.0",
+        "CMU Graphics Lab motion capture, via envpool-assets 0.4.1",
+    ),
     "deepmimic": ("MIT", "DeepMimic reference motions, via pybullet 3.2.7"),
     "model": ("Apache-2.0", "trained by this project"),
 }

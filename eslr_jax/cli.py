@@ -301,18 +301,19 @@ def train(
         set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
         resume: Go on from the newest checkpoint of the folder.
     """
-    from eslr_jax.config import TrainConfig, load_toml, parse_override
+    from eslr_jax.config import parse_override
     from eslr_jax.errors import ConfigError
     from eslr_jax.training.checkpoint import read_run_config
     from eslr_jax.training.loop import train as run
     from eslr_jax.training.plot import plot_curves
+    from eslr_jax.training.recipe import load_recipe
 
     if resume:
         chosen = read_run_config(out)
     elif config is None:
         raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
     else:
-        chosen = load_toml(TrainConfig, config, dict(parse_override(text) for text in set_))
+        chosen = load_recipe(config, dict(parse_override(text) for text in set_))
     _use_compile_cache()
     with _training_progress(chosen.iterations) as show:
         state = run(chosen, out, resume=resume, on_progress=show)
@@ -403,7 +404,9 @@ def evaluate(
     if json_:
         print(json.dumps(result, indent=2))
         return
-    table = Table("", "excess, median [mJ]", "relative to the drop", "on the model's own states [mJ]", box=None)
+    table = Table(
+        "", "excess, median [mJ]", "relative to the drop", "on the model's own states [mJ]", box=None
+    )
     own = result["on_policy"]
     rows = {model: (result, own)}
     rows |= {f"L-BFGS {count}": (result["lbfgs"][count], own["lbfgs"][count]) for count in result["lbfgs"]}

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import json
 import tomllib
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from eslr_jax.errors import ConfigError
@@ -117,7 +116,14 @@ class TrainConfig:
         Raises:
             ValueError: Names the field.
         """
-        for name in ("iterations", "slots_per_garment", "horizon", "horizon_growth", "log_every", "checkpoint_every"):
+        for name in (
+            "iterations",
+            "slots_per_garment",
+            "horizon",
+            "horizon_growth",
+            "log_every",
+            "checkpoint_every",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
@@ -191,25 +197,20 @@ def to_json(config: Any) -> str:
     return json.dumps(to_dict(config), indent=2)
 
 
-def load_toml(cls: type[Config], path: str | Path, overrides: dict[str, Any] | None = None) -> Config:
-    """Read a config from a TOML file, then apply dotted overrides.
+def apply_overrides(values: dict[str, Any], overrides: dict[str, Any]) -> None:
+    """Set dotted keys in nested tables.
 
     Raises:
-        ConfigError: The file is missing, not TOML, or holds an unknown or impossible value.
+        ConfigError: A key leads through something that is no table.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text())
-    except FileNotFoundError as error:
-        raise ConfigError(f"no config file {path}; give an existing TOML file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
-    for dotted, value in (overrides or {}).items():
+    for dotted, value in overrides.items():
         *tables, key = dotted.split(".")
-        target = values
+        target: Any = values
         for table in tables:
             target = target.setdefault(table, {})
+            if not isinstance(target, dict):
+                raise ConfigError(f"--set {dotted}: {table} is not a table")
         target[key] = value
-    return from_dict(cls, values)
 
 
 def parse_override(text: str) -> tuple[str, Any]:

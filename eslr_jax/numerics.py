@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-def safe_norm(x: Float[Array, "..."], axis: int = -1, keepdims: bool = False) -> Float[Array, "..."]:
+def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> Float[Array, ...]:
     """Return the Euclidean norm with a zero (not NaN) gradient at zero.
 
     Args:
@@ -20,14 +20,14 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1, keepdims: bool = False) ->
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
 
-def safe_normalize(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+def safe_normalize(x: Float[Array, ...], axis: int = -1) -> Float[Array, ...]:
     """Return unit vectors; a zero vector stays zero and has a zero gradient."""
     squared = jnp.sum(x * x, axis=axis, keepdims=True)
     is_zero = squared == 0
     return jnp.where(is_zero, 0.0, x * jax.lax.rsqrt(jnp.where(is_zero, 1.0, squared)))
 
 
-def masked_sum(x: Float[Array, "rows ..."], mask: Bool[Array, " rows"]) -> Float[Array, "..."]:
+def masked_sum(x: Float[Array, "rows ..."], mask: Bool[Array, " rows"]) -> Float[Array, ...]:
     """Sum the rows of `x` where `mask` holds; masked rows may be anything, also NaN."""
     mask = mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim))
     return jnp.sum(jnp.where(mask, x, 0), axis=0)
@@ -158,7 +158,7 @@ def vertex_normals(
 
 
 @jax.custom_jvp
-def arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
+def arctan2(y: Float[Array, ...], x: Float[Array, ...]) -> Float[Array, ...]:
     """Return the angle of (x, y), with a zero gradient at the origin.
 
     In float32 a polynomial within 2 ulp replaces the library call, which XLA does not vectorise on a CPU

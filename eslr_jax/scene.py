@@ -110,9 +110,7 @@ def reachable_faces(garment: Garment, skinned: jax.Array, poses: BodyMotion, rea
 
 
 @jax.jit
-def _clear_of_body(
-    position: jax.Array, garment: Garment, body: jax.Array, surface: BodySurface
-) -> jax.Array:
+def _clear_of_body(position: jax.Array, garment: Garment, body: jax.Array, surface: BodySurface) -> jax.Array:
     """Move vertices that lie within the clearance of the body onto it; pinned ones stay."""
 
     def project(_, position):

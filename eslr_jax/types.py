@@ -43,11 +43,11 @@ class Garment:
 class Material:
     """Fabric of a garment; scalars, or one value per face (stretch), hinge (bending) or vertex (density)."""
 
-    density: Float[Array, "..."]  # [kg/m^2]
-    lame_mu: Float[Array, "..."]  # [Pa]
-    lame_lambda: Float[Array, "..."]  # [Pa]
-    bending_stiffness: Float[Array, "..."]  # [J]
-    thickness: Float[Array, "..."]  # [m]
+    density: Float[Array, ...]  # [kg/m^2]
+    lame_mu: Float[Array, ...]  # [Pa]
+    lame_lambda: Float[Array, ...]  # [Pa]
+    bending_stiffness: Float[Array, ...]  # [J]
+    thickness: Float[Array, ...]  # [m]
 
 
 @struct.dataclass
@@ -138,7 +138,9 @@ class Trajectory:
 
     positions: Float[Array, "frames vertices 3"]  # frame 0 is the skinned start
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
-    residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame's step; 0 at the start
+    residuals: Float[
+        Array, " frames"
+    ]  # force norm over weight at the end of each frame's step; 0 at the start
     iterations: Int[Array, " frames"]  # solver or corrector iterations spent on each frame
     status: Int[Array, ""]
     first_bad_frame: Int[Array, ""]
@@ -152,5 +154,6 @@ class Trajectory:
 def tree_cast(tree: object, dtype) -> object:
     """Cast the floating-point leaves of a pytree, for float64 references."""
     return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if jax.numpy.issubdtype(leaf.dtype, jax.numpy.floating) else leaf, tree
+        lambda leaf: leaf.astype(dtype) if jax.numpy.issubdtype(leaf.dtype, jax.numpy.floating) else leaf,
+        tree,
     )

@@ -65,7 +65,9 @@ def find_asset(kind: str, name: str) -> Path:
     names = asset_names(kind)
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]}? " if close else ""
-    raise AssetError(f"no {kind} named {name!r}: {hint}there are {', '.join(names)}; a path to a file works too")
+    raise AssetError(
+        f"no {kind} named {name!r}: {hint}there are {', '.join(names)}; a path to a file works too"
+    )
 
 
 def is_intact(asset: Asset) -> bool:

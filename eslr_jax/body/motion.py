@@ -108,7 +108,9 @@ def pose_body(
     rest, joints = shape_body(body, shape)
     if shape is not None:
         # Longer legs take longer steps and carry the root higher, so that the soles stay on the floor.
-        before, after = (leg_length(body.joint_names, np.asarray(j)) for j in (body.joint_rest_positions, joints))
+        before, after = (
+            leg_length(body.joint_names, np.asarray(j)) for j in (body.joint_rest_positions, joints)
+        )
         translations = translations * (after / before)
     transforms = joint_transforms(rotations, translations, joints, body.parents)
     return BodyMotion(
@@ -138,7 +140,9 @@ def shape_body(body: Body, shape: np.ndarray | None) -> tuple[jax.Array, jax.Arr
 
 @partial(jax.jit, static_argnames="parents")
 def _joint_transforms(rotations, translations, joints, parents):
-    return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(rotations, translations, joints, parents)
+    return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(
+        rotations, translations, joints, parents
+    )
 
 
 def joint_transforms(

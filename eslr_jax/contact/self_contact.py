@@ -34,6 +34,7 @@ class SelfContacts:
     weights: Float[Array, "pairs 3"]  # barycentric, of the point of the face nearest to the vertex at t
     side: Float[Array, " pairs"]  # 1 where the vertex is on the side of the face's normal at t, -1 behind
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
+    status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
 class _Grid(NamedTuple):
@@ -53,7 +54,7 @@ def find_self_contacts(
     radius: Float[Array, ""] | float = SEARCH_RADIUS,
     capacity: int | None = None,
     cell_capacity: int = _CELL_CAPACITY,
-) -> tuple[SelfContacts, Int[Array, ""]]:
+) -> SelfContacts:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
     A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
@@ -69,9 +70,6 @@ def find_self_contacts(
         capacity: Rows for pairs; four per vertex by default. Static.
         cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
             centroid is close; static.
-
-    Returns:
-        The pairs, and status bits: SELF_CONTACT_OVERFLOW if a capacity was too small.
     """
     num_vertices = position.shape[0]
     capacity = _PAIRS_PER_VERTEX * num_vertices if capacity is None else capacity
@@ -96,15 +94,15 @@ def find_self_contacts(
     vertex = jnp.where(is_used, vertex[rows], num_vertices - 1)
     corner = jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1)
     is_used = is_used & ~_is_around(vertex, corner, garment)
-    contacts = SelfContacts(
+    is_full = (most > cell_capacity) | (num_close > limit) | (count > capacity)
+    return SelfContacts(
         vertices=vertex,
         corners=corner,
         weights=weights[rows],
         side=jnp.where(is_used, side[rows], 0.0),
         count=count,
+        status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
     )
-    is_full = (most > cell_capacity) | (num_close > limit) | (count > capacity)
-    return contacts, jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
 
 
 def _mean(points: list[Vector3]) -> Vector3:

@@ -102,7 +102,9 @@ def split_clips(split: str) -> tuple[str, ...]:
     """
     motions = load_splits()["motions"]
     if not motions.get(split):
-        raise ConfigError(f"no clips in split {split!r}; there are {', '.join(name for name in motions if motions[name])}")
+        raise ConfigError(
+            f"no clips in split {split!r}; there are {', '.join(name for name in motions if motions[name])}"
+        )
     return tuple(motions[split])
 
 

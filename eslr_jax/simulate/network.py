@@ -39,7 +39,12 @@ def graph_inputs(
 
 
 def predict_acceleration(
-    params: Any, garment: Garment, problem: FrameProblem, inputs: GraphInputs, material: Material, config: ModelConfig
+    params: Any,
+    garment: Garment,
+    problem: FrameProblem,
+    inputs: GraphInputs,
+    material: Material,
+    config: ModelConfig,
 ) -> tuple[Float[Array, "vertices 3"], Int[Array, ""]]:
     """Integrate the network's acceleration, as the paper does, and return positions and status bits.
 

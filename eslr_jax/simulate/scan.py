@@ -56,7 +56,15 @@ def scan_frames(
     """
 
     def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
-        problem = frame_problem(scene.garment, state, frame, scene.surface, scene.timestep, parameters)
+        problem = frame_problem(
+            scene.garment,
+            state,
+            frame,
+            scene.surface,
+            scene.timestep,
+            parameters,
+            self_contact=config.self_contact,
+        )
         report: StepReport
         state, report = step(params, scene.garment, scene.material, problem, state, config)
         return state, Frames(state.position, state.velocity, report.residual, report.iterations)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
@@ -42,6 +44,8 @@ def frame_problem(
     surface: BodySurface | None,
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
+    *,
+    self_contact: bool = False,
 ) -> FrameProblem:
     """Find the frame's contacts and state its minimisation problem."""
     contacts = None
@@ -49,7 +53,11 @@ def frame_problem(
         assert frame.body is not None
         assert frame.next_body is not None
         contacts = find_contacts(state.position, frame.body, frame.next_body, surface)
-    return make_problem(garment, state, contacts, frame.pin_targets, timestep, parameters)
+    self_contacts = None
+    if self_contact:
+        guess = state.position + timestep * state.velocity
+        self_contacts = find_self_contacts(state.position, guess, garment)
+    return make_problem(garment, state, contacts, frame.pin_targets, timestep, parameters, self_contacts)
 
 
 def solve(
@@ -99,15 +107,19 @@ def step(
         assert config.model is not None
         start, status = network_step(params, garment, material, problem, state, config.model)
         iterations = config.corrector_steps
-    minimum = solve(
-        problem,
-        garment,
-        material,
-        start,
-        iterations=iterations,
-        memory=config.solver_memory,
-        tolerance=config.tolerance,
-    )
+    if iterations:
+        minimum = solve(
+            problem,
+            garment,
+            material,
+            start,
+            iterations=iterations,
+            memory=config.solver_memory,
+            tolerance=config.tolerance,
+        )
+    else:  # no loop: the network alone can be differentiated through time
+        value, gradient = jax.value_and_grad(potential)(start, problem, garment, material)
+        minimum = Minimum(start, value, gradient, jnp.int32(0))
     position = pin(problem, garment, minimum.position)
     weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
     report = StepReport(safe_norm(minimum.gradient.reshape(-1)) / weight, minimum.iterations)
@@ -125,6 +137,8 @@ def next_state(
     load = state.friction_load
     if problem.contacts is not None:
         load = next_friction_load(position, problem, garment)
+    if problem.self_contacts is not None:
+        status = status | problem.self_contacts.status
     is_finite = jnp.all(jnp.isfinite(position))
     status = state.status | status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
     return ClothState(
@@ -133,5 +147,7 @@ def next_state(
         friction_load=load,
         status=status,
         frame=state.frame + 1,
-        first_bad_frame=jnp.where((state.status == 0) & (status != 0), state.frame + 1, state.first_bad_frame),
+        first_bad_frame=jnp.where(
+            (state.status == 0) & (status != 0), state.frame + 1, state.first_bad_frame
+        ),
     )

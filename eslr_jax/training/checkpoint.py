@@ -23,7 +23,9 @@ class Checkpoints:
 
     def __init__(self, folder: Path):
         """Open the folder; it is created on the first save."""
-        options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, create=True, enable_async_checkpointing=True)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=_KEPT, create=True, enable_async_checkpointing=True
+        )
         self._manager = ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
 
     def save(self, state: TrainState) -> None:
@@ -43,7 +45,9 @@ class Checkpoints:
             self._manager.wait_until_finished()
         except (OSError, ValueError) as error:
             text = str(error).splitlines()[0]
-            raise CheckpointError(f"a checkpoint could not be written: {text}; free some space and resume") from error
+            raise CheckpointError(
+                f"a checkpoint could not be written: {text}; free some space and resume"
+            ) from error
 
     def latest(self) -> int | None:
         """Return the iteration of the newest whole checkpoint."""
@@ -66,7 +70,9 @@ class Checkpoints:
             plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
         except (ValueError, KeyError, TypeError) as error:
             text = str(error).splitlines()[0]
-            raise CheckpointError(f"checkpoint {step} is for another run: {text}; choose another --out") from error
+            raise CheckpointError(
+                f"checkpoint {step} is for another run: {text}; choose another --out"
+            ) from error
         leaves = jax.tree.leaves(plain)
         return jax.tree.unflatten(jax.tree.structure(example), leaves)
 
@@ -103,7 +109,9 @@ def read_run_config(folder: Path) -> TrainConfig:
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged; start the run again in another folder") from error
     if version > FORMAT:
-        raise CheckpointError(f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax")
+        raise CheckpointError(
+            f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax"
+        )
     try:
         return from_dict(TrainConfig, values)
     except ConfigError as error:

@@ -55,9 +55,7 @@ class TrainingData:
 
     def body(self, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "surface_vertices 3"]:
         """Return the posed body surface [m]."""
-        return lbs.skin(
-            self.surface_rest, self.surface_skin_weights, self.surface_skin_indices, transforms
-        )
+        return lbs.skin(self.surface_rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
 
 
 def clips_of(split: str) -> list[str]:
@@ -68,7 +66,9 @@ def clips_of(split: str) -> list[str]:
     """
     clips = load_splits()["motions"]
     if split not in clips or not clips[split]:
-        raise ConfigError(f"no clips in split {split!r}; there are {', '.join(name for name in clips if clips[name])}")
+        raise ConfigError(
+            f"no clips in split {split!r}; there are {', '.join(name for name in clips if clips[name])}"
+        )
     return clips[split]
 
 
@@ -95,9 +95,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         surface_rest=body.rest_positions[surface.vertex_ids],
         surface_skin_weights=body.skin_weights[surface.vertex_ids],
         surface_skin_indices=body.skin_indices[surface.vertex_ids],
-        joint_transforms=joint_transforms(
-            rotations, translations, body.joint_rest_positions, body.parents
-        ),
+        joint_transforms=joint_transforms(rotations, translations, body.joint_rest_positions, body.parents),
         frames_left=jnp.asarray(frames_left, jnp.int32),
         start_frames=jnp.asarray(np.flatnonzero(frames_left), jnp.int32),
     )

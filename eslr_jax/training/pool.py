@@ -54,9 +54,7 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
     )
 
 
-def start_trajectory(
-    key: Array, data: TrainingData, garment: Garment, config: TrainConfig
-) -> Slot:
+def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: TrainConfig) -> Slot:
     """Start at a random frame of a random clip: skinned, noisy, pushed out of the body.
 
     Args:

@@ -1,0 +1,141 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError, MotionError, NonFiniteError
+from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.rollout import raise_for_status, rollout, rollout_in_chunks
+from eslr_jax.scene import SceneOptions, prepare_scene
+from eslr_jax.simulate.scan import simulate_scene
+
+PHYSICS = SimConfig(simulator="physics", solver_iterations=400, tolerance=0.1)
+SMALL = dataclasses.replace(MODELS["eslr-small"], passes=2)
+NETWORK = SimConfig(simulator="network", model=SMALL)
+
+
+@pytest.fixture(scope="module")
+def scene(tshirt, walk):
+    return prepare_scene(tshirt, walk)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return init_model(SMALL)
+
+
+@pytest.fixture(scope="module")
+def learned(scene, params):
+    return simulate_scene(params, scene, PhysicsParameters(), NETWORK)
+
+
+@pytest.fixture(scope="module")
+def physical(scene):
+    return simulate_scene(None, scene, PhysicsParameters(), PHYSICS)
+
+
+def test_physics_rollout_is_finite_and_dressed(physical, scene):
+    from eslr_jax.evaluation.report import trajectory_report
+
+    report = trajectory_report(physical, scene)
+    assert report["finite"]
+    assert report["num_frames"] == 8
+    assert report["max_principal_stretch"] < 1.3
+    assert report["penetration_p999_mm"] < 3.0
+
+
+def test_frame_zero_is_clear_of_the_body(scene):
+    from eslr_jax.contact.nearest import find_contacts
+
+    body = scene.body_positions[0]
+    contacts = find_contacts(scene.start.position, body, body, scene.surface)
+    assert float(contacts.distances.min()) > 0
+
+
+def test_frame_by_frame_equals_one_scan(scene, params, learned):
+    parts, timing = rollout_in_chunks(params, scene, config=NETWORK, chunk=1)
+    assert parts.positions.shape == learned.positions.shape
+    np.testing.assert_allclose(parts.positions, learned.positions, atol=1e-4)
+    assert timing.frame_ms > 0
+
+
+def test_corrector_lowers_the_residual(scene, params, learned):
+    corrected = simulate_scene(
+        params, scene, PhysicsParameters(), dataclasses.replace(NETWORK, corrector_steps=30)
+    )
+    assert float(jnp.median(corrected.residuals[1:])) < 0.2 * float(jnp.median(learned.residuals[1:]))
+    assert int(corrected.iterations[1:].max()) == 30
+
+
+def test_tolerance_stops_early(physical):
+    assert float(physical.residuals[1:].max()) <= 0.1
+    assert int(physical.iterations[1:].max()) < 400
+
+
+def test_gradient_through_time_is_finite(scene, params):
+    short = scene.replace(body_positions=scene.body_positions[:3], num_frames=3)
+
+    def height(weights):
+        trajectory = simulate_scene({**params, "params": weights}, short, PhysicsParameters(), NETWORK)
+        return jnp.sum(trajectory.positions[-1, :, 1])
+
+    gradient = jax.tree.leaves(jax.grad(height)(params["params"]))
+    assert all(np.isfinite(leaf).all() for leaf in gradient)
+    assert any(float(jnp.abs(leaf).max()) > 0 for leaf in gradient)
+
+
+def test_scene_without_a_body_falls_like_implicit_euler(tshirt, walk):
+    options = SceneOptions(has_body=False, start_at_rest=True)
+    scene = prepare_scene(tshirt, walk, options=options)
+    scene = scene.replace(start=scene.start.replace(position=tshirt.rest_positions))
+    assert scene.surface is None
+    trajectory = simulate_scene(None, scene, PhysicsParameters(), PHYSICS)
+    mass = np.asarray(tshirt.vertex_areas)
+    height = (np.asarray(trajectory.positions)[..., 1] * mass).sum(axis=1) / mass.sum()
+    frames, timestep = np.arange(8), 1 / 30
+    # Backward Euler: velocity after n steps is -g n dt, so the fall is g dt^2 n (n + 1) / 2.
+    fall = 9.81 * timestep**2 * frames * (frames + 1) / 2
+    np.testing.assert_allclose(height[0] - height, fall, rtol=2e-3, atol=1e-5)
+
+
+def test_non_finite_positions_raise_with_the_frame(scene):
+    broken = scene.replace(body_positions=scene.body_positions.at[4].set(jnp.nan))
+    trajectory = simulate_scene(None, broken, PhysicsParameters(), PHYSICS)
+    with pytest.raises(NonFiniteError, match="frame 4"):
+        raise_for_status(trajectory)
+
+
+def test_network_without_weights_is_refused(tshirt, walk):
+    with pytest.raises(ConfigError, match="load_model"):
+        rollout(None, tshirt, walk, config=NETWORK)
+
+
+def test_single_frame_is_refused(tshirt, walk):
+    single = walk.replace(positions=walk.positions[:1], joint_transforms=walk.joint_transforms[:1])
+    with pytest.raises(MotionError, match="two frames"):
+        prepare_scene(tshirt, single)
+
+
+def test_vmap_equals_one_by_one(scene, params, learned):
+    starts = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), scene.start)
+    starts = starts.replace(velocity=starts.velocity.at[1].multiply(0.5))
+
+    def run(start):
+        return simulate_scene(params, scene.replace(start=start), PhysicsParameters(), NETWORK).positions
+
+    together = jax.vmap(run)(starts)
+    slower = run(jax.tree.map(lambda leaf: leaf[1], starts))
+    np.testing.assert_allclose(together[0], learned.positions, atol=1e-4)
+    np.testing.assert_allclose(together[1], slower, atol=1e-4)
+
+
+def test_one_trace_per_shape(scene):
+    simulate_scene(None, scene, PhysicsParameters(), PHYSICS)
+    before = simulate_scene._cache_size()
+    faster = scene.replace(start=scene.start.replace(velocity=2 * scene.start.velocity))
+    simulate_scene(None, faster, PhysicsParameters(gravity=3.0), PHYSICS)
+    assert simulate_scene._cache_size() == before
