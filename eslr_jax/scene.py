@@ -14,7 +14,7 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import MotionError
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.types import BodyMotion, BodySurface, ClothState, Garment, Material, Scene
+from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
 REACH = 0.12  # [m] that cloth is expected to stray from its skinned position; farther body faces are left out
 _SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
@@ -37,6 +37,7 @@ def prepare_scene(
     *,
     material: Material = COTTON,
     options: SceneOptions | None = None,
+    surface: BodySurface | None = None,
 ) -> Scene:
     """Collect what a rollout reads, and leave out what it does not need.
 
@@ -47,6 +48,8 @@ def prepare_scene(
         poses: The body in motion.
         material: Fabric.
         options: What to leave out or add.
+        surface: Search this part of the body instead of what the garment can reach, so that several scenes
+            share one compiled rollout; see `shared_surface`.
 
     Raises:
         MotionError: The motion has fewer than two frames.
@@ -56,12 +59,11 @@ def prepare_scene(
     if num_frames < 2:
         raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
     skinned = skin_garment(garment, poses.joint_transforms)
-    surface = body_positions = None
-    if options.has_body:
+    if surface is None and options.has_body:
         faces = reachable_faces(garment, skinned, poses, options.reach)
         if len(faces):
             surface = prepare_surface(np.asarray(poses.rest_positions), faces)
-            body_positions = poses.positions[:, surface.vertex_ids]
+    body_positions = None if surface is None else poses.positions[:, surface.vertex_ids]
     position = skinned[0]
     if surface is not None:
         assert body_positions is not None
@@ -107,6 +109,16 @@ def reachable_faces(garment: Garment, skinned: jax.Array, poses: BodyMotion, rea
         is_near |= np.isfinite(distance)
     faces = np.asarray(poses.faces)
     return faces[is_near[faces].any(axis=1) & np.asarray(poses.is_obstacle)]
+
+
+def shared_surface(garments: list[Garment], body: Body, reach: float = 0.15) -> BodySurface:
+    """Return the obstacle faces within `reach` [m] of any of the garments in the rest pose."""
+    points = np.concatenate([np.asarray(g.rest_positions)[np.asarray(g.vertex_mask)] for g in garments])
+    rest = np.asarray(body.rest_positions)
+    distance, _ = cKDTree(points).query(rest, distance_upper_bound=reach)
+    faces = np.asarray(body.faces)
+    chosen = np.isfinite(distance)[faces].any(axis=1) & np.asarray(body.is_obstacle)
+    return prepare_surface(rest, faces[chosen])
 
 
 @jax.jit

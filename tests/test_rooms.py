@@ -9,8 +9,8 @@ PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 
 # From the top of the house down; a room may import itself and what stands before it.
 ROOMS = [
-    "errors", "types", "config", "numerics", "io", "geometry", "body", "assets", "contact", "physics", "graph",
-    "models", "scene", "simulate", "rollout", "training", "render", "evaluation", "cli",
+    "errors", "types", "config", "numerics", "io", "geometry", "body", "assets", "contact", "physics",
+    "graph", "models", "scene", "simulate", "rollout", "training", "render", "evaluation", "cli",
 ]  # fmt: skip
 KERNELS = {"numerics", "contact", "graph", "models", "physics", "simulate"}
 HOST = {"io", "geometry", "assets", "scene", "rollout", "render", "cli"}

@@ -10,16 +10,21 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import Motion, pose_body
+from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
 from eslr_jax.evaluation.metrics import measure_frames
+from eslr_jax.geometry.padding import common_bucket, garment_bucket, pad_garment
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scene
+from eslr_jax.scene import prepare_scene, shared_surface
 from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.types import Garment
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
+_STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
+_STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,24 +69,27 @@ def evaluate(
     config = SimConfig(simulator="network", model=model, corrector_steps=corrector_steps)
     body = load_body()
     scenes, forced, policy = [], [], []
+    drifts: dict[str, float] = {}
     total = len(garments) * len(clips)
-    for garment in garments:
-        cloth = load_garment(
-            garment,
-            vertices=options.vertices,  # type: ignore[arg-type]
-            embedding_size=model.embedding_size,
-            embedding_mode=model.embedding_mode,
-            pad=True,
-        )
+    cloths = _load_alike(garments, options.vertices, model)
+    surface = shared_surface(cloths, body)
+    for garment, cloth in zip(garments, cloths, strict=True):
         for clip in clips:
             motion = load_motion(clip)
-            scene = prepare_scene(cloth, pose_body(body, back_and_forth(motion, options.excess_frames)))
-            long = prepare_scene(cloth, pose_body(body, back_and_forth(motion, options.rollout_frames)))
-            on_truth, on_policy = _excesses(params, scene, config, options.every)
+
+            def scene_of(num_frames: int, motion=motion, cloth=cloth):
+                poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
+                return prepare_scene(cloth, poses, surface=surface)
+
+            on_truth, on_policy = _excesses(params, scene_of(options.excess_frames), config, options.every)
             forced.append(on_truth)
             policy.append(on_policy)
-            scenes.append({"garment": garment, "clip": clip, **_free_rollout(params, long, config)})
+            free = _free_rollout(params, scene_of(options.rollout_frames), config)
+            scenes.append({"garment": garment, "clip": clip, **free})
             on_scene(len(scenes), total, f"{garment} {clip}")
+        still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
+        resting = prepare_scene(cloth, pose_body(body, still, arm_abduction=0.0), surface=surface)
+        drifts[garment] = _drift(params, resting, config)
     return {
         "split": options.split,
         "vertices": options.vertices,
@@ -89,9 +97,24 @@ def evaluate(
         "clips": list(clips),
         **_summarize(forced),
         "on_policy": _summarize(policy),
-        "rollout": _pool_rollouts(scenes),
+        "rollout": _pool_rollouts(scenes) | {"drift_mm_s": max(drifts.values()), "drift_mm_s_of": drifts},
         "scenes": scenes,
     }
+
+
+def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> list[Garment]:
+    """Load garments padded to one bucket: all scenes then share one compiled rollout."""
+    cloths = [
+        load_garment(
+            name,
+            vertices=vertices,  # type: ignore[arg-type]
+            embedding_size=model.embedding_size,
+            embedding_mode=model.embedding_mode,
+        )
+        for name in names
+    ]
+    bucket = common_bucket([garment_bucket(cloth) for cloth in cloths])
+    return [to_device(pad_garment(cloth, bucket)) for cloth in cloths]
 
 
 def split_clips(split: str) -> tuple[str, ...]:
@@ -173,6 +196,16 @@ def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:
         "penetration_p999_mm": float(max(np.quantile(depth, 0.999), 0.0) * 1e3),
         "coverage": _coverage(positions[-1], np.asarray(scene.body_positions)[-1]),
     }
+
+
+def _drift(params: Any, scene, config: SimConfig) -> float:
+    """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s]."""
+    trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
+    areas = np.asarray(scene.garment.vertex_areas)
+    centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
+    frames = round(1.0 / float(scene.timestep))
+    moved = centre[-1] - centre[-1 - frames]
+    return float(np.hypot(moved[0], moved[2]) * 1e3)
 
 
 def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float:

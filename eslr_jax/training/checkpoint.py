@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: asynchronous, rotated, never half-written (the only room that imports orbax)."""
+"""Checkpoints of a training run: asynchronous, rotated, never half-written."""
 
 from __future__ import annotations
 

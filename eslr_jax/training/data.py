@@ -7,21 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
-from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body import lbs
 from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
-from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.padding import common_bucket, garment_bucket, pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.types import Body, BodySurface, Garment
+from eslr_jax.scene import shared_surface
+from eslr_jax.types import BodySurface, Garment
 
 _FPS = 30.0
-_REACH = 0.15  # [m] of rest-pose body faces around the rest garments
 
 
 @struct.dataclass
@@ -47,7 +45,7 @@ class TrainingData:
         return jax.tree.map(lambda leaf: leaf[index], self.garments)
 
     def transforms(self, frame: Int[Array, ""], yaw: Float[Array, ""]) -> Float[Array, "joints 3 4"]:
-        """Return joint transforms of a frame, the whole scene turned about the vertical axis by `yaw` [rad]."""
+        """Return joint transforms of a frame, the scene turned about the vertical by `yaw` [rad]."""
         cos, sin = jnp.cos(yaw), jnp.sin(yaw)
         zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
         turn = jnp.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
@@ -86,7 +84,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     stacked = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *[to_device(pad_garment(garment, bucket)) for garment in garments]
     )
-    surface = prepare_surface(np.asarray(body.rest_positions), _faces_near(body, garments))
+    surface = shared_surface(garments, body)
     motions = [load_motion(clip) for clip in clips_of(config.split)]
     rotations, translations, frames_left = _join_clips(motions)
     return TrainingData(
@@ -99,14 +97,6 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         frames_left=jnp.asarray(frames_left, jnp.int32),
         start_frames=jnp.asarray(np.flatnonzero(frames_left), jnp.int32),
     )
-
-
-def _faces_near(body: Body, garments: list[Garment]) -> np.ndarray:
-    """Return the obstacle faces near any garment in the rest pose."""
-    points = np.concatenate([np.asarray(g.rest_positions)[np.asarray(g.vertex_mask)] for g in garments])
-    distance, _ = cKDTree(points).query(np.asarray(body.rest_positions), distance_upper_bound=_REACH)
-    faces = np.asarray(body.faces)
-    return faces[np.isfinite(distance)[faces].any(axis=1) & np.asarray(body.is_obstacle)]
 
 
 def _join_clips(motions: list[Motion]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -120,8 +120,8 @@ def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoi
             **{str(i): leaf for i, leaf in enumerate(jax.tree.leaves(jax.device_get(state.pools)))},
         )
         raise NonFiniteError(
-            f"{skipped} updates were not finite by iteration {int(state.iteration)}; the last good checkpoint is "
-            f"{last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
+            f"{skipped} updates were not finite by iteration {int(state.iteration)}; the last good checkpoint "
+            f"is {last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
         )
 
 
