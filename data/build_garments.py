@@ -42,47 +42,78 @@ from garment_solid import (
     make_grid,
     nearest_body_weights,
     signed_distance,
+    smoothstep,
 )
 from garment_specs import LEVELS, SPECS, GarmentSpec
 
 CLEARANCE = 0.005  # smallest distance between garment and body at rest [m]
+FIXED_TO_HIPS = ("LHipJoint", "RHipJoint")  # joints of the CMU skeleton that have no rotation of their own
+BODICE_SMOOTHING = 0.03  # diffusion length of skin weights above the waist [m]
+WAIST_HEIGHT = (
+    0.25  # from here down to the hips, the diffusion of skin weights grows to that of the skirt [m]
+)
 FAIRING = 0.025  # bumps of the solid narrower than a few times this are smoothed away [m]
 POSITION_STEP = 2.0**-17  # stored positions are multiples of this [m]: 8 micrometres, and they compress well
 WEIGHT_LEVELS = 1024  # stored weights are multiples of 1 / WEIGHT_LEVELS and sum to one exactly
 
 
-def push_out(vertices: np.ndarray, body: Body, clearance: float) -> np.ndarray:
-    """Move vertices that are closer than `clearance` [m] to the body away from it."""
+def push_out(vertices: np.ndarray, faces: np.ndarray, body: Body, clearance: float) -> np.ndarray:
+    """Move cloth, triangles included, that is closer than `clearance` [m] to the body away from it."""
+    edges, _ = mesh_edges(faces)
     normals = face_normals(body.vertices, body.faces)
-    for _ in range(5):
-        distance, face, closest, _ = igl.signed_distance(vertices, body.vertices, body.faces)
-        near = distance < clearance
-        if not near.any():
+    corners = np.concatenate(
+        [np.repeat(np.arange(len(vertices))[:, None], 3, axis=1), edges[:, [0, 1, 1]], faces]
+    )
+    for _ in range(10):
+        samples = np.concatenate([vertices, vertices[edges].mean(axis=1), vertices[faces].mean(axis=1)])
+        distance, face, closest, _ = igl.signed_distance(samples, body.vertices, body.faces)
+        near = np.flatnonzero(distance < clearance)
+        if not near.size:
             break
-        outward = np.where(distance > 1e-4, 1.0, -1.0)[:, None] * (vertices - closest)
+        outward = np.sign(distance[near])[:, None] * (samples[near] - closest[near])
         length = np.linalg.norm(outward, axis=1, keepdims=True)
-        outward = np.where(length > 1e-4, outward / np.maximum(length, 1e-9), normals[face])
-        vertices = vertices + np.where(near, clearance - distance, 0.0)[:, None] * outward
+        outward = np.where(length > 1e-4, outward / np.maximum(length, 1e-9), normals[face[near]])
+        push = (clearance - distance[near])[:, None] * outward
+        total, count = np.zeros_like(vertices), np.zeros((len(vertices), 1))
+        np.add.at(total, corners[near], push[:, None])
+        np.add.at(count, corners[near], 1.0)
+        vertices = vertices + total / np.maximum(count, 1.0)
     return vertices
 
 
 def garment_weights(vertices: np.ndarray, body: Body, leg_follow: float) -> np.ndarray:
     """Return dense skin weights [V, J] of the closest body points, with `leg_follow` of the legs' weights."""
     dense = nearest_body_weights(vertices, body)
+    for name in FIXED_TO_HIPS:
+        dense[:, body.columns["Hips"]] += dense[:, body.columns[name]]
+        dense[:, body.columns[name]] = 0.0
     legs = [body.columns[name] for name in limb_names(LEG)]
     dense[:, body.columns["Hips"]] += (1.0 - leg_follow) * dense[:, legs].sum(axis=1)
     dense[:, legs] *= leg_follow
     return dense
 
 
+def smooth_weights(dense: np.ndarray, surface: Surface, skirt_smoothing: float) -> np.ndarray:
+    """Diffuse skin weights [V, J] over `BODICE_SMOOTHING`, and over `skirt_smoothing` [m] below the hips."""
+    bodice = diffuse(dense, surface, BODICE_SMOOTHING)
+    if skirt_smoothing <= BODICE_SMOOTHING:
+        return bodice
+    share = smoothstep(1.0 - surface[0][:, 1:2] / WAIST_HEIGHT)
+    return (1.0 - share) * bodice + share * diffuse(dense, surface, skirt_smoothing)
+
+
 def quantise_weights(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keep the four largest weights, normalised to multiples of 1 / WEIGHT_LEVELS that sum to one.
+
+    The fifth is subtracted first: where the fourth and the fifth change places, neither jumps, so cloth that
+    is skinned with the result has no creases.
 
     Returns:
         Weights [V, 4] float32 and joint indices [V, 4] int16, largest first.
     """
-    indices = np.argsort(-dense, axis=1, kind="stable")[:, :4]
+    indices = np.argsort(-dense, axis=1, kind="stable")[:, :5]
     top = np.clip(np.take_along_axis(dense, indices, axis=1), 0.0, None)
+    indices, top = indices[:, :4], top[:, :4] - top[:, 4:]
     counts = np.round(top / top.sum(axis=1, keepdims=True) * WEIGHT_LEVELS)
     counts[:, 0] += WEIGHT_LEVELS - counts.sum(axis=1)
     indices = np.where(counts > 0, indices, 0)
@@ -105,9 +136,9 @@ def build_level(body: Body, pattern: Surface, spec: GarmentSpec, num_vertices: i
     """Return the arrays of one garment file."""
     vertices, faces = remesh(pattern, num_vertices, len(boundary_loops(pattern[1])))
     vertices, faces = fit_to_cut(vertices, faces, pattern)
-    vertices, faces = reorder(push_out(vertices, body, CLEARANCE), faces)
-    dense = diffuse(garment_weights(vertices, body, spec.leg_follow), (vertices, faces), spec.smoothing)
-    weights, indices = quantise_weights(dense)
+    vertices, faces = reorder(push_out(vertices, faces, body, CLEARANCE), faces)
+    dense = garment_weights(vertices, body, spec.leg_follow)
+    weights, indices = quantise_weights(smooth_weights(dense, (vertices, faces), spec.skirt_smoothing))
     stored = np.round((vertices + body.origin) / POSITION_STEP) * POSITION_STEP
     return {
         "rest_positions": stored.astype(np.float32),

@@ -67,7 +67,7 @@ class GarmentSpec:
     sleeve: Sleeve | None = None
     trouser: Trouser | None = None
     drapes: tuple[Drape, ...] = ()
-    smoothing: float = 0.03  # diffusion length of the skin weights [m]
+    skirt_smoothing: float = 0.0  # diffusion length of the skin weights below the hips [m]
     leg_follow: float = 1.0  # share of the legs' skin weights that is kept; the rest goes to the hips
     pin_depth: float = 0.0  # vertices within this distance below the top edge are pinned [m]
 
@@ -76,15 +76,15 @@ CREW = Neck(0.575, 0.099, 0.070, 0.022)
 SCOOP = Neck(0.575, 0.088, 0.135, 0.075)
 SPECS = {
     "tshirt": GarmentSpec(
-        0.010, 0.030, leg_follow=0.5, neck=CREW, sleeve=Sleeve(0.66, (0.012, 0.020, 0.024)),
+        0.010, 0.030, leg_follow=0.7, neck=CREW, sleeve=Sleeve(0.66, (0.012, 0.020, 0.024)),
         drapes=(Drape(0.46, -0.10, 0.022, flare=0.02),),
     ),
     "tank": GarmentSpec(
-        0.010, 0.030, leg_follow=0.5, pin_depth=0.025, neck=SCOOP, armhole=Armhole(),
+        0.010, 0.030, leg_follow=0.7, pin_depth=0.025, neck=SCOOP, armhole=Armhole(),
         drapes=(Drape(0.46, -0.10, 0.012, flare=0.02),),
     ),
     "longsleeve": GarmentSpec(
-        0.010, 0.025, leg_follow=0.5, neck=CREW, sleeve=Sleeve(1.90, (0.012, 0.018, 0.018, 0.016, 0.014)),
+        0.010, 0.025, leg_follow=0.7, neck=CREW, sleeve=Sleeve(1.90, (0.012, 0.018, 0.018, 0.016, 0.014)),
         drapes=(Drape(0.46, -0.12, 0.018),),
     ),
     "shorts": GarmentSpec(0.010, 0.006, trouser=Trouser(-0.27, 0.13, (0.016, 0.022, 0.028)), pin_depth=0.04),
@@ -92,19 +92,19 @@ SPECS = {
         0.010, 0.006, trouser=Trouser(-0.875, 0.13, (0.014, 0.020, 0.024, 0.022, 0.028)), pin_depth=0.04
     ),
     "dress": GarmentSpec(
-        0.010, 0.030, neck=SCOOP, armhole=Armhole(), smoothing=0.12, pin_depth=0.025,
+        0.010, 0.030, neck=SCOOP, armhole=Armhole(), skirt_smoothing=0.12, pin_depth=0.025,
         drapes=(Drape(0.24, -0.52, 0.012, flare=0.20),),
     ),
     "kneepants": GarmentSpec(
         0.010, 0.006, trouser=Trouser(-0.50, 0.13, (0.014, 0.022, 0.026)), pin_depth=0.04
     ),
     "shortsleeve": GarmentSpec(
-        0.009, 0.025, leg_follow=0.5, neck=Neck(0.570, 0.108, 0.082, 0.032),
+        0.009, 0.025, leg_follow=0.7, neck=Neck(0.570, 0.108, 0.082, 0.032),
         sleeve=Sleeve(0.50, (0.010, 0.016)),
         drapes=(Drape(0.46, -0.04, 0.012),),
     ),
     "tightdress": GarmentSpec(
-        0.009, 0.030, neck=SCOOP, armhole=Armhole(), smoothing=0.08, pin_depth=0.025,
+        0.009, 0.030, neck=SCOOP, armhole=Armhole(), skirt_smoothing=0.05, pin_depth=0.025,
         drapes=(Drape(0.20, -0.36, 0.008),),
     ),
 }  # fmt: skip
