@@ -6,6 +6,8 @@ benchmarks. It reads the same weights and the same graph as the package and shar
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,9 @@ def numpy_segment_sum(rows, segments, num_segments):
     np.add.at(total, np.asarray(segments), rows)
     return total
 
+
+# Compiles in half the time; for tests of what is computed, not of how.
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 SEGMENT_SUMS = {np: numpy_segment_sum, jnp: jax.ops.segment_sum}
 
@@ -128,7 +133,7 @@ def plain_block(x, embedding, mask, projection, weights, config, xp):
     located = xp.concatenate([here, embedding / 0.5], axis=1)
     queries, keys, values = located @ weights["query"], located @ weights["key"], here @ weights["value"]
     phi_q, phi_k = plain_features(queries, keys, projection, config.attention_kernel, xp)
-    phi_k = phi_k * mask[:, None]
+    phi_k = phi_k * mask[:, None].astype(x.dtype)
     attended = (phi_q @ (phi_k.T @ values)) / (phi_q @ phi_k.sum(axis=0)[:, None])
     x = x + attended @ weights["output"] + weights["output_bias"]
     if config.attention_feedforward:
@@ -138,9 +143,7 @@ def plain_block(x, embedding, mask, projection, weights, config, xp):
 
 def plain_normalize(rows, normalizer, num_static, xp):
     changing = rows[:, : rows.shape[1] - num_static]
-    deviation = xp.maximum(
-        xp.sqrt(normalizer.squared_deviations / xp.maximum(normalizer.count, 1.0)), 1e-8
-    )
+    deviation = xp.maximum(xp.sqrt(normalizer.squared_deviations / xp.maximum(normalizer.count, 1.0)), 1e-8)
     deviation = xp.where(normalizer.count > 0, deviation, 1.0)
     return xp.concatenate([(changing - normalizer.mean) / deviation, rows[:, changing.shape[1] :]], axis=1)
 
@@ -229,7 +232,9 @@ def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool 
 
     def noise(scale, *columns):
         rows = scale * generator.standard_normal((num_real, *columns))
-        return jnp.asarray(np.pad(rows, ((0, num_vertices - num_real), *[(0, 0)] * len(columns))), jnp.float32)
+        return jnp.asarray(
+            np.pad(rows, ((0, num_vertices - num_real), *[(0, 0)] * len(columns))), jnp.float32
+        )
 
     position = garment.rest_positions + noise(0.003, 3)
     outward = np.asarray(position) * [1, 0, 1]

@@ -75,8 +75,8 @@ def world_tables(
 
 
 def _take(x: Float[Array, "rows features"], indices: Int[Array, " items"]) -> Float[Array, "items features"]:
-    """Gather rows; indices are known to be in range."""
-    return x.at[indices].get(mode="promise_in_bounds")
+    """Gather rows; indices are known to be in range and not negative."""
+    return x.at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _append_zero(x: Float[Array, "rows features"]) -> Float[Array, "rows_and_one features"]:

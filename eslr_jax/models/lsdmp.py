@@ -71,11 +71,10 @@ class LsdmpLayer(nn.Module):
         size, is_residual = self.config.latent_size, self.config.residual
         garment, body = latents.garment, latents.body
         edge = self.mesh_mlp
-        mesh_step = edge.finish(
-            edge.start(latents.mesh, 2 * size)
-            + take_receivers(edge.start(garment, 0, bias=True), mesh)
-            + take_senders(edge.start(garment, size), mesh)
-        )
+        ends = take_receivers(edge.start(garment, 0, bias=True), mesh) + take_senders(
+            edge.start(garment, size), mesh
+        )  # summed first: one kernel gathers both
+        mesh_step = edge.finish(edge.start(latents.mesh, 2 * size) + ends)
         mesh_sum = sum_receivers(mesh_step, mesh)
         vertex = self.vertex_mlp
         hidden = vertex.start(garment, 0, bias=True) + vertex.start(mesh_sum, size)

@@ -1,0 +1,260 @@
+"""Graphs and features against float64 NumPy, written down from the facts and not from the code."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_models import make_scene, quick_jit, to_float64
+
+from eslr_jax.config import ModelConfig
+from eslr_jax.errors import Status
+from eslr_jax.graph.build import (
+    build_frame_graph,
+    build_graph,
+    build_pass_graph,
+    feature_sizes,
+    join_features,
+)
+from eslr_jax.graph.features import mean_edge_length
+from eslr_jax.graph.inputs import next_pass
+
+HOOD = ModelConfig()
+GRADIENT = ModelConfig(features="gradient", output="correction", update_body=False)
+
+
+def build(config, scene):
+    return quick_jit(lambda *scene: build_graph(*scene, config))(*scene)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(8, 6)
+
+
+@pytest.fixture(scope="module")
+def hood_graph(scene):
+    return build(HOOD, scene)
+
+
+@pytest.fixture(scope="module")
+def gradient_graph(scene):
+    return build(GRADIENT, scene)
+
+
+def numpy_normals(faces, x):
+    normals = np.zeros_like(x)
+    for a, b, c in faces:
+        for corner in (a, b, c):
+            normals[corner] += np.cross(x[b] - x[a], x[c] - x[a])
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def with_norm(x):
+    return np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
+
+
+MATERIAL = np.array([0.6475, 0.2845, 0.4551])  # bending, mu, lambda inputs of HOOD's evaluation fabric
+
+
+def test_hood_garment_features(scene, hood_graph):
+    garment, _, inputs = (to_float64(tree) for tree in scene)
+    count = len(garment.vertex_areas)
+    expected = np.concatenate(
+        [
+            inputs.velocity,
+            numpy_normals(garment.faces, inputs.position),
+            np.full((count, 1), 1 / 30),
+            np.log(0.20022 * garment.vertex_areas)[:, None],
+            np.tile(MATERIAL, (count, 1)),
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(hood_graph.nodes["garment"], expected, atol=1e-4)
+    assert set(np.unique(hood_graph.globals["garment_type"])) == {0, 3}
+
+
+def test_hood_mesh_features(scene, hood_graph):
+    garment, _, inputs = (to_float64(tree) for tree in scene)
+    edges = [(a, b) for a, b in zip(garment.senders, garment.receivers, strict=True)]
+    rows = []
+    for sender, receiver in edges:
+        now = inputs.position[sender] - inputs.position[receiver]
+        rest = garment.rest_positions[sender] - garment.rest_positions[receiver]
+        rows.append([*now, np.linalg.norm(now), *rest, np.linalg.norm(rest), 1 / 30, *MATERIAL])
+    np.testing.assert_allclose(hood_graph.edges["mesh"], rows, atol=1e-4)
+
+
+def test_hood_world_features_and_the_rows_beyond_the_radius(scene, hood_graph):
+    _, _, inputs = (to_float64(tree) for tree in scene)
+    contacts = inputs.contacts
+    is_close = np.abs(contacts.distances) <= 0.03
+    assert 0 < is_close.sum() < len(is_close)
+    now, later = inputs.position - contacts.points, inputs.position - contacts.next_points
+    step = np.full((len(now), 1), 1 / 30)
+    expected = np.concatenate([with_norm(now), with_norm(later), step], axis=1)
+    expected[~is_close] = 0
+    np.testing.assert_allclose(hood_graph.edges["world"], expected, atol=1e-6)
+    np.testing.assert_array_equal(hood_graph.globals["world_mask"], is_close)
+    reverse = np.concatenate([with_norm(-now), with_norm(-later), step], axis=1)
+    reverse[~is_close] = 0
+    np.testing.assert_allclose(hood_graph.edges["world_reverse"], reverse, atol=1e-6)
+    body = np.concatenate([inputs.body_velocity, contacts.normals, step, -np.ones((len(now), 4))], axis=1)
+    body[~is_close] = 0
+    np.testing.assert_allclose(hood_graph.nodes["body"], body, atol=1e-6)
+
+
+def test_gradient_node_features(scene, gradient_graph):
+    garment, _, inputs = (to_float64(tree) for tree in scene)
+    rest = garment.rest_positions
+    spacing = np.mean(np.linalg.norm(rest[garment.senders] - rest[garment.receivers], axis=1))
+    np.testing.assert_allclose(mean_edge_length(scene[0]), spacing, rtol=1e-6)
+    cut = lambda x: np.clip(x, -5, 5)  # noqa: E731
+    rows = []
+    for v, normal in enumerate(numpy_normals(garment.faces, inputs.position)):
+        area = garment.vertex_areas[v]
+        diagonal = 0.20022 * area * 900 + 4.7e-4 * (2 * 23600 + 44400)
+        step = -inputs.gradient[v] / diagonal / (0.1 * spacing)
+        row = [*cut(inputs.velocity[v] / 0.02), *normal, 0.0, np.log(0.20022 / 0.2)]
+        row += [cut(np.log(area / spacing**2)), np.log(spacing / 0.02), garment.is_pinned[v], *MATERIAL]
+        row += [*cut((inputs.guess[v] - inputs.inertial_guess[v]) / 0.01)]
+        for force in (-inputs.gradient[v], -inputs.previous_gradient[v]):
+            size = np.arcsinh(np.linalg.norm(force) / inputs.weight[v]) / 2
+            row += [*(force / np.linalg.norm(force) * size), size]
+            if force is not inputs.previous_gradient[v] and len(row) == 21:
+                row += [*np.tanh(step), np.log1p(np.linalg.norm(step)) / 2]
+                row += [*cut(inputs.correction[v] / 0.01)]
+        rows.append(row)
+    np.testing.assert_allclose(gradient_graph.nodes["garment"], rows, atol=2e-4)
+
+
+def test_gradient_edge_features(scene, gradient_graph):
+    garment, _, inputs = (to_float64(tree) for tree in scene)
+    spacing = float(mean_edge_length(scene[0]))
+    rows = []
+    for sender, receiver in zip(garment.senders, garment.receivers, strict=True):
+        rest = garment.rest_positions[sender] - garment.rest_positions[receiver]
+        length = np.linalg.norm(rest)
+        now = inputs.position[sender] - inputs.position[receiver]
+        guess = inputs.guess[sender] - inputs.guess[receiver]
+        strain, guess_strain = ((np.linalg.norm(x) / length - 1) / 0.1 for x in (now, guess))
+        rows.append([*now / spacing, *rest / spacing, length / spacing - 1, strain, *guess / spacing])
+        rows[-1].append(guess_strain)
+    np.testing.assert_allclose(gradient_graph.edges["mesh"], np.clip(rows, -5, 5), atol=2e-4)
+
+
+def test_gradient_world_features(scene, gradient_graph):
+    _, _, inputs = (to_float64(tree) for tree in scene)
+    contacts = inputs.contacts
+    now, later = inputs.position - contacts.points, inputs.position - contacts.next_points
+    inertia, guess = (
+        np.sum((x - contacts.next_points) * contacts.next_normals, axis=1, keepdims=True)
+        for x in (inputs.inertial_guess, inputs.guess)
+    )
+    expected = [with_norm(now / 0.02), with_norm(later / 0.02), contacts.distances[:, None] / 0.01]
+    expected += [inertia / 0.01, guess / 0.01, guess / 0.002]
+    expected = np.clip(np.concatenate(expected, axis=1), -5, 5)
+    expected[np.abs(contacts.distances) > 0.03] = 0
+    np.testing.assert_allclose(gradient_graph.edges["world"], expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("config", [HOOD, GRADIENT], ids=["hood", "gradient"])
+def test_feature_sizes_are_those_of_the_graph(config, scene):
+    graph = jax.eval_shape(lambda *scene: build_graph(*scene, config), *scene)
+    sizes = {name: rows.shape[1] for name, rows in {**graph.nodes, **graph.edges}.items()}
+    sizes.pop("world_reverse", None)
+    assert sizes == feature_sizes(config)
+
+
+def test_hood_sizes_are_twenty_twelve_nine():
+    assert feature_sizes(HOOD) == {"garment": 20 - 9, "body": 20 - 9, "mesh": 12, "world": 9}
+
+
+def test_the_first_pass_knows_no_correction(scene):
+    garment, material, inputs = scene
+    first = inputs.replace(correction=None, previous_gradient=None)
+    graph = build(GRADIENT, (garment, material, first))
+    np.testing.assert_array_equal(graph.nodes["garment"][:, -7:], 0)
+    later = next_pass(first, first.guess + 0.01, 2 * first.gradient)
+    np.testing.assert_allclose(later.correction, 0.01, atol=1e-6)
+    np.testing.assert_array_equal(later.previous_gradient, first.gradient)
+
+
+def test_a_frame_joined_with_its_pass_is_the_whole_graph(scene, gradient_graph):
+    @quick_jit
+    def join(*scene):
+        frame = build_frame_graph(*scene, GRADIENT)
+        return join_features(frame, build_pass_graph(*scene, frame))
+
+    joined = join(*scene)
+    for first, second in zip(jax.tree.leaves(joined), jax.tree.leaves(gradient_graph), strict=True):
+        np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+def test_missing_inputs_are_named(scene):
+    garment, material, inputs = scene
+    with pytest.raises(ValueError, match=r"GraphInputs\.gradient"):
+        build_graph(garment, material, inputs.replace(gradient=None), GRADIENT)
+
+
+@pytest.mark.parametrize("config", [HOOD, GRADIENT], ids=["hood", "gradient"])
+def test_world_edges_fit_their_capacity_or_say_so(config, scene):
+    num_edges = int(jnp.sum(jnp.abs(scene[2].contacts.distances) <= 0.03))
+    whole = build(config, scene)
+    assert whole.globals["status"] == Status.OK
+    exact = build(dataclasses.replace(config, world_edge_capacity=num_edges), scene)
+    assert exact.globals["status"] == Status.OK
+    mask = np.asarray(whole.globals["world_mask"])
+    for name in ("world", "world_reverse") if config.update_body else ("world",):
+        np.testing.assert_allclose(exact.edges[name], whole.edges[name][mask], atol=1e-6)
+    np.testing.assert_array_equal(exact.receivers["world"], np.flatnonzero(mask))
+    tight = build(dataclasses.replace(config, world_edge_capacity=num_edges - 3), scene)
+    assert Status(int(tight.globals["status"])) == Status.WORLD_EDGE_OVERFLOW
+    np.testing.assert_allclose(tight.edges["world"], whole.edges["world"][mask][:-3], atol=1e-6)
+
+
+def test_a_scene_without_a_body_has_no_world_entries():
+    graph = build(GRADIENT, make_scene(8, 6, body=False))
+    assert (set(graph.nodes), set(graph.edges), set(graph.senders)) == ({"garment"}, {"mesh"}, {"mesh"})
+    assert graph.globals["status"] == Status.OK
+
+
+def test_material_per_face_and_hinge_matches_the_scalar(scene, hood_graph):
+    garment, material, inputs = scene
+    varied = material.replace(
+        lame_mu=jnp.full(garment.faces.shape[0], material.lame_mu),
+        lame_lambda=jnp.full(garment.faces.shape[0], material.lame_lambda),
+        bending_stiffness=jnp.full(garment.hinges.shape[0], material.bending_stiffness),
+        density=jnp.full(garment.vertex_areas.shape[0], material.density),
+    )
+    graph = build(HOOD, (garment, varied, inputs))
+    for first, second in zip(jax.tree.leaves(graph), jax.tree.leaves(hood_graph), strict=True):
+        np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+@pytest.mark.parametrize("config", [HOOD, GRADIENT], ids=["hood", "gradient"])
+def test_padding_changes_no_real_row_and_stays_finite(config, scene):
+    padded_scene = make_scene(8, 6, pad=True)
+    graph, padded = build(config, scene), build(config, padded_scene)
+    assert padded.nodes["garment"].shape[0] > graph.nodes["garment"].shape[0]
+    for group, padded_group in ((graph.nodes, padded.nodes), (graph.edges, padded.edges)):
+        for name, rows in group.items():
+            np.testing.assert_allclose(padded_group[name][: rows.shape[0]], rows, atol=1e-5)
+            assert np.isfinite(padded_group[name]).all()
+
+
+@pytest.mark.parametrize("config", [HOOD, GRADIENT], ids=["hood", "gradient"])
+def test_gradients_of_features_are_finite_where_lengths_vanish(config):
+    garment, material, inputs = make_scene(8, 6, pad=True)
+
+    def total(position, guess, gradient):
+        collapsed = inputs.replace(position=position, guess=guess, gradient=gradient)
+        graph = build_graph(garment, material, collapsed, config)
+        return sum(jnp.sum(rows**2) for rows in [*graph.nodes.values(), *graph.edges.values()])
+
+    zeros = jnp.zeros_like(inputs.position)
+    for slope in quick_jit(jax.grad(total, argnums=(0, 1, 2)))(zeros, zeros, zeros):
+        assert np.isfinite(slope).all()
