@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.types import Contacts, Garment
 
 
@@ -12,7 +13,8 @@ def penetration(
     position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
 ) -> Float[Array, " vertices"]:
     """Return max(thickness - d, 0) [m], d the height over the tangent plane at t + 1; zero where far."""
-    height = jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=-1)
+    offset = sub3(components(position), components(contacts.next_points))
+    height = dot3(offset, components(contacts.next_normals))
     return jnp.where(contacts.is_near, jnp.maximum(thickness - height, 0.0), 0.0)
 
 
@@ -37,7 +39,7 @@ def collision_energy(
     Source: HOOD (arXiv 2212.07242), with the closest point on the triangle in place of its centroid.
     """
     depth = penetration(position, contacts, thickness)
-    return stiffness * jnp.sum(garment.vertex_areas * depth**3)
+    return stiffness * jnp.sum(garment.vertex_areas * depth * depth * depth)
 
 
 def contact_forces(
@@ -49,4 +51,4 @@ def contact_forces(
 ) -> Float[Array, " vertices"]:
     """Return the normal force on every vertex [N], the negative derivative of its collision energy."""
     depth = penetration(position, contacts, thickness)
-    return 3.0 * stiffness * garment.vertex_areas * depth**2
+    return 3.0 * stiffness * garment.vertex_areas * depth * depth

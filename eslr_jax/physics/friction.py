@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.types import Contacts
 
 
@@ -30,9 +31,15 @@ def friction_energy(
 
     Source: lagged friction as in Li et al. 2020 (IPC), doi 10.1145/3386569.3392425, eq. 15.
     """
-    motion = (position - start) - (contacts.next_points - contacts.points)
-    normal = contacts.next_normals
-    tangential = motion - jnp.sum(motion * normal, axis=-1, keepdims=True) * normal
-    squared = jnp.sum(tangential * tangential, axis=-1)
+    body_motion = sub3(components(contacts.next_points), components(contacts.points))
+    motion = sub3(sub3(components(position), components(start)), body_motion)
+    normal = components(contacts.next_normals)
+    along_normal = dot3(motion, normal)
+    tangential = (
+        motion[0] - along_normal * normal[0],
+        motion[1] - along_normal * normal[1],
+        motion[2] - along_normal * normal[2],
+    )
+    squared = dot3(tangential, tangential)
     # squared / (sqrt(squared + s^2) + s) equals sqrt(squared + s^2) - s without its cancellation.
     return coefficient * jnp.sum(load * squared / (jnp.sqrt(squared + slip * slip) + slip))

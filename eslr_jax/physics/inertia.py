@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.types import Garment, Material
 
 
@@ -23,5 +24,5 @@ def inertia_energy(
 
     Source: Gast et al. 2015, doi 10.1109/TVCG.2015.2459687; HOOD's inertia loss.
     """
-    offset = position - inertial_guess
-    return jnp.sum(masses * jnp.sum(offset * offset, axis=-1)) / (2.0 * timestep * timestep)
+    offset = sub3(components(position), components(inertial_guess))
+    return jnp.sum(masses * dot3(offset, offset)) / (2.0 * timestep * timestep)

@@ -1,0 +1,143 @@
+"""Positive semi-definite Hessians of single elements, in closed form and float64 NumPy (host).
+
+Every function returns one small dense block per face, hinge or vertex; `newton` sums them into a matrix.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.types import Garment, Material
+
+
+def project_symmetric_2x2(
+    a: Float[np.ndarray, " blocks"], b: Float[np.ndarray, " blocks"], c: Float[np.ndarray, " blocks"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the entries of [[a, b], [b, c]] with its negative eigenvalues set to zero.
+
+    With mean m = (a + c) / 2, half difference d = (a - c) / 2 and r = sqrt(d^2 + b^2) the eigenvalues are
+    m + r and m - r, and the projector onto the first is (I + [[d, b], [b, -d]] / r) / 2.
+    """
+    mean, half = 0.5 * (a + c), 0.5 * (a - c)
+    radius = np.hypot(half, b)
+    larger, smaller = np.maximum(mean + radius, 0.0), np.maximum(mean - radius, 0.0)
+    middle = 0.5 * (larger + smaller)
+    slope = 0.5 * (larger - smaller) / np.where(radius > 0, radius, 1.0)
+    return middle + slope * half, slope * b, middle - slope * half
+
+
+def stretch_blocks(
+    position: Float[np.ndarray, "vertices 3"], garment: Garment, material: Material
+) -> Float[np.ndarray, "faces 9 9"]:
+    """Return the projected Hessian of the membrane energy per face [N/m], rows by corner, then axis.
+
+    In the frame of the singular vectors, F = U diag(s_1, s_2) V^T, the 6x6 Hessian with respect to F falls
+    into two 2x2 blocks (stretch; shear and spin) and the two stresses that act out of the plane.
+
+    Args:
+        position: Vertex positions [m].
+        garment: Rest areas and frames; NumPy leaves.
+        material: Thickness [m] and Lame parameters [Pa].
+
+    Source: Kim and Eberle 2022, Dynamic Deformables, section 7 (analytic eigensystems), for a 3x2 F.
+    """
+    corners = position[garment.faces]
+    inverse = np.asarray(garment.inverse_rest_frames, np.float64)
+    weights = np.stack([inverse[:, 0], inverse[:, 1], -inverse[:, 0] - inverse[:, 1]], axis=1)  # dF = dx_c w_c
+    gradient = np.einsum("fca,fcj->faj", corners, weights)
+    left, stretch, right = np.linalg.svd(gradient, full_matrices=True)
+    s1, s2 = stretch[:, 0], stretch[:, 1]
+    mu, lame_lambda = np.asarray(material.lame_mu, np.float64), np.asarray(material.lame_lambda, np.float64)
+    g1, g2 = 0.5 * (s1 * s1 - 1.0), 0.5 * (s2 * s2 - 1.0)
+    stress1 = 2.0 * mu * g1 + lame_lambda * (g1 + g2)
+    stress2 = 2.0 * mu * g2 + lame_lambda * (g1 + g2)
+
+    modulus = 2.0 * mu + lame_lambda
+    block = np.zeros((len(corners), 3, 2, 3, 2))
+    a, b, c = project_symmetric_2x2(
+        stress1 + modulus * s1 * s1, lame_lambda * s1 * s2, stress2 + modulus * s2 * s2
+    )
+    block[:, 0, 0, 0, 0], block[:, 1, 1, 1, 1] = a, c
+    block[:, 0, 0, 1, 1] = block[:, 1, 1, 0, 0] = b
+    a, b, c = project_symmetric_2x2(stress2 + mu * s1 * s1, mu * s1 * s2, stress1 + mu * s2 * s2)
+    block[:, 0, 1, 0, 1], block[:, 1, 0, 1, 0] = a, c  # F_12 feels the stress along 2
+    block[:, 0, 1, 1, 0] = block[:, 1, 0, 0, 1] = b
+    block[:, 2, 0, 2, 0], block[:, 2, 1, 2, 1] = np.maximum(stress1, 0.0), np.maximum(stress2, 0.0)
+
+    rotated = np.einsum("fcj,fkj->fck", weights, right)  # right holds V^T
+    jacobian = np.einsum("fai,fcj->fijca", left, rotated).reshape(-1, 6, 9)
+    scale = np.asarray(garment.rest_areas, np.float64) * np.asarray(material.thickness, np.float64)
+    block = block.reshape(-1, 6, 6) * scale[:, None, None]
+    return jacobian.transpose(0, 2, 1) @ block @ jacobian
+
+
+def dihedral_gradients(
+    position: Float[np.ndarray, "vertices 3"], garment: Garment
+) -> Float[np.ndarray, "hinges 4 3"]:
+    """Return the derivative of every hinge's angle by its four vertices [1/m]; zero where it is collapsed.
+
+    Source: Tamstorf and Grinspun 2013, doi 10.1016/j.gmod.2013.07.001, section 4.
+    """
+    start, end, left, right = np.swapaxes(position[garment.hinges], 0, 1)
+    edge = end - start
+    normal_left, normal_right = np.cross(edge, left - start), np.cross(right - start, edge)
+    squared_left, squared_right = np.sum(normal_left**2, axis=1), np.sum(normal_right**2, axis=1)
+    squared_edge = np.sum(edge**2, axis=1)
+    is_real = (squared_left > 0) & (squared_right > 0) & (squared_edge > 0)
+    squared_edge = np.where(is_real, squared_edge, 1.0)
+    length = np.where(is_real, np.sqrt(squared_edge), 0.0)
+    by_left = -(length / np.where(is_real, squared_left, 1.0))[:, None] * normal_left
+    by_right = -(length / np.where(is_real, squared_right, 1.0))[:, None] * normal_right
+    foot_left = (np.sum((left - start) * edge, axis=1) / squared_edge)[:, None]
+    foot_right = (np.sum((right - start) * edge, axis=1) / squared_edge)[:, None]
+    by_start = -(1.0 - foot_left) * by_left - (1.0 - foot_right) * by_right
+    by_end = -foot_left * by_left - foot_right * by_right
+    return np.stack([by_start, by_end, by_left, by_right], axis=1)
+
+
+def bending_blocks(
+    position: Float[np.ndarray, "vertices 3"], garment: Garment, material: Material
+) -> Float[np.ndarray, "hinges 12 12"]:
+    """Return the Gauss-Newton Hessian of the bending energy per hinge [N/m]: stiffness times g g^T."""
+    gradient = dihedral_gradients(position, garment).reshape(-1, 12)
+    return bending_stiffnesses(garment, material)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+
+
+def bending_stiffnesses(garment: Garment, material: Material) -> Float[np.ndarray, " hinges"]:
+    """Return k_b l^2 / (4 (A_a + A_b)) per hinge with rest lengths [J]; zero where padded."""
+    rest = np.asarray(garment.rest_positions, np.float64)
+    edge = rest[garment.hinges[:, 1]] - rest[garment.hinges[:, 0]]
+    areas = np.asarray(garment.hinge_rest_areas, np.float64)
+    is_real = areas > 0
+    scale = np.where(is_real, np.sum(edge**2, axis=1) / (4.0 * np.where(is_real, areas, 1.0)), 0.0)
+    return np.asarray(material.bending_stiffness, np.float64) * scale
+
+
+def vertex_blocks(
+    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> Float[np.ndarray, "vertices 3 3"]:
+    """Return the Hessian of inertia, collision and friction per vertex [N/m]; all positive semi-definite."""
+    masses = np.asarray(material.density, np.float64) * np.asarray(garment.vertex_areas, np.float64)
+    timestep = float(problem.timestep)
+    blocks = (masses / timestep**2)[:, None, None] * np.eye(3)
+    contacts, parameters = problem.contacts, problem.parameters
+    if contacts is None:
+        return blocks
+    normal = np.asarray(contacts.next_normals, np.float64)
+    outer = normal[:, :, None] * normal[:, None, :]
+    height = np.sum((position - contacts.next_points) * normal, axis=1)
+    depth = np.where(contacts.is_near, np.maximum(float(problem.collision_thickness) - height, 0.0), 0.0)  # type: ignore[arg-type]
+    stiffness = 6.0 * float(parameters.collision_stiffness) * garment.vertex_areas * depth
+    blocks = blocks + stiffness[:, None, None] * outer
+
+    motion = (position - problem.position) - (contacts.next_points - contacts.points)
+    tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
+    slip = float(parameters.friction_speed) * timestep
+    length = np.sqrt(np.sum(tangential**2, axis=1) + slip**2)
+    direction = tangential / length[:, None]
+    # The normals are unit vectors up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
+    curvature = np.eye(3) - outer - direction[:, :, None] * direction[:, None, :]
+    load = float(parameters.friction_coefficient) * np.asarray(problem.friction_load, np.float64)
+    return blocks + (load / length)[:, None, None] * curvature

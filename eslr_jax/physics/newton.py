@@ -1,0 +1,205 @@
+"""Projected Newton on the host, in float64: the reference minimum of one frame's potential.
+
+The energy and its gradient are the package's own, evaluated in float64; the matrix is the sum of element
+Hessians made positive semi-definite in closed form, factorised by a banded Cholesky after reverse
+Cuthill-McKee ordering.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jaxtyping import Float
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from eslr_jax.physics import hessian
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.problem import FrameProblem, start_guess
+from eslr_jax.types import Garment, Material, tree_cast
+
+_ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
+_MAX_HALVINGS = 40
+
+
+class NewtonMinimum(NamedTuple):
+    """Where projected Newton stopped."""
+
+    position: Float[np.ndarray, "vertices 3"]  # [m]
+    value: float  # [J]
+    residual: float  # force norm over weight
+    iterations: int
+    is_converged: bool  # the residual is below the tolerance
+
+
+class _Bands(NamedTuple):
+    """Where the entries of element blocks go in the lower bands of the ordered matrix."""
+
+    order: np.ndarray  # free degree of freedom at each row of the matrix, as an index into positions.ravel()
+    entries: np.ndarray  # flat positions in all blocks, raveled one after the other, that are kept
+    targets: np.ndarray  # flat position in the bands of every kept entry
+    shape: tuple[int, int]  # bands, rows
+
+
+def minimize_newton(
+    problem: FrameProblem,
+    garment: Garment,
+    material: Material,
+    start: Float[np.ndarray, "vertices 3"] | None = None,
+    *,
+    tolerance: float = 1e-6,
+    max_iterations: int = 300,
+) -> NewtonMinimum:
+    """Minimise one frame's potential by projected Newton with an Armijo line search.
+
+    Args:
+        problem: The frame's minimisation problem.
+        garment: Rest mesh.
+        material: Fabric.
+        start: Initial positions [m]; `start_guess` by default.
+        tolerance: Stop when the force norm falls below this share of the vertex weights' norm.
+        max_iterations: Upper bound of factorisations.
+
+    Source: Teran et al. 2005, doi 10.1145/1073368.1073394 (projected Newton).
+    """
+    problem, garment, material = to_float64((problem, garment, material))
+    evaluate = _evaluator(problem, garment, material)
+    is_free = _free_vertices(problem, garment)
+    bands = _find_bands(garment, is_free)
+    masses = material.density * garment.vertex_areas
+    weight = float(problem.parameters.gravity) * np.linalg.norm(masses)
+
+    x = np.array(start_guess(problem, garment) if start is None else start, np.float64)
+    if problem.pin_targets is not None:
+        x = np.where(np.asarray(garment.is_pinned)[:, None], problem.pin_targets, x)
+    value, gradient = evaluate(x)
+    iteration = 0
+    for iteration in range(max_iterations):
+        if np.linalg.norm(gradient[is_free]) <= tolerance * weight:
+            break
+        direction = _newton_direction(x, gradient, problem, garment, material, bands)
+        found = _line_search(evaluate, x, value, gradient, direction)
+        if found is None:
+            break
+        x, value, gradient = found
+    residual = float(np.linalg.norm(gradient[is_free]) / weight)
+    return NewtonMinimum(x, value, residual, iteration, residual <= tolerance)
+
+
+def potential_float64(
+    position: Float[Any, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> float:
+    """Return the potential at `position` in float64 [J]."""
+    return _evaluator(*to_float64((problem, garment, material)))(np.asarray(position, np.float64))[0]
+
+
+def to_float64(tree: Any) -> Any:
+    """Return a pytree with NumPy leaves, the floating ones in float64."""
+    with jax.enable_x64(True):
+        return tree_cast(jax.tree.map(np.asarray, tree), np.float64)
+
+
+@jax.jit
+def _value_and_gradient(position, problem, garment, material):
+    return jax.value_and_grad(potential)(position, problem, garment, material)
+
+
+def _evaluator(problem: FrameProblem, garment: Garment, material: Material) -> Callable:
+    """Return a function from positions to the potential [J] and its gradient [N] in float64."""
+    with jax.enable_x64(True):
+        constants = jax.device_put((problem, garment, material))
+
+    def evaluate(position: np.ndarray) -> tuple[float, np.ndarray]:
+        with jax.enable_x64(True):
+            value, gradient = _value_and_gradient(position, *constants)
+            return float(value), np.asarray(gradient)
+
+    return evaluate
+
+
+def _free_vertices(problem: FrameProblem, garment: Garment) -> np.ndarray:
+    """Return which vertices may move: real ones that no pin holds."""
+    is_free = np.array(garment.vertex_mask, bool)
+    if problem.pin_targets is not None:
+        is_free &= ~np.asarray(garment.is_pinned)
+    return is_free
+
+
+def _find_bands(garment: Garment, is_free: np.ndarray) -> _Bands:
+    """Order the free vertices so that the matrix has a narrow band, and map the blocks' entries to it."""
+    count = len(is_free)
+    faces, hinges = (np.asarray(table) for table in (garment.faces, garment.hinges))
+    hinges = hinges[np.asarray(garment.hinge_rest_areas) > 0]
+    rows, columns = (np.concatenate(part) for part in zip(_pairs(faces), _pairs(hinges), strict=True))
+    links = scipy.sparse.csr_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count))
+    ordered = reverse_cuthill_mckee(links, symmetric_mode=True)
+    ordered = ordered[is_free[ordered]]
+    place = np.full(count, -1)
+    place[ordered] = np.arange(len(ordered))
+
+    tables = (faces, np.asarray(garment.hinges), np.arange(count)[:, None])
+    places = [_dof_pairs(place[table], place[table] >= 0) for table in tables]
+    row, column = (np.concatenate(part) for part in zip(*places, strict=True))
+    is_kept = (row >= column) & (column >= 0)
+    entries = np.flatnonzero(is_kept)
+    row, column = row[entries], column[entries]
+    # Padded hinges only name the padded vertex, which is not free, so no band is widened by them.
+    shape = (int(np.max(row - column, initial=0)) + 1, 3 * len(ordered))
+    order = (3 * ordered[:, None] + np.arange(3)).ravel()
+    return _Bands(order, entries, (row - column) * shape[1] + column, shape)
+
+
+def _pairs(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all ordered pairs of the columns of a table, as rows and columns of a matrix."""
+    corners = table.shape[1]
+    return np.repeat(table, corners, axis=1).ravel(), np.tile(table, (1, corners)).ravel()
+
+
+def _dof_pairs(places: np.ndarray, is_free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrix rows and columns of all entries of the elements' blocks; -1 for fixed vertices."""
+    dofs = np.where(is_free[:, :, None], 3 * places[:, :, None] + np.arange(3), -1)
+    return _pairs(dofs.reshape(len(places), -1))
+
+
+def _newton_direction(
+    x: np.ndarray,
+    gradient: np.ndarray,
+    problem: FrameProblem,
+    garment: Garment,
+    material: Material,
+    bands: _Bands,
+) -> np.ndarray:
+    """Return minus the inverse of the projected Hessian times the gradient [m]; zero where fixed."""
+    blocks = (
+        hessian.stretch_blocks(x, garment, material),
+        hessian.bending_blocks(x, garment, material),
+        hessian.vertex_blocks(x, problem, garment, material),
+    )
+    values = np.concatenate([block.ravel() for block in blocks])[bands.entries]
+    size = bands.shape[0] * bands.shape[1]
+    matrix = np.bincount(bands.targets, values, minlength=size).reshape(bands.shape)
+    solution = scipy.linalg.solveh_banded(
+        matrix, gradient.ravel()[bands.order], overwrite_ab=True, lower=True, check_finite=False
+    )
+    direction = np.zeros(gradient.size)
+    direction[bands.order] = -solution
+    return direction.reshape(gradient.shape)
+
+
+def _line_search(
+    evaluate: Callable, x: np.ndarray, value: float, gradient: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray] | None:
+    """Halve the step until the energy falls enough; None if it never does."""
+    slope = float(np.sum(gradient * direction))
+    slack = 4 * np.finfo(np.float64).eps * abs(value)
+    for halvings in range(_MAX_HALVINGS):
+        size = 0.5**halvings
+        candidate = x + size * direction
+        new_value, new_gradient = evaluate(candidate)
+        if new_value <= value + _ARMIJO * size * slope + slack:
+            return candidate, new_value, new_gradient
+    return None
