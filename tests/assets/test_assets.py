@@ -1,0 +1,126 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from eslr_jax.assets import asset_names, load_garment, load_model, load_motion, load_splits
+from eslr_jax.assets.catalog import is_intact, list_assets
+from eslr_jax.body.motion import Motion, pose_body, still_motion
+from eslr_jax.errors import AssetError, CheckpointError, MotionError
+from eslr_jax.io.weights import read_weights, write_weights
+from eslr_jax.models.registry import MODELS, init_model
+
+
+def test_every_file_is_intact_and_licensed():
+    for asset in list_assets():
+        assert is_intact(asset), asset.file
+        assert asset.licence
+        assert asset.source
+
+
+def test_the_box_is_small():
+    files = {asset.file: asset.bytes for asset in list_assets() if asset.kind != "model"}
+    assert sum(files.values()) < 8_000_000
+
+
+def test_splits_name_what_exists_once():
+    splits = load_splits()
+    for kind, names in (("motions", asset_names("motion")), ("garments", None)):
+        listed = [name for split in splits[kind].values() for name in split]
+        assert len(listed) == len(set(listed))
+        if names is not None:
+            assert set(listed) <= set(names)
+    garments = {name.rsplit("_", 1)[0] for name in asset_names("garment")}
+    assert {name for split in splits["garments"].values() for name in split} == garments
+
+
+@pytest.mark.parametrize("load", [load_garment, load_motion, load_model])
+def test_unknown_names_list_what_exists(load):
+    with pytest.raises(AssetError, match="there are"):
+        load("nosuchthing")
+
+
+def test_close_names_are_suggested():
+    with pytest.raises(AssetError, match="did you mean cmu_016_32"):
+        load_motion("cmu_016_23x".replace("23x", "3 2"))
+
+
+def test_missing_motion_file(tmp_path):
+    with pytest.raises(AssetError, match="doesn't exist"):
+        load_motion(tmp_path / "walk.npz")
+
+
+def test_motion_for_another_skeleton_is_refused(body):
+    motion = load_motion("cmu_016_32")
+    names = ("Pelvis", *motion.joint_names[1:])
+    with pytest.raises(MotionError, match="another skeleton"):
+        pose_body(body, dataclasses.replace(motion, joint_names=names))
+
+
+@pytest.mark.parametrize(
+    ("frames", "spoil", "message"),
+    [(0, None, "no frames"), (4, np.nan, "frame 2"), (4, np.inf, "not finite")],
+)
+def test_broken_motions_are_refused(body, frames, spoil, message):
+    rotations = np.zeros((frames, 31, 3))
+    if spoil is not None:
+        rotations[2] = spoil
+    with pytest.raises(MotionError, match=message):
+        Motion("broken", rotations, np.zeros((frames, 3)), 30.0, body.joint_names)
+
+
+def test_too_many_frames_are_refused(body):
+    with pytest.raises(MotionError, match="fewer than"):
+        pose_body(body, load_motion("cmu_016_32"), num_frames=10_000)
+
+
+def test_still_body_stands_on_the_floor(body):
+    poses = pose_body(body, still_motion(body, 2), arm_abduction=0.0)
+    np.testing.assert_allclose(np.asarray(poses.positions)[..., 1].min(), 0.0, atol=1e-5)
+    np.testing.assert_array_equal(poses.positions[0], poses.positions[1])
+
+
+def test_shaped_bodies_stay_on_the_floor(body):
+    for value in (-2.0, 2.0):
+        shape = np.zeros(10)
+        shape[0] = value
+        poses = pose_body(body, still_motion(body, 1), shape=shape, arm_abduction=0.0)
+        assert abs(float(np.asarray(poses.positions)[..., 1].min())) < 0.03
+
+
+def test_weights_round_trip(tmp_path):
+    config = MODELS["eslr-small"]
+    params = init_model(config)
+    write_weights(tmp_path / "model.npz", params, config, {"description": "test"})
+    loaded, read_config, training = read_weights(tmp_path / "model.npz")
+    assert read_config == config
+    assert training == {"description": "test"}
+    np.testing.assert_array_equal(
+        loaded["constants"]["projection"], np.asarray(params["constants"]["projection"])
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 99}, "update eslr-jax"),
+        ({"model": {"latent_sise": 3}}, "another architecture"),
+        ({"model": None}, "damaged|architecture"),
+    ],
+)
+def test_foreign_weights_are_refused(tmp_path, change, message):
+    config = MODELS["eslr-small"]
+    write_weights(tmp_path / "model.npz", init_model(config), config, {})
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(CheckpointError, match=message):
+        read_weights(tmp_path / "model.npz")
+
+
+def test_weights_without_their_json_are_refused(tmp_path):
+    config = MODELS["eslr-small"]
+    write_weights(tmp_path / "model.npz", init_model(config), config, {})
+    (tmp_path / "model.json").unlink()
+    with pytest.raises(CheckpointError, match="copy both"):
+        read_weights(tmp_path / "model.npz")

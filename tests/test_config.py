@@ -1,0 +1,95 @@
+import json
+
+import pytest
+
+from eslr_jax.config import (
+    ModelConfig,
+    SimConfig,
+    TrainConfig,
+    apply_overrides,
+    from_dict,
+    parse_override,
+    to_dict,
+    to_json,
+)
+from eslr_jax.errors import ConfigError
+from eslr_jax.training.recipe import load_recipe
+
+
+def test_round_trip_through_json():
+    config = SimConfig(model=ModelConfig(latent_size=64), corrector_steps=3)
+    assert from_dict(SimConfig, json.loads(to_json(config))) == config
+
+
+def test_unknown_key_suggests_the_closest():
+    with pytest.raises(ConfigError, match="did you mean latent_size"):
+        from_dict(ModelConfig, {"latent_sise": 64})
+
+
+def test_nested_unknown_key_names_its_table():
+    with pytest.raises(ConfigError, match=r"model\.nonsense"):
+        from_dict(SimConfig, {"model": {"nonsense": 1}})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"latent_size": "wide"}, "wrong type"),
+        ({"latent_size": True}, "wrong type"),
+        ({"latent_size": 0}, "latent_size must be at least 1"),
+        ({"features": "magic"}, "not one of"),
+        ({"passes": 3}, "passes > 1 needs"),
+        ({"output_scale": -1.0}, "must be positive"),
+    ],
+)
+def test_impossible_values_name_the_field(values, message):
+    with pytest.raises(ConfigError, match=message):
+        from_dict(ModelConfig, values)
+
+
+def test_configs_are_hashable_static_arguments():
+    assert hash(SimConfig(model=ModelConfig())) == hash(SimConfig(model=ModelConfig()))
+
+
+def test_overrides_reach_into_tables():
+    values = {"model": {"passes": 1}}
+    apply_overrides(values, dict([parse_override("model.passes=4"), parse_override("split=test")]))
+    assert values == {"model": {"passes": 4}, "split": "test"}
+    with pytest.raises(ConfigError, match="key=value"):
+        parse_override("passes")
+    with pytest.raises(ConfigError, match="not a table"):
+        apply_overrides({"split": "train"}, {"split.x": 1})
+
+
+def test_recipe_takes_a_model_by_name(tmp_path):
+    path = tmp_path / "recipe.toml"
+    path.write_text('model = "eslr-small"\niterations = 10\n')
+    config = load_recipe(path, {"model.passes": 2})
+    assert (config.iterations, config.model.passes, config.model.latent_size) == (10, 2, 32)
+    assert from_dict(TrainConfig, json.loads(json.dumps(to_dict(config)))) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('model = "eslr-tiny"', "unknown model"),
+        ("iterations = 10", "names no model"),
+        ("model = [", "not valid TOML"),
+        ('model = "eslr-small"\nitarations = 3', "did you mean iterations"),
+        ('model = "eslr-small"\nhorizon = 0', "horizon must be at least 1"),
+    ],
+)
+def test_broken_recipes_are_refused(tmp_path, text, message):
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_recipe(path)
+
+
+def test_shipped_recipes_load():
+    from pathlib import Path
+
+    recipes = sorted((Path(__file__).parents[1] / "experiments" / "configs").glob("*.toml"))
+    assert recipes
+    for recipe in recipes:
+        load_recipe(recipe)
