@@ -27,7 +27,7 @@ class ModelConfig:
     residual: bool = True  # open: v and e of a layer are added to its inputs (MeshGraphNet)
     readd_edges: bool = True  # open: every smoothing adds e of eq. 3 again, not the first alone
     smooth_world_edges: bool = True  # open: N(i) of eq. 3 counts incoming world edges too
-    update_body: bool = True  # open: body rows pass messages and are smoothed like garment vertices
+    update_body: bool = False  # open: see models.lsdmp; a body row has one edge and nothing to pass on
     attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
     attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
     attention_kernel: Literal["relu", "softmax"] = "relu"  # open

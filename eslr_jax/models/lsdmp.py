@@ -3,7 +3,13 @@
 Symbols of the paper: v (`garment`, `body`), e^m (`mesh`), e^w (`world`, and `world_reverse` from garment to
 body), f_e (`mesh_mlp`, `world_mlp`), f_v (`vertex_mlp`), f'_v (`smooth_mlp`), N(i) neighbours of vertex i.
 
-Source: paper, eqs. 1-4; MeshGraphNet and HOOD for what they leave open, see `ModelConfig`.
+What the paper leaves open follows MeshGraphNet and HOOD, by options of `ModelConfig`. One default differs:
+HOOD updates its body vertices, through which garment vertices near the same one hear of each other. Here
+every world edge ends at its own nearest point on the body, a row with that one edge, which could only hand a
+vertex its own message back; so body rows keep their encoding, and a layer costs a quarter less. `update_body`
+restores HOOD's way. The number of weights is the same, the two directions share f_e and both ends share f_v.
+
+Source: paper, eqs. 1-4.
 """
 
 from __future__ import annotations

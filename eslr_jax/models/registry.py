@@ -29,7 +29,6 @@ SMALL = ModelConfig(
     message_passing_steps=1,
     attention_blocks=1,
     latent_size=32,
-    update_body=False,
     attention_size=32,
     attention_features=64,
     attention_kernel="softmax",

@@ -22,8 +22,8 @@ from eslr_jax.graph.build import (
 from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.inputs import next_pass
 
-HOOD = ModelConfig()
-GRADIENT = ModelConfig(features="gradient", output="correction", update_body=False)
+HOOD = ModelConfig(update_body=True)
+GRADIENT = ModelConfig(features="gradient", output="correction")
 
 
 def build(config, scene):

@@ -19,7 +19,12 @@ from eslr_jax.models.registry import MODELS, apply_model, init_model
 from eslr_jax.types import tree_cast
 
 TINY = ModelConfig(
-    message_passing_steps=2, attention_blocks=2, latent_size=16, attention_size=8, attention_features=24
+    message_passing_steps=2,
+    attention_blocks=2,
+    latent_size=16,
+    update_body=True,
+    attention_size=8,
+    attention_features=24,
 )
 GRADIENT = dataclasses.replace(
     MODELS["eslr-small"], message_passing_steps=2, latent_size=16, attention_size=8, attention_features=24
@@ -120,17 +125,22 @@ def test_layer_matches_numpy_alone():
     """One LSDMP layer on random latents: eqs. 1-4 and nothing else."""
     config = TINY
     garment, material, inputs = make_scene(8, 6)
-    graph = build_graph(garment, material, inputs, config)
+    graph = quick_jit(lambda *scene: build_graph(*scene, config))(garment, material, inputs)
     generator = np.random.default_rng(0)
     size = config.latent_size
     names = {**graph.nodes, **graph.edges}
     rows = {name: generator.standard_normal((len(x), size)).astype(np.float32) for name, x in names.items()}
-    mesh = mesh_tables(garment, jnp.float32)
-    entries = graph.globals
-    world = world_tables(entries["world_slot"], graph.receivers["world"], entries["world_mask"], jnp.float32)
-    latents = Latents(mesh_sum=sum_receivers(jnp.asarray(rows["mesh"]), mesh), **rows)
     weights = layer_weights(scramble(init_model(config))["params"]["layers"], 1)
-    actual, _ = LsdmpLayer(config).apply({"params": weights}, latents, (mesh, world))
+
+    @quick_jit
+    def apply(weights, rows, graph, garment):
+        mesh, entries = mesh_tables(garment, jnp.float32), graph.globals
+        mask = entries["world_mask"]
+        world = world_tables(entries["world_slot"], graph.receivers["world"], mask, jnp.float32)
+        latents = Latents(mesh_sum=sum_receivers(rows["mesh"], mesh), **rows)
+        return LsdmpLayer(config).apply({"params": weights}, latents, (mesh, world))[0]
+
+    actual = apply(weights, rows, graph, garment)
     expected = plain_layer(*(to_float64(tree) for tree in (rows, graph, weights)), config, np)
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(actual, name), values, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,331 @@
+"""Time a step of the networks: the exact path against the plain build, reduced precision, and PyTorch.
+
+    python experiments/benchmarks/step_time.py --json out.json
+
+All variants of a comparison run in turns (A B A B ...) in one process and are given as ratios of medians.
+Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a
+process of its own that is bound to one core; it is left out where PyTorch is missing. `floor_share` is the
+share of the exact forward pass that its matrix products alone would take, at the rate of one large product
+measured in the same turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT / "tests"), str(Path(__file__).resolve().parent)]
+
+SIZES = {"1k": (32, 32), "4k": (64, 64), "12k": (110, 110), "50k": (224, 224)}
+MODEL = "eslr-15"
+
+
+def timed(function, args) -> float:
+    """Return seconds of one call."""
+    import jax
+
+    start = time.perf_counter()
+    jax.block_until_ready(function(*args))
+    return time.perf_counter() - start
+
+
+def take_turns(functions: dict, turns: int) -> dict[str, float]:
+    """Return the median seconds of every function, called in turns after one warm-up."""
+    import numpy as np
+
+    times = {name: [] for name in functions}
+    for turn in range(turns + 1):
+        for name, (function, args) in functions.items():
+            seconds = timed(function, args)
+            if turn:
+                times[name].append(seconds)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def compile_timed(function, args) -> tuple:
+    """Return the compiled function, and its seconds of compilation and MB of temporary memory."""
+    import jax
+
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    return compiled, {
+        "compile_s": round(seconds, 3),
+        "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1) if memory else None,
+    }
+
+
+def load(model: str, size: str) -> tuple:
+    """Return config, weights, graph and garment of a tube of that size."""
+    import jax
+    from reference_models import make_scene
+
+    from eslr_jax.graph.build import build_graph
+    from eslr_jax.models.registry import MODELS, init_model, update_statistics
+
+    config = MODELS[model]
+    scene = make_scene(*SIZES[size])
+    graph = jax.jit(lambda *scene: build_graph(*scene, config))(*scene)
+    params = update_statistics(config, init_model(config), graph, scene[0], scene[2].velocity)
+    return config, params, graph, scene[0]
+
+
+def networks(config) -> dict:
+    """Return the three builds of a network, each a function of (params, graph, garment)."""
+    import jax.numpy as jnp
+    from reference_models import plain_network
+
+    from eslr_jax.models.registry import apply_model
+
+    reduced = dataclasses.replace(config, precision="bfloat16")
+    return {
+        "plain": lambda *args: plain_network(config, *args, jnp),
+        "exact": lambda *args: apply_model(config, *args),
+        "reduced": lambda *args: apply_model(reduced, *args),
+    }
+
+
+def training_step(network):
+    """Return a step of Adam on a quadratic loss: forward, backward, update."""
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    optimizer = optax.adam(1e-4)
+
+    def step(params, graph, garment, state):
+        def loss(trained):
+            return jnp.sum(network({**params, "params": trained}, graph, garment) ** 2)
+
+        gradient = jax.grad(loss)(params["params"])
+        update, state = optimizer.update(gradient, state)
+        return optax.apply_updates(params["params"], update), state
+
+    return step, optimizer.init
+
+
+def measure_size(size: str, turns: int, training: bool) -> dict:
+    """Return times, compile times and memory of every build at one size."""
+    import jax.numpy as jnp
+
+    config, params, graph, garment = load(MODEL, size)
+    result: dict = {
+        "vertices": int(garment.vertex_areas.shape[0]),
+        "edges": int(garment.senders.shape[0]),
+        "builds": {},
+    }
+    forwards, flops = {}, 0.0
+    for name, network in networks(config).items():
+        args = (params, graph, garment)
+        compiled, facts = compile_timed(network, args)
+        forwards[f"forward_{name}"] = (compiled, args)
+        result["builds"][f"forward_{name}"] = facts
+        if name == "exact":
+            flops = matmul_flops(config, result["vertices"], result["edges"])
+    rows = jnp.ones((result["edges"], config.latent_size))
+    kernel = jnp.eye(config.latent_size)
+    product, _ = compile_timed(jnp.matmul, (rows, kernel))
+    times = take_turns({**forwards, "product": (product, (rows, kernel))}, turns)
+    rate = 2 * rows.shape[0] * config.latent_size**2 / times.pop("product")
+    result["matmul_gflops_per_s"] = round(rate / 1e9, 1)
+    result["floor_share"] = round(flops / rate / times["forward_exact"], 3)
+    if training:
+        steps = {}
+        for name, network in networks(config).items():
+            step, init = training_step(network)
+            args = (params, graph, garment, init(params["params"]))
+            compiled, facts = compile_timed(step, args)
+            steps[f"train_{name}"] = (compiled, args)
+            result["builds"][f"train_{name}"] = facts
+        times.update(take_turns(steps, max(3, turns // 2)))
+    for name, seconds in times.items():
+        result["builds"][name]["run_ms"] = round(1e3 * seconds, 2)
+        result["builds"][name]["us_per_vertex"] = round(1e6 * seconds / result["vertices"], 2)
+    result["forward_exact_vs_plain"] = ratio(times, "forward_plain", "forward_exact")
+    result["forward_reduced_vs_plain"] = ratio(times, "forward_plain", "forward_reduced")
+    if training:
+        result["train_exact_vs_plain"] = ratio(times, "train_plain", "train_exact")
+        result["train_reduced_vs_plain"] = ratio(times, "train_plain", "train_reduced")
+    return result
+
+
+def ratio(times: dict[str, float], slow: str, fast: str) -> float:
+    """Return how many times as fast `fast` is."""
+    return round(times[slow] / times[fast], 3)
+
+
+def matmul_flops(config, vertices: int, edges: int) -> float:
+    """Return the operations of the matrix products of an exact forward pass, a world edge per vertex.
+
+    Counted in products of a row with a square kernel of the latent size.
+    """
+    hidden = config.hidden_layers
+    per_edge = 1 + hidden  # edge perceptron; its vertex pieces are counted per vertex
+    per_vertex = 2 + (3 + hidden) + (3 + hidden)  # both ends, vertex perceptron, world perceptron
+    if config.update_body:
+        per_vertex += (3 + hidden) + (2 + hidden)
+    if config.smoothing_steps:
+        per_vertex += (1 + hidden) * (2 if config.update_body else 1)
+    rows = config.message_passing_steps * (per_edge * edges + per_vertex * vertices)
+    rows += hidden * (edges + 4 * vertices)  # encoders behind their narrow first layer, decoder
+    square = 2.0 * config.latent_size**2 * rows
+    features = config.attention_features * config.attention_size
+    block = 4 * config.latent_size * config.attention_size + 4 * features
+    return square + 2.0 * config.attention_blocks * vertices * block
+
+
+def measure_passes(size: str, turns: int) -> dict:
+    """Return the time of one pass of the small models, and of what a frame needs once."""
+    import jax
+    from reference_models import make_scene
+
+    from eslr_jax.graph.build import build_frame_graph, build_pass_graph
+    from eslr_jax.models.registry import MODELS, apply_pass, encode_frame, init_model
+
+    functions = {}
+    for name in ("eslr-small", "lsdmp-small", "gsa-small", "mgn-small"):
+        config = MODELS[name]
+        params, scene = init_model(config), make_scene(*SIZES[size])
+
+        def frame(params, garment, material, inputs, config=config):
+            graph = build_frame_graph(garment, material, inputs, config)
+            return graph, encode_frame(config, params, graph, garment)
+
+        def one_pass(params, graph, encoded, garment, material, inputs, config=config):
+            changing = build_pass_graph(garment, material, inputs, graph)
+            return apply_pass(config, params, encoded, changing, garment)
+
+        graph, encoded = jax.jit(frame)(params, *scene)
+        functions[f"{name} frame"] = (jax.jit(frame), (params, *scene))
+        functions[f"{name} pass"] = (jax.jit(one_pass), (params, graph, encoded, *scene))
+    return {name: round(1e3 * seconds, 3) for name, seconds in take_turns(functions, 5 * turns).items()}
+
+
+def measure_torch(size: str, turns: int) -> dict:
+    """Return ratios to PyTorch; to be called in a process bound to one core."""
+    import numpy as np
+    import torch
+    import torch_meshgraphnet
+
+    functions, garment = {}, None
+    for model in ("eslr-15", "mgn-15"):
+        config, params, graph, garment = load(model, size)
+        for name, network in networks(config).items():
+            if name != "plain":
+                args = (params, graph, garment)
+                functions[f"{model} {name}"] = (compile_timed(network, args)[0], args)
+    edges = (np.asarray(garment.senders), np.asarray(garment.receivers))
+    functions["torch mgn-15"] = (
+        torch_meshgraphnet.make_forward(*edges, garment.vertex_areas.shape[0]),
+        (),
+    )
+    times = take_turns(functions, turns)
+    return {
+        "torch": torch.__version__,
+        "threads": 1,
+        "run_ms": {name: round(1e3 * seconds, 1) for name, seconds in times.items()},
+        "eslr15_exact_vs_torch_mgn15": ratio(times, "torch mgn-15", "eslr-15 exact"),
+        "eslr15_reduced_vs_torch_mgn15": ratio(times, "torch mgn-15", "eslr-15 reduced"),
+        "mgn15_exact_vs_torch_mgn15": ratio(times, "torch mgn-15", "mgn-15 exact"),
+        "mgn15_reduced_vs_torch_mgn15": ratio(times, "torch mgn-15", "mgn-15 reduced"),
+    }
+
+
+def torch_in_a_process(size: str, turns: int) -> dict | None:
+    """Run `measure_torch` on one core, or return None where that is not possible."""
+    import importlib.util
+
+    if importlib.util.find_spec("torch") is None or not hasattr(os, "sched_setaffinity"):
+        return None
+    core = max(os.sched_getaffinity(0))
+    code = (
+        f"import json, os, sys; os.sched_setaffinity(0, {{{core}}})\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        f"import step_time; print(json.dumps(step_time.measure_torch({size!r}, {turns})))"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
+    )
+    if done.returncode:
+        print(done.stderr[-2000:], file=sys.stderr)
+        return None
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"], choices=SIZES, help="vertices")
+    parser.add_argument("--turns", type=int, default=10, help="turns per comparison")
+    parser.add_argument("--no-training", action="store_true", help="leave the training steps out")
+    parser.add_argument("--no-torch", action="store_true", help="leave the comparison with PyTorch out")
+    parser.add_argument("--json", nargs="?", const="-", help="write JSON to this file, or to the screen")
+    options = parser.parse_args()
+
+    import jax
+
+    sizes = {}
+    for size in options.sizes:
+        print(f"{size}: {MODEL} ...", file=sys.stderr)
+        sizes[size] = measure_size(size, options.turns, not options.no_training)
+        sizes[size]["pass_ms"] = measure_passes(size, options.turns)
+        if not options.no_torch:
+            print(f"{size}: PyTorch ...", file=sys.stderr)
+            sizes[size]["torch"] = torch_in_a_process(size, options.turns)
+    main_size = sizes.get("4k") or sizes[options.sizes[-1]]
+    keys = ("forward_exact_vs_plain", "train_exact_vs_plain", "forward_reduced_vs_plain", "floor_share")
+    report = {
+        **{key: main_size.get(key) for key in keys},
+        **{
+            key: (main_size.get("torch") or {}).get(key)
+            for key in ("eslr15_exact_vs_torch_mgn15", "eslr15_reduced_vs_torch_mgn15")
+        },
+        "model": MODEL,
+        "sizes": sizes,
+        "device": str(jax.devices()[0]),
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(os.getloadavg()[0], 1),
+        "versions": {"jax": jax.__version__, "python": platform.python_version()},
+    }
+    if options.json == "-":
+        print(json.dumps(report, indent=2))
+        return
+    if options.json:
+        Path(options.json).write_text(json.dumps(report, indent=2) + "\n")
+    print_table(report)
+
+
+def print_table(report: dict) -> None:
+    """Print the report as tables."""
+    for size, result in report["sizes"].items():
+        print(f"\n{size}: {result['vertices']} vertices, {result['edges']} directed edges")
+        print(f"{'':18}{'run ms':>11}{'us/vertex':>11}{'compile s':>11}{'memory MB':>11}")
+        for name, facts in result["builds"].items():
+            columns = (facts[key] for key in ("run_ms", "us_per_vertex", "compile_s", "temporary_mb"))
+            print(
+                f"{name:18}"
+                + "".join(f"{value:>{width}}" for value, width in zip(columns, (10, 11, 11, 11), strict=True))
+            )
+        for name, milliseconds in result["pass_ms"].items():
+            print(f"{name:18}{milliseconds:>11}")
+        for name, milliseconds in ((result.get("torch") or {}).get("run_ms") or {}).items():
+            print(f"{name:18}{milliseconds:>11}  (one thread)")
+    print()
+    for key, value in report.items():
+        if isinstance(value, float | str) or value is None:
+            print(f"{key}: {value}")
+
+
+if __name__ == "__main__":
+    main()
