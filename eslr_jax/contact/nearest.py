@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, v
 from eslr_jax.types import BodySurface, Contacts
 
 _NEAREST_PATCHES = 4  # patches whose vertices are tried
+_OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
+_TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
 
 
@@ -37,7 +40,13 @@ def nearest_point(
     """
     body = components(positions)
     point = components(query)
-    vertex = _nearest_vertex(point, body, surface)
+    return _nearest_on_faces(point, body, surface, _nearest_vertex(point, body, surface))
+
+
+def _nearest_on_faces(
+    point: Vector3, body: Vector3, surface: BodySurface, vertex: Int[Array, " vertices"]
+) -> SurfacePoint:
+    """Return the nearest point on the faces around one surface vertex per query point."""
     candidates = surface.vertex_faces[vertex]
     corners = [tuple(c[surface.faces[:, k]] for c in body) for k in range(3)]
     triangles = [tuple(c[candidates] for c in corner) for corner in corners]
@@ -52,16 +61,35 @@ def nearest_point(
     return SurfacePoint(face, (1.0 - u - v, u, v), best)
 
 
-def _nearest_vertex(point: Vector3, body: Vector3, surface: BodySurface) -> Int[Array, " vertices"]:
-    """Return the surface vertex nearest to each point, looking into the nearest patches."""
-    squared = _squared_distances(point, tuple(c[surface.patch_centers] for c in body))
+def _nearest_vertex(
+    point: Vector3,
+    body: Vector3,
+    surface: BodySurface,
+    is_excluded: Callable[[Vector3, Int[Array, "..."]], Bool[Array, "vertices _"]] | None = None,
+) -> Int[Array, " vertices"]:
+    """Return the surface vertex nearest to each point, looking into the nearest patches.
+
+    Args:
+        point: Query points, by components.
+        body: Surface vertices, by components.
+        surface: Search tables.
+        is_excluded: Given candidate positions and their vertex numbers, which ones do not count.
+    """
+    centers = tuple(c[surface.patch_centers] for c in body)
+    squared = _squared_distances(point, centers)
+    if is_excluded is not None:
+        rows = tuple(c[None] for c in centers)
+        squared = jnp.where(is_excluded(rows, surface.patch_centers[None]), jnp.inf, squared)
     members = []
     for _ in range(min(_NEAREST_PATCHES, squared.shape[1])):
         patch = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
         members.append(surface.patch_vertices[patch])
         squared = jnp.where(jnp.arange(squared.shape[1])[None] == patch[:, None], jnp.inf, squared)
     candidates = jnp.concatenate(members, axis=1)
-    squared = sum((c[candidates] - p[:, None]) ** 2 for c, p in zip(body, point, strict=True))
+    positions = tuple(c[candidates] for c in body)
+    squared = sum((c - p[:, None]) ** 2 for c, p in zip(positions, point, strict=True))
+    if is_excluded is not None:
+        squared = jnp.where(is_excluded(positions, candidates), jnp.inf, squared)
     slot = _first_true(squared <= jnp.min(squared, axis=1)[:, None])
     return jnp.take_along_axis(candidates, slot[:, None], axis=1)[:, 0]
 
@@ -140,21 +168,66 @@ def find_contacts(
         next_body: Surface vertices at t + 1 [m].
         surface: Search tables.
     """
+    normals = vertex_normals(body, surface.faces, surface.face_incidence)
     location = nearest_point(position, body, surface)
+    return _contacts_at(location, position, body, next_body, normals, surface)
+
+
+def find_both_sides(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    next_body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+) -> tuple[Contacts, Contacts]:
+    """Return the nearest contacts, and those with the part of the body that faces them across the cloth.
+
+    Cloth between two thighs, or between an arm and the chest, touches both. With the nearest alone the other
+    limb sweeps over a vertex and then pushes it out on its far side.
+
+    Args:
+        position: Garment vertices at t [m].
+        body: Surface vertices at t [m].
+        next_body: Surface vertices at t + 1 [m].
+        surface: Search tables.
+    """
+    normals = vertex_normals(body, surface.faces, surface.face_incidence)
+    nearest = nearest_point(position, body, surface)
+    contacts = _contacts_at(nearest, position, body, next_body, normals, surface)
+    point, body_points, facing = components(position), components(body), components(contacts.normals)
+    normal = components(normals)
+
+    def is_excluded(candidates: Vector3, ids: Int[Array, "..."]) -> Bool[Array, "vertices _"]:
+        turned = sum(n[ids] * f[:, None] for n, f in zip(normal, facing, strict=True))
+        ahead = sum((c - p[:, None]) * f[:, None] for c, p, f in zip(candidates, point, facing, strict=True))
+        return (turned > _OPPOSED) | (ahead < 0)
+
+    vertex = _nearest_vertex(point, body_points, surface, is_excluded)
+    opposite = _nearest_on_faces(point, body_points, surface, vertex)
+    across = _contacts_at(opposite, position, body, next_body, normals, surface)
+    is_facing = jnp.sum(across.normals * contacts.normals, axis=-1) < _OPPOSED
+    is_outside = across.distances > -_TOUCHING
+    return contacts, across.replace(is_near=across.is_near & is_facing & is_outside)
+
+
+def _contacts_at(
+    location: SurfacePoint,
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    next_body: Float[Array, "surface_vertices 3"],
+    normals: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+) -> Contacts:
+    """Carry located body points to t + 1, with their tangent planes."""
+    next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
     points = interpolate(body, location, surface)
-    normals, next_normals = (
-        safe_normalize(
-            interpolate(vertex_normals(corners, surface.faces, surface.face_incidence), location, surface)
-        )
-        for corners in (body, next_body)
-    )
-    side = jnp.sum((position - points) * normals, axis=-1)
+    here = safe_normalize(interpolate(normals, location, surface))
+    side = jnp.sum((position - points) * here, axis=-1)
     distance = jnp.sqrt(location.squared_distance)
     return Contacts(
         points=points,
         next_points=interpolate(next_body, location, surface),
-        normals=normals,
-        next_normals=next_normals,
+        normals=here,
+        next_normals=safe_normalize(interpolate(next_normals, location, surface)),
         distances=jnp.where(side < 0, -distance, distance),
         is_near=distance < CONTACT_RADIUS,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.types import Garment, Material
+from eslr_jax.types import Contacts, Garment, Material
 
 
 def project_symmetric_2x2(
@@ -127,10 +127,9 @@ def vertex_blocks(
         return blocks
     normal = np.asarray(contacts.next_normals, np.float64)
     outer = normal[:, :, None] * normal[:, None, :]
-    height = np.sum((position - contacts.next_points) * normal, axis=1)
-    depth = np.where(contacts.is_near, np.maximum(float(problem.collision_thickness) - height, 0.0), 0.0)  # type: ignore[arg-type]
-    stiffness = 6.0 * float(parameters.collision_stiffness) * garment.vertex_areas * depth
-    blocks = blocks + stiffness[:, None, None] * outer
+    for side in (contacts, problem.across):
+        if side is not None:
+            blocks = blocks + _collision_blocks(position, side, problem, garment)
 
     motion = (position - problem.position) - (contacts.next_points - contacts.points)
     tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
@@ -141,3 +140,15 @@ def vertex_blocks(
     curvature = np.eye(3) - outer - direction[:, :, None] * direction[:, None, :]
     load = float(parameters.friction_coefficient) * np.asarray(problem.friction_load, np.float64)
     return blocks + (load / length)[:, None, None] * curvature
+
+
+def _collision_blocks(
+    position: Float[np.ndarray, "vertices 3"], contacts: Contacts, problem: FrameProblem, garment: Garment
+) -> Float[np.ndarray, "vertices 3 3"]:
+    """Return the Hessian of the collision energy with one set of tangent planes [N/m]."""
+    normal = np.asarray(contacts.next_normals, np.float64)
+    height = np.sum((position - contacts.next_points) * normal, axis=1)
+    thickness = float(problem.collision_thickness)  # type: ignore[arg-type]
+    depth = np.where(contacts.is_near, np.maximum(thickness - height, 0.0), 0.0)
+    stiffness = 6.0 * float(problem.parameters.collision_stiffness) * garment.vertex_areas * depth
+    return stiffness[:, None, None] * normal[:, :, None] * normal[:, None, :]

@@ -14,6 +14,7 @@ from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy, vertex_masses
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import Garment, Material
 
 
@@ -26,6 +27,7 @@ class PotentialTerms(NamedTuple):
     gravity: Float[Array, ""]
     collision: Float[Array, ""] | float
     friction: Float[Array, ""] | float
+    repulsion: Float[Array, ""] | float = 0.0  # of self-contact
 
 
 def potential_terms(
@@ -50,6 +52,10 @@ def potential_terms(
         collision = collision_energy(
             position, contacts, garment, parameters.collision_stiffness, problem.collision_thickness
         )
+        if problem.across is not None:
+            collision = collision + collision_energy(
+                position, problem.across, garment, parameters.collision_stiffness, problem.collision_thickness
+            )
         friction = friction_energy(
             position,
             problem.position,
@@ -58,6 +64,15 @@ def potential_terms(
             parameters.friction_coefficient,
             parameters.friction_speed * problem.timestep,
         )
+    repulsion: Float[Array, ""] | float = 0.0
+    if problem.self_contacts is not None:
+        repulsion = repulsion_energy(
+            position,
+            problem.self_contacts,
+            garment,
+            parameters.repulsion_stiffness,
+            parameters.repulsion_thickness,
+        )
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
@@ -65,6 +80,7 @@ def potential_terms(
         gravity=gravity_energy(position, problem.position, masses, parameters.gravity),
         collision=collision,
         friction=friction,
+        repulsion=repulsion,
     )
 
 

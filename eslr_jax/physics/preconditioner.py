@@ -9,6 +9,7 @@ from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.collision import penetration
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 
 
@@ -30,7 +31,7 @@ def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " ver
 def hessian_diagonal(
     problem: FrameProblem, garment: Garment, material: Material, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: inertia, stretch, contact and friction at `position`.
+    """Return a positive stiffness per vertex [N/m]: inertia, stretch, contacts and friction at `position`.
 
     Padded and pinned vertices get one, so that dividing by it is safe.
     """
@@ -40,8 +41,18 @@ def hessian_diagonal(
         assert problem.friction_load is not None
         parameters = problem.parameters
         depth = penetration(position, problem.contacts, problem.collision_thickness)
+        if problem.across is not None:
+            depth = depth + penetration(position, problem.across, problem.collision_thickness)
         slip = parameters.friction_speed * problem.timestep
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * parameters.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + parameters.friction_coefficient * problem.friction_load / (3.0 * slip)
+    if problem.self_contacts is not None:
+        diagonal = diagonal + repulsion_diagonal(
+            position,
+            problem.self_contacts,
+            garment,
+            problem.parameters.repulsion_stiffness,
+            problem.parameters.repulsion_thickness,
+        )
     return jnp.where(garment.vertex_mask, diagonal, 1.0)

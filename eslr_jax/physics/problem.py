@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+from eslr_jax.contact.self_contact import SelfContacts
+from eslr_jax.physics.repulsion import push_apart
 from eslr_jax.types import ClothState, Contacts, Garment
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
@@ -22,6 +24,8 @@ class PhysicsParameters:
     friction_coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
     friction_speed: Float[Array, ""] | float = 9e-4
     """[m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5."""
+    repulsion_stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], between layers of cloth; as for the body
+    repulsion_thickness: Float[Array, ""] | float = 3e-3  # [m] (ContourCraft)
 
 
 @struct.dataclass
@@ -36,6 +40,8 @@ class FrameProblem:
     friction_load: Float[Array, " vertices"] | None  # normal force at t [N]
     collision_thickness: Float[Array, ""] | None  # of `contact_thickness` [m]
     parameters: PhysicsParameters
+    across: Contacts | None = None  # with the body part on the other side of the cloth; None without a body
+    self_contacts: SelfContacts | None = None  # None: layers of cloth pass through each other
 
 
 def contact_thickness(garment: Garment, parameters: PhysicsParameters) -> Float[Array, ""]:
@@ -56,6 +62,8 @@ def make_problem(
     pin_targets: Float[Array, "vertices 3"] | None,
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
+    self_contacts: SelfContacts | None = None,
+    across: Contacts | None = None,
 ) -> FrameProblem:
     """Collect what one frame's potential depends on.
 
@@ -66,6 +74,8 @@ def make_problem(
         pin_targets: Where pinned vertices are at t + 1, or None without pins.
         timestep: Duration of the frame [s].
         parameters: Constants of the scene.
+        self_contacts: Pairs of vertices and faces of the cloth that are close, or None.
+        across: Contacts with the body part on the other side of the cloth, or None.
     """
     return FrameProblem(
         position=state.position,
@@ -76,6 +86,8 @@ def make_problem(
         friction_load=None if contacts is None else state.friction_load,
         collision_thickness=None if contacts is None else contact_thickness(garment, parameters),
         parameters=parameters,
+        across=across,
+        self_contacts=self_contacts,
     )
 
 
@@ -105,5 +117,12 @@ def push_out(
 
 
 def start_guess(problem: FrameProblem, garment: Garment) -> Float[Array, "vertices 3"]:
-    """Return the inertial guess pushed out of the body: the best cheap start that was found."""
-    return push_out(problem, garment, problem.inertial_guess)
+    """Return the inertial guess pushed out of the body: the best cheap start that was found.
+
+    With self-contact its layers are pushed apart as well.
+    """
+    position = push_out(problem, garment, problem.inertial_guess)
+    if problem.self_contacts is None:
+        return position
+    thickness = problem.parameters.repulsion_thickness
+    return push_out(problem, garment, push_apart(position, problem.self_contacts, thickness))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
@@ -17,7 +17,8 @@ from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.lbfgs import Minimum, minimize
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.preconditioner import hessian_diagonal
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, start_guess
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin
+from eslr_jax.physics.start import solver_start
 from eslr_jax.simulate.network import network_step
 from eslr_jax.types import BodySurface, ClothState, Garment, Material
 
@@ -48,16 +49,18 @@ def frame_problem(
     self_contact: bool = False,
 ) -> FrameProblem:
     """Find the frame's contacts and state its minimisation problem."""
-    contacts = None
+    contacts = across = None
     if surface is not None:
         assert frame.body is not None
         assert frame.next_body is not None
-        contacts = find_contacts(state.position, frame.body, frame.next_body, surface)
+        contacts, across = find_both_sides(state.position, frame.body, frame.next_body, surface)
     self_contacts = None
     if self_contact:
         guess = state.position + timestep * state.velocity
         self_contacts = find_self_contacts(state.position, guess, garment)
-    return make_problem(garment, state, contacts, frame.pin_targets, timestep, parameters, self_contacts)
+    return make_problem(
+        garment, state, contacts, frame.pin_targets, timestep, parameters, self_contacts, across
+    )
 
 
 def solve(
@@ -102,7 +105,7 @@ def step(
     """
     status = jnp.int32(Status.OK)
     if config.simulator == "physics":
-        start, iterations = start_guess(problem, garment), config.solver_iterations
+        start, iterations = solver_start(problem, garment, material), config.solver_iterations
     else:
         assert config.model is not None
         start, status = network_step(params, garment, material, problem, state, config.model)

@@ -1,0 +1,556 @@
+"""Hard cases of cloth on bodies: dropped, struck, started inside, pinched, on needles and slopes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eslr_jax.assets import load_body, load_garment
+from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.evaluation.colliders import Capsule, Collider, Plane, RoundedCone, Sphere
+from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.hard_cases.build import (
+    FRAME,
+    capsule,
+    corners_of,
+    hanging_sheet,
+    icosphere,
+    join_meshes,
+    make_cloth,
+    make_scene,
+    plane,
+    revolve,
+    sheet,
+    tube,
+)
+from eslr_jax.evaluation.hard_cases.case import HardCase, Runs, Scenes
+from eslr_jax.evaluation.hard_cases.measures import (
+    Measure,
+    center,
+    depths,
+    largest_stretch,
+    own_gaps,
+    quantile_depth,
+    rms_speed,
+    speeds,
+)
+from eslr_jax.evaluation.hard_cases.simulators import Run, StressScene, simulate
+from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.scene import SceneOptions, prepare_scene
+from eslr_jax.types import Material
+
+_MM = 1e3  # millimetres per metre
+_RADIUS = 0.25  # [m] of the ball
+_HEIGHT = 0.30  # [m] of the sheet above the ball's centre
+_SWING_START = 0.5  # [s]
+_COLUMNS = 33  # vertices along the side of the one-metre sheet
+
+
+def _swing(time: np.ndarray) -> np.ndarray:
+    """Return the ball's displacement along x [m]: 0.15 m at 1 Hz after half a second."""
+    return 0.15 * np.sin(2 * np.pi * np.maximum(time - _SWING_START, 0.0))
+
+
+def drop_scene(
+    options: dict[str, Any],
+    *,
+    height: float = _HEIGHT,
+    seconds: float = 1.5,
+    timestep: float = FRAME,
+    material: Material = COTTON,
+    is_swinging: bool = True,
+    columns: int = _COLUMNS,
+) -> StressScene:
+    """Return a sheet of one square metre over a ball that starts to swing after half a second.
+
+    Args:
+        options: What the simulator asks of `prepare_garment`.
+        height: Of the sheet over the ball's centre [m].
+        seconds: Length of the scene.
+        timestep: Seconds between frames.
+        material: Fabric.
+        is_swinging: Whether the ball swings at all.
+        columns: Vertices along the side of the sheet.
+    """
+    garment = make_cloth(sheet(columns, columns, (1.0, 1.0)), options)
+    start = np.asarray(garment.rest_positions, np.float64) + np.array([0.0, height, 0.0])
+    ball = icosphere(4, _RADIUS)
+    frames = round(seconds / timestep) + 1
+    x = _swing(np.arange(frames) * timestep) * is_swinging
+    return make_scene(
+        garment,
+        start,
+        frames,
+        timestep=timestep,
+        material=material,
+        body=ball,
+        body_positions=ball[0] + x[:, None, None] * np.array([1.0, 0.0, 0.0]),
+        colliders=lambda frame: (Sphere(np.array([x[frame], 0.0, 0.0]), _RADIUS),),
+    )
+
+
+# --- the same scene, turned ------------------------------------------------------------------------------
+
+
+def _turned(stress: StressScene, matrix: np.ndarray) -> StressScene:
+    """Return a scene with everything in the world turned or mirrored; the rest mesh stays."""
+    scene = stress.scene
+    turn = jnp.asarray(matrix.T, jnp.float32)
+    is_mirror = np.linalg.det(matrix) < 0
+    assert scene.body_positions is not None
+    assert scene.surface is not None
+    garment, surface = scene.garment, scene.surface
+    if is_mirror:  # normals must still point out
+        garment = _mirrored(garment, turn)
+        body = np.asarray(scene.body_positions[0] @ turn)
+        surface = prepare_surface(body, np.asarray(surface.faces)[:, ::-1])
+    return dataclasses.replace(
+        stress,
+        scene=dataclasses.replace(
+            scene,
+            garment=garment,
+            surface=surface,
+            start=dataclasses.replace(
+                scene.start, position=scene.start.position @ turn, velocity=scene.start.velocity @ turn
+            ),
+            body_positions=scene.body_positions @ turn,
+        ),
+    )
+
+
+def _mirrored(garment, turn):
+    """Return the mirror image of a garment, vertex by vertex."""
+    size = garment.geodesic_embedding.shape[1]
+    return prepare_garment(
+        np.asarray(garment.rest_positions @ turn),
+        np.asarray(garment.faces)[:, ::-1].copy(),
+        skin_weights=np.asarray(garment.skin_weights),
+        skin_indices=np.asarray(garment.skin_indices),
+        embedding_size=size,
+    )
+
+
+def _yaw(degrees: float) -> np.ndarray:
+    """Return the rotation about y; exact for multiples of 90 degrees."""
+    cosine, sine = np.round(np.cos(np.radians(degrees)), 15), np.round(np.sin(np.radians(degrees)), 15)
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+
+
+_TURNS = {"0": _yaw(0), "90": _yaw(90), "180": _yaw(180), "270": _yaw(270), "mirrored": np.diag([-1.0, 1, 1])}
+
+
+def _build_turned(options: dict[str, Any]) -> Scenes:
+    rig = load_body()
+    garment = load_garment("tshirt", body=rig, **options)
+    scenes: Scenes = {}
+    for label, matrix in _TURNS.items():
+        poses = pose_body(rig, still_motion(rig, 61 if label == "0" else 31))
+        stress = StressScene(prepare_scene(garment, poses, options=SceneOptions(start_at_rest=True)))
+        assert stress.scene.surface is not None
+        stress = dataclasses.replace(stress, body_faces=np.asarray(stress.scene.surface.faces))
+        scenes[label] = _turned(stress, matrix)
+    return scenes
+
+
+def _measure_turned(runs: Runs) -> list[Measure]:
+    straight = runs["0"].positions
+    measures = []
+    for label, matrix in _TURNS.items():
+        if label == "0":
+            continue
+        back = runs[label].positions[-1] @ matrix  # the inverse of a turn is its transpose
+        difference = np.linalg.norm(back - straight[len(runs[label].positions) - 1], axis=-1)
+        measures.append(
+            Measure(f"turned {label}: difference after 1 s, rms [mm]", _MM * _rms(difference), 5.0)
+        )
+    path = center(runs["0"])
+    drift = abs(path[-1, 0] - path[len(path) // 2, 0]) / (len(path) // 2 * FRAME)
+    return [*measures, Measure("sideways drift in the second second [mm/s]", _MM * drift, 5.0)]
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+TURNED = HardCase(
+    name="turned",
+    reason="physics knows no north and no left: the same scene turned or mirrored must give the same cloth",
+    build=_build_turned,
+    measure=_measure_turned,
+    picture="0",
+)
+
+
+# --- dropped on a ball that swings -----------------------------------------------------------------------
+
+_TAUGHT_FRAMES = (4, 7, 9, 11, 14, 18, 24, 32)  # fall, impact, drape, swing
+
+
+def _build_drop(options: dict[str, Any]) -> Scenes:
+    stress = drop_scene(options)
+    reference = simulate(None, stress, SimConfig(simulator="physics", solver_iterations=200))
+    states, _ = trajectory_states(reference, stress.scene, stress.parameters)
+    scenes: Scenes = {"drop": stress}
+    assert stress.scene.body_positions is not None
+    for frame in _TAUGHT_FRAMES:
+        state = jax.tree.map(lambda leaf, frame=frame: leaf[frame], states)
+        scene = dataclasses.replace(
+            stress.scene,
+            start=state,
+            body_positions=stress.scene.body_positions[frame : frame + 2],
+            num_frames=2,
+        )
+        scenes[f"taught {frame}"] = dataclasses.replace(
+            stress, scene=scene, colliders=_shifted(stress.colliders, frame)
+        )
+    return scenes
+
+
+def _shifted(colliders, first: int) -> Callable[[int], tuple[Collider, ...]]:
+    return lambda frame: colliders(frame + first)
+
+
+def _measure_drop(runs: Runs) -> list[Measure]:
+    run = runs["drop"]
+    taught = [own_gaps_from_start(runs[f"taught {frame}"]) for frame in _TAUGHT_FRAMES]
+    return [
+        Measure("excess from the solver's states, median [J]", float(np.median(taught)), 0.008),
+        Measure("excess from the solver's states, largest [J]", float(np.max(taught)), None),
+        Measure("depth in the ball, 99.9 % [mm]", quantile_depth(run), 2.0),
+        Measure("stretch, largest", largest_stretch(run), 1.25),
+    ]
+
+
+def own_gaps_from_start(run: Run) -> float:
+    """Return the excess of a run of one frame, from the state it starts in [J]."""
+    return float(own_gaps(run, 1).excess[0])
+
+
+DROP = HardCase(
+    name="drop_on_ball",
+    reason="impact, drape and drag: one scene with every energy at work, and an optimum to be measured by",
+    build=_build_drop,
+    measure=_measure_drop,
+    picture="drop",
+)
+
+
+# --- a limb that moves fast ------------------------------------------------------------------------------
+
+_SPEEDS = (1, 2, 4, 8)  # [m/s]
+_LIMB_RADIUS = 0.045  # [m]
+_BEFORE, _AFTER = 8, 15  # frames at rest before and after the move
+_MOVE = 8  # frames of the move
+
+
+def _build_fast_limb(options: dict[str, Any]) -> Scenes:
+    sleeve = tube(22, 16, (0.06, 0.06), 0.3)
+    positions = sleeve[0][:, [1, 0, 2]] * [-1, 1, 1] - np.array([0.15, 0.0, 0.0])  # along x
+    garment = make_cloth((positions, sleeve[1]), options)
+    start = np.asarray(garment.rest_positions, np.float64) - np.array([0.0, 0.01, 0.0])
+    limb = capsule(_LIMB_RADIUS, 0.5)
+    frames = 1 + _BEFORE + _MOVE + _AFTER
+    scenes: Scenes = {}
+    for speed in _SPEEDS:
+        path = speed * FRAME * np.clip(np.arange(frames) - _BEFORE, 0, _MOVE)
+        track = np.stack([np.zeros(frames), np.zeros(frames), path], axis=1)
+
+        def colliders(frame: int, track=track) -> tuple[Collider, ...]:
+            ends = track[frame] + np.array([[-0.25, 0, 0], [0.25, 0, 0]])
+            return (Capsule(ends[0], ends[1], _LIMB_RADIUS),)
+
+        scenes[f"{speed} m/s"] = make_scene(
+            garment,
+            start,
+            frames,
+            body=limb,
+            body_positions=limb[0] + track[:, None],
+            colliders=colliders,
+        )
+    return scenes
+
+
+def _measure_fast_limb(runs: Runs) -> list[Measure]:
+    measures = []
+    for speed in _SPEEDS:
+        run = runs[f"{speed} m/s"]
+        depth = depths(run)
+        deepest = float(max(np.quantile(depth, 0.999), 0.0))
+        is_deep = depth.max(axis=1) > 5.0
+        late = np.flatnonzero(is_deep[_BEFORE + _MOVE :])
+        recovery = float(late[-1] + 1) if len(late) else 0.0
+        measures += [
+            Measure(f"{speed} m/s: depth in the limb, 99.9 % [mm]", deepest, 5.0 if speed <= 2 else None),
+            Measure(f"{speed} m/s: depth in the limb, largest [mm]", float(max(depth.max(), 0.0)), None),
+            Measure(f"{speed} m/s: frames to clear after the stop", recovery, 5.0 if speed <= 4 else None),
+            Measure(f"{speed} m/s: stretch, largest", largest_stretch(run), None),
+        ]
+    return measures
+
+
+FAST_LIMB = HardCase(
+    name="fast_limb",
+    reason="an arm jerks its sleeve by up to 27 cm in a frame, more than the sleeve is wide",
+    build=_build_fast_limb,
+    measure=_measure_fast_limb,
+    picture="8 m/s",
+)
+
+
+# --- started inside the body -----------------------------------------------------------------------------
+
+_DEPTHS = (5, 10, 20, 50)  # [mm]
+
+
+def _build_start_inside(options: dict[str, Any]) -> Scenes:
+    return {
+        f"{depth} mm": drop_scene(options, height=_RADIUS - depth / _MM, seconds=1.0, is_swinging=False)
+        for depth in _DEPTHS
+    }
+
+
+def _measure_start_inside(runs: Runs) -> list[Measure]:
+    measures = []
+    for label, run in runs.items():
+        is_inside = np.flatnonzero(depths(run).max(axis=1) > 1.0)
+        frames = float(is_inside[-1] + 1) if len(is_inside) else 0.0
+        measures += [
+            Measure(f"{label}: frames until less than 1 mm inside", frames, 10.0),
+            Measure(f"{label}: speed of a vertex, largest [m/s]", float(speeds(run).max()), 10.0),
+            Measure(f"{label}: stretch, largest", largest_stretch(run), 1.5),
+        ]
+    return measures
+
+
+START_INSIDE = HardCase(
+    name="start_inside",
+    reason="skinned garments start inside the body: they must come out soon, and not like a shot",
+    build=_build_start_inside,
+    measure=_measure_start_inside,
+    picture="50 mm",
+)
+
+
+# --- other timesteps and fabrics -------------------------------------------------------------------------
+
+_TIMESTEPS = {"dt 1/60 s": 1 / 60, "dt 1/30 s": 1 / 30, "dt 1/15 s": 1 / 15, "dt 1/10 s": 1 / 10}
+_FABRICS = {  # HOOD's training ranges
+    "mu 15.9 kPa, lambda 3.5 kPa": {"lame_mu": 15909.0, "lame_lambda": 3535.0},
+    "mu 63.6 kPa, lambda 93 kPa": {"lame_mu": 63636.0, "lame_lambda": 93333.0},
+    "bending 6.4e-8 J": {"bending_stiffness": 6.37e-8},
+    "bending 1.3e-3 J": {"bending_stiffness": 1.31e-3},
+    "density 0.043 kg/m2": {"density": 0.0434},
+    "density 0.7 kg/m2": {"density": 0.7},
+}
+
+
+def _build_steps_and_fabrics(options: dict[str, Any]) -> Scenes:
+    scenes: Scenes = {
+        label: drop_scene(options, seconds=0.8, timestep=timestep) for label, timestep in _TIMESTEPS.items()
+    }
+    for label, changes in _FABRICS.items():
+        material = dataclasses.replace(COTTON, **{name: np.float32(value) for name, value in changes.items()})
+        scenes[label] = drop_scene(options, seconds=0.8, material=material)
+    return scenes
+
+
+def _measure_steps_and_fabrics(runs: Runs) -> list[Measure]:
+    measures = []
+    for label, run in runs.items():
+        if run.refusal is not None:
+            measures.append(Measure(f"{label}: refused, {run.refusal}"[:100], 0, 0))
+            continue
+        excess = own_gaps(run, max((len(run.positions) - 1) // 4, 1)).excess
+        measures += [
+            Measure(f"{label}: stretch, largest", largest_stretch(run), 1.25),
+            Measure(f"{label}: depth in the ball, 99.9 % [mm]", quantile_depth(run), 2.0),
+            Measure(f"{label}: excess, median [J]", float(np.median(excess)), 0.008),
+        ]
+    return measures
+
+
+STEPS_AND_FABRICS = HardCase(
+    name="steps_and_fabrics",
+    reason="timesteps and fabrics at the ends of their ranges: within bars, or refused",
+    build=_build_steps_and_fabrics,
+    measure=_measure_steps_and_fabrics,
+    picture="dt 1/10 s",
+    may_refuse=True,
+)
+
+
+# --- a needle and a thin edge ----------------------------------------------------------------------------
+
+_TIP = 2e-3  # [m], radius of the needle's tip and of the edge
+_HALF_ANGLE = np.radians(15.0)
+
+
+def _needle() -> tuple[tuple[np.ndarray, np.ndarray], RoundedCone]:
+    """Return a round-tipped cone that points up, its tip at height zero, as a mesh and exactly."""
+    height = 0.25
+    apex = -_TIP
+    angle = np.linspace(_HALF_ANGLE, np.pi / 2, 6)
+    tip = np.stack([_TIP * np.cos(angle), apex + _TIP * np.sin(angle)], axis=1)
+    levels = -height * np.linspace(0, 1, 24)[::-1] ** 2
+    levels = levels[levels < tip[0, 1]]
+    flank = np.stack([tip[0, 0] + (tip[0, 1] - levels) * np.tan(_HALF_ANGLE), levels], axis=1)
+    profile = np.concatenate([[[0.0, -height]], flank, tip])
+    profile[-1, 0] = 0.0
+    cone = RoundedCone(np.array([0.0, apex, 0.0]), np.array([0.0, -1.0, 0.0]), _HALF_ANGLE, _TIP)
+    return revolve(profile, 24), cone
+
+
+def _build_needle(options: dict[str, Any]) -> Scenes:
+    garment = make_cloth(sheet(_COLUMNS, _COLUMNS, (0.5, 0.5)), options)
+    start = np.asarray(garment.rest_positions, np.float64) + np.array([0.003, 0.05, 0.004])
+    mesh, cone = _needle()
+    edge = capsule(_TIP, 0.7, around=12, rings=60)
+    bar = Capsule(np.array([-0.35, 0.0, 0.0]), np.array([0.35, 0.0, 0.0]), _TIP)
+    return {
+        "needle": make_scene(garment, start, 46, body=mesh, colliders=lambda frame: (cone,)),
+        "thin edge": make_scene(garment, start, 46, body=edge, colliders=lambda frame: (bar,)),
+    }
+
+
+def _longest_edge(run: Run) -> float:
+    """Return the largest ratio of an edge's length to its rest length, over all frames."""
+    assert run.stress is not None
+    garment = run.stress.scene.garment
+    ends = np.asarray(garment.senders), np.asarray(garment.receivers)
+    rest = np.asarray(garment.rest_positions, np.float64)
+    length = np.linalg.norm(run.positions[:, ends[0]] - run.positions[:, ends[1]], axis=-1)
+    return float(np.max(length / np.linalg.norm(rest[ends[0]] - rest[ends[1]], axis=-1)))
+
+
+def _measure_needle(runs: Runs) -> list[Measure]:
+    measures = []
+    for label, run in runs.items():
+        depth = depths(run, exact=True)
+        measures += [
+            Measure(f"{label}: depth over whole triangles, largest [mm]", float(max(depth.max(), 0.0)), 5.0),
+            Measure(f"{label}: longest edge over its rest length", _longest_edge(run), 1.5),
+        ]
+    return measures
+
+
+NEEDLE = HardCase(
+    name="needle",
+    reason="a tip of 2 mm finds the gap between vertices 16 mm apart",
+    build=_build_needle,
+    measure=_measure_needle,
+    picture="needle",
+)
+
+
+# --- pinched between two limbs ---------------------------------------------------------------------------
+
+
+def _build_pinch(options: dict[str, Any]) -> Scenes:
+    size, radius = 0.4, 0.05
+    mesh = hanging_sheet(21, 21, (size, size))
+    garment = make_cloth(mesh, options, is_pinned=corners_of(mesh[0], (-1, 1), (1, 1), axes=(0, 1)))
+    start = mesh[0] + np.array([0.0, size / 2, 0.0])
+    limb = capsule(radius, 0.6)
+    body = join_meshes(limb, limb)
+    frames = 76
+    gap = np.interp(np.arange(frames), [0, 10, 40], [0.07, 0.07, -0.01])  # [m], then still
+    centers = np.stack([np.zeros(frames), np.zeros(frames), radius + gap / 2], axis=1)
+    count = len(limb[0])
+    tracks = body[0] + np.concatenate(
+        [np.repeat(sign * centers[:, None], count, axis=1) for sign in (-1, 1)], axis=1
+    )
+
+    def colliders(frame: int) -> tuple[Collider, ...]:
+        end = np.array([0.3, 0.0, 0.0])
+        middles = (-centers[frame], centers[frame])
+        return tuple(Capsule(middle - end, middle + end, radius) for middle in middles)
+
+    return {
+        "pinch": make_scene(garment, start, frames, body=body, body_positions=tracks, colliders=colliders)
+    }
+
+
+def _measure_pinch(runs: Runs) -> list[Measure]:
+    run = runs["pinch"]
+    return [
+        Measure("speed with the limbs still, rms [m/s]", rms_speed(run, len(run.positions) - 16), 0.1),
+        Measure("stretch, largest", largest_stretch(run), 1.5),
+        Measure("depth in the limbs, 99.9 % [mm]", quantile_depth(run), None),
+    ]
+
+
+PINCH = HardCase(
+    name="pinch",
+    reason="cloth between an arm and a chest that overlap has nowhere to go, and must not tremble",
+    build=_build_pinch,
+    measure=_measure_pinch,
+    picture="pinch",
+)
+
+
+# --- a long rest on a slope ------------------------------------------------------------------------------
+
+
+def _build_slope(options: dict[str, Any]) -> Scenes:
+    tilt = np.radians(20.0)
+    mesh = sheet(13, 13, (0.3, 0.3))
+    garment = make_cloth(mesh, options)
+    turn = np.array([[np.cos(tilt), -np.sin(tilt), 0], [np.sin(tilt), np.cos(tilt), 0], [0, 0, 1]])
+    normal = turn @ np.array([0.0, 1.0, 0.0])
+    start = mesh[0] @ turn.T + 3e-3 * normal
+    return {
+        "rest": make_scene(
+            garment,
+            start,
+            1801,
+            body=plane(0.6, 13, tilt),
+            colliders=lambda frame: (Plane(np.zeros(3), normal),),
+            parameters=PhysicsParameters(friction_coefficient=0.5),
+        )
+    }
+
+
+def _measure_slope(runs: Runs) -> list[Measure]:
+    run = runs["rest"]
+    half = len(run.positions) // 2
+    path = center(run)
+    creep = np.linalg.norm(path[-1] - path[half]) / ((len(path) - 1 - half) * run.timestep)
+    steps = np.linalg.norm(np.diff(run.positions[half:], axis=0), axis=-1)
+    return [
+        Measure("creep in the second half minute [mm/s]", _MM * float(creep), 1.0),
+        Measure(
+            "motion in one frame, largest rms [mm]",
+            _MM * float(np.sqrt(np.mean(steps**2, axis=1)).max()),
+            0.2,
+        ),
+        Measure("depth in the slope, 99.9 % [mm]", quantile_depth(run), None),
+    ]
+
+
+SLOPE = HardCase(
+    name="slope",
+    reason="a minute on a slope of 20 degrees with friction 0.5: cloth at rest must stay at rest",
+    build=_build_slope,
+    measure=_measure_slope,
+    picture="rest",
+)
+
+BODY_CASES: tuple[HardCase, ...] = (
+    TURNED,
+    DROP,
+    FAST_LIMB,
+    START_INSIDE,
+    STEPS_AND_FABRICS,
+    NEEDLE,
+    PINCH,
+    SLOPE,
+)
