@@ -1,0 +1,67 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides, find_contacts, nearest_point
+from eslr_jax.contact.surface import prepare_surface
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.25)
+    vertices = jnp.asarray(mesh.vertices, jnp.float32)
+    surface = prepare_surface(mesh.vertices, mesh.faces)
+    return mesh, vertices[surface.vertex_ids], surface
+
+
+def test_nearest_point_is_the_exact_one_on_a_sphere(sphere):
+    mesh, vertices, surface = sphere
+    generator = np.random.default_rng(0)
+    direction = generator.standard_normal((300, 3))
+    query = (
+        direction / np.linalg.norm(direction, axis=1, keepdims=True) * generator.uniform(0.2, 0.32, (300, 1))
+    )
+    found = nearest_point(jnp.asarray(query, jnp.float32), vertices, surface)
+    triangles = mesh.triangles
+    exact = [
+        np.linalg.norm(
+            trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1))) - point, axis=1
+        ).min()
+        for point in query
+    ]
+    np.testing.assert_allclose(np.sqrt(found.squared_distance), exact, atol=2e-6)
+
+
+def test_signed_distance_normal_and_gate(sphere):
+    _, vertices, surface = sphere
+    query = jnp.array([[0.0, 0.26, 0.0], [0.0, 0.24, 0.0], [0.0, 0.25 + 2 * CONTACT_RADIUS, 0.0]])
+    contacts = find_contacts(query, vertices, vertices, surface)
+    np.testing.assert_allclose(contacts.distances[:2], [0.01, -0.01], atol=1e-3)
+    np.testing.assert_allclose(contacts.normals[0], [0.0, 1.0, 0.0], atol=0.05)
+    np.testing.assert_array_equal(contacts.is_near, [True, True, False])
+
+
+def test_contact_point_moves_with_the_body(sphere):
+    _, vertices, surface = sphere
+    offset = jnp.array([[0.1, -0.05, 0.02]])
+    query = jnp.array([[0.1, 0.24, 0.0]])
+    contacts = find_contacts(query, vertices, vertices + offset, surface)
+    np.testing.assert_allclose(contacts.next_points - contacts.points, offset, atol=1e-6)
+    np.testing.assert_allclose(contacts.next_normals, contacts.normals, atol=1e-6)
+
+
+def test_cloth_between_two_limbs_sees_both():
+    left = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    right = left.copy()
+    right.apply_translation([0.23, 0.0, 0.0])
+    both = trimesh.util.concatenate(left, right)
+    surface = prepare_surface(both.vertices, both.faces)
+    vertices = jnp.asarray(both.vertices, jnp.float32)[surface.vertex_ids]
+    query = jnp.array([[0.11, 0.0, 0.0], [-0.11, 0.0, 0.0]])  # between the two, and beyond the left one
+    contacts, across = jax.jit(find_both_sides)(query, vertices, vertices, surface)
+    np.testing.assert_allclose(contacts.distances, [0.01, 0.01], atol=1e-3)
+    np.testing.assert_array_equal(across.is_near, [True, False])
+    np.testing.assert_allclose(across.distances[0], 0.02, atol=1e-3)
+    np.testing.assert_allclose(across.normals[0], [-1.0, 0.0, 0.0], atol=0.05)

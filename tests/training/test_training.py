@@ -1,0 +1,123 @@
+import dataclasses
+import json
+import os
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+from eslr_jax.assets import load_model
+from eslr_jax.config import TrainConfig
+from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax.models.registry import MODELS
+from eslr_jax.training import data, loop
+from eslr_jax.training.loop import train
+
+MODEL = dataclasses.replace(MODELS["mgn-small"], passes=1, latent_size=16)
+CONFIG = TrainConfig(
+    model=MODEL,
+    garments=("tshirt",),
+    iterations=6,
+    warmup=2,
+    slots_per_garment=2,
+    log_every=2,
+    checkpoint_every=2,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_clip_and_one_compilation():
+    """Train on one clip, and let the runs of this file share data and compiled steps."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(data, "clips_of", lambda split: ["cmu_016_32"])
+    loaded = data.load_training_data(CONFIG, "1k")
+    patch.setattr(loop, "load_training_data", lambda config, vertices: loaded)
+    steps = {}
+    make = loop.make_train_step
+
+    def make_once(config, resolution):
+        key = dataclasses.replace(config, seed=0)
+        if key not in steps:
+            steps[key] = make(config, resolution)
+        return steps[key]
+
+    patch.setattr(loop, "make_train_step", make_once)
+    yield
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return train(CONFIG, folder), folder
+
+
+def test_run_leaves_metrics_and_a_model(finished):
+    state, folder = finished
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [record["iteration"] for record in records] == [2, 4, 6]
+    assert all(np.isfinite(list(record.values())).all() for record in records)
+    assert int(state.skipped) == 0
+    params, config = load_model(folder / "model.npz")
+    assert config == MODEL
+    for loaded, trained in zip(jax.tree.leaves(params), jax.tree.leaves(state.params), strict=True):
+        np.testing.assert_array_equal(loaded, trained)
+
+
+def test_training_moves_the_weights(finished):
+    from eslr_jax.models.registry import init_model
+
+    state, _ = finished
+    pairs = zip(
+        jax.tree.leaves(state.params["params"]), jax.tree.leaves(init_model(MODEL)["params"]), strict=True
+    )
+    assert any(not np.array_equal(trained, initial) for trained, initial in pairs)
+
+
+def test_interrupted_run_resumes_bit_by_bit(finished, tmp_path):
+    whole, _ = finished
+
+    def interrupt(done, total, metrics):
+        if done == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    part = train(CONFIG, tmp_path, on_progress=interrupt)
+    assert int(part.iteration) < CONFIG.iterations
+    assert not (tmp_path / "model.npz").exists()
+    resumed = train(CONFIG, tmp_path, resume=True)
+    for ours, theirs in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_folder_in_use_is_not_overwritten(finished):
+    _, folder = finished
+    before = (folder / "metrics.jsonl").read_text()
+    with pytest.raises(CheckpointError, match="--resume"):
+        train(CONFIG, folder)
+    with pytest.raises(CheckpointError, match="another configuration"):
+        train(dataclasses.replace(CONFIG, seed=1), folder, resume=True)
+    assert (folder / "metrics.jsonl").read_text() == before
+
+
+def test_resuming_nothing_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="no training run"):
+        train(CONFIG, tmp_path, resume=True)
+
+
+def test_half_written_checkpoint_is_not_taken(finished, tmp_path):
+    """A folder that orbax has not renamed yet is no checkpoint."""
+    _, folder = finished
+    from eslr_jax.training.checkpoint import Checkpoints
+
+    checkpoints = Checkpoints(folder)
+    latest = checkpoints.latest()
+    (folder / "checkpoints" / f"{latest + 1}.orbax-checkpoint-tmp-1").mkdir()
+    assert Checkpoints(folder).latest() == latest
+
+
+def test_unknown_split_lists_what_exists():
+    from eslr_jax.evaluation.evaluate import split_clips
+
+    with pytest.raises(ConfigError, match="validation"):
+        split_clips("holdout")
