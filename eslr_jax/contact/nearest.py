@@ -15,6 +15,7 @@ _NEAREST_PATCHES = 4  # patches whose vertices are tried
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
 _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
+MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 
 
 class SurfacePoint(NamedTuple):
@@ -220,14 +221,25 @@ def _contacts_at(
     """Carry located body points to t + 1, with their tangent planes."""
     next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
     points = interpolate(body, location, surface)
+    next_points = interpolate(next_body, location, surface)
     here = safe_normalize(interpolate(normals, location, surface))
     side = jnp.sum((position - points) * here, axis=-1)
     distance = jnp.sqrt(location.squared_distance)
     return Contacts(
         points=points,
-        next_points=interpolate(next_body, location, surface),
+        next_points=next_points,
         normals=here,
         next_normals=safe_normalize(interpolate(next_normals, location, surface)),
         distances=jnp.where(side < 0, -distance, distance),
-        is_near=distance < CONTACT_RADIUS,
+        # A limb that comes closer during the frame would otherwise jump over cloth that is far at t.
+        is_near=distance - jnp.maximum(approach(points, next_points, here), 0.0) < CONTACT_RADIUS,
     )
+
+
+def approach(
+    points: Float[Array, "vertices 3"],
+    next_points: Float[Array, "vertices 3"],
+    normals: Float[Array, "vertices 3"],
+) -> Float[Array, " vertices"]:
+    """Return by how much body points move along their normals during the frame, towards the cloth [m]."""
+    return jnp.sum((next_points - points) * normals, axis=-1)

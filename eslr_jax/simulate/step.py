@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_both_sides
+from eslr_jax.contact.nearest import MAX_APPROACH, approach, find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
@@ -140,6 +140,10 @@ def next_state(
     load = state.friction_load
     if problem.contacts is not None:
         load = next_friction_load(position, problem, garment)
+        contacts = problem.contacts
+        moved = approach(contacts.points, contacts.next_points, contacts.normals)
+        is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & garment.vertex_mask)
+        status = status | jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
     if problem.self_contacts is not None:
         status = status | problem.self_contacts.status
     is_finite = jnp.all(jnp.isfinite(position))

@@ -170,11 +170,10 @@ def _measure_bad_start(runs: Runs) -> list[Measure]:
         rest = np.asarray(run.stress.scene.garment.rest_positions)
         settled = settle(run.stress, rest)
         lowest = mechanical_energy(_with_positions(run, np.stack([settled, settled])))[0]
-        drop = energy[0] - lowest
+        # Heights count from the pins, so the settled energy is that of the whole sag.
+        above, drop = energy[-1] - lowest, energy[0] - lowest
         measures += [
-            Measure(
-                f"{label}: energy above the settled one after 2 s [%]", 100 * (energy[-1] - lowest) / drop, 10
-            ),
+            Measure(f"{label}: energy above the settled one after 2 s [%]", 100 * above / abs(lowest), 10.0),
             Measure(f"{label}: rise of energy, of the drop [%]", 100 * largest_rise(energy) / drop, 0.1),
             Measure(f"{label}: triangles inside out at the end [%]", 100 * _flipped_share(run), None),
         ]
