@@ -6,8 +6,9 @@ Every function returns one small dense block per face, hinge or vertex; `newton`
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from eslr_jax.contact.self_contact import SelfContacts
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.types import Contacts, Garment, Material
 
@@ -45,7 +46,7 @@ def stretch_blocks(
     """
     corners = position[garment.faces]
     inverse = np.asarray(garment.inverse_rest_frames, np.float64)
-    weights = np.stack([inverse[:, 0], inverse[:, 1], -inverse[:, 0] - inverse[:, 1]], axis=1)  # dF = dx_c w_c
+    weights = np.stack([inverse[:, 0], inverse[:, 1], -inverse[:, 0] - inverse[:, 1]], axis=1)  # dF / dx_c
     gradient = np.einsum("fca,fcj->faj", corners, weights)
     left, stretch, right = np.linalg.svd(gradient, full_matrices=True)
     s1, s2 = stretch[:, 0], stretch[:, 1]
@@ -122,33 +123,70 @@ def vertex_blocks(
     masses = np.asarray(material.density, np.float64) * np.asarray(garment.vertex_areas, np.float64)
     timestep = float(problem.timestep)
     blocks = (masses / timestep**2)[:, None, None] * np.eye(3)
-    contacts, parameters = problem.contacts, problem.parameters
-    if contacts is None:
+    for contacts in (problem.contacts, problem.across):
+        if contacts is not None:
+            blocks = blocks + _collision_blocks(position, contacts, problem, garment)
+    if problem.contacts is None:
         return blocks
-    normal = np.asarray(contacts.next_normals, np.float64)
-    outer = normal[:, :, None] * normal[:, None, :]
-    for side in (contacts, problem.across):
-        if side is not None:
-            blocks = blocks + _collision_blocks(position, side, problem, garment)
-
-    motion = (position - problem.position) - (contacts.next_points - contacts.points)
-    tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
-    slip = float(parameters.friction_speed) * timestep
-    length = np.sqrt(np.sum(tangential**2, axis=1) + slip**2)
-    direction = tangential / length[:, None]
-    # The normals are unit vectors up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
-    curvature = np.eye(3) - outer - direction[:, :, None] * direction[:, None, :]
-    load = float(parameters.friction_coefficient) * np.asarray(problem.friction_load, np.float64)
-    return blocks + (load / length)[:, None, None] * curvature
+    return blocks + _friction_blocks(position, problem.contacts, problem)
 
 
 def _collision_blocks(
-    position: Float[np.ndarray, "vertices 3"], contacts: Contacts, problem: FrameProblem, garment: Garment
+    position: np.ndarray, contacts: Contacts, problem: FrameProblem, garment: Garment
 ) -> Float[np.ndarray, "vertices 3 3"]:
-    """Return the Hessian of the collision energy with one set of tangent planes [N/m]."""
+    """Return 6 k a depth n n^T per vertex."""
+    assert problem.collision_thickness is not None
     normal = np.asarray(contacts.next_normals, np.float64)
     height = np.sum((position - contacts.next_points) * normal, axis=1)
-    thickness = float(problem.collision_thickness)  # type: ignore[arg-type]
-    depth = np.where(contacts.is_near, np.maximum(thickness - height, 0.0), 0.0)
-    stiffness = 6.0 * float(problem.parameters.collision_stiffness) * garment.vertex_areas * depth
+    depth = np.where(contacts.is_near, np.maximum(float(problem.collision_thickness) - height, 0.0), 0.0)
+    stiffness = 6.0 * float(problem.parameters.collision_stiffness) * np.asarray(garment.vertex_areas) * depth
     return stiffness[:, None, None] * normal[:, :, None] * normal[:, None, :]
+
+
+def _friction_blocks(
+    position: np.ndarray, contacts: Contacts, problem: FrameProblem
+) -> Float[np.ndarray, "vertices 3 3"]:
+    """Return mu N (I - n n^T - u u^T / l^2) / l per vertex, with l = sqrt(|u|^2 + s^2)."""
+    normal = np.asarray(contacts.next_normals, np.float64)
+    motion = (position - problem.position) - (contacts.next_points - contacts.points)
+    tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
+    slip = float(problem.parameters.friction_speed) * float(problem.timestep)
+    length = np.sqrt(np.sum(tangential**2, axis=1) + slip**2)
+    direction = tangential / length[:, None]
+    # Unit normals are so up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
+    outer = [vector[:, :, None] * vector[:, None, :] for vector in (normal, direction)]
+    curvature = np.eye(3) - outer[0] - outer[1]
+    load = float(problem.parameters.friction_coefficient) * np.asarray(problem.friction_load, np.float64)
+    return (load / length)[:, None, None] * curvature
+
+
+def pair_table(contacts: SelfContacts | None) -> Int[np.ndarray, "pairs 4"]:
+    """Return the vertex and the face's corners of every self-contact pair in use."""
+    if contacts is None:
+        return np.zeros((0, 4), np.int64)
+    table = np.concatenate([np.asarray(contacts.vertices)[:, None], np.asarray(contacts.corners)], axis=1)
+    return table[np.asarray(contacts.side) != 0]
+
+
+def pair_blocks(
+    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem, garment: Garment
+) -> Float[np.ndarray, "pairs 12 12"]:
+    """Return 6 k a depth g g^T per self-contact pair in use, with the direction held: g = (n, -w_k n)."""
+    contacts, parameters = problem.self_contacts, problem.parameters
+    if contacts is None:
+        return np.zeros((0, 12, 12))
+    side = np.asarray(contacts.side)
+    table, is_used = pair_table(contacts), side != 0
+    vertex, a, b, c = np.swapaxes(position[table], 0, 1)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal * (side[is_used] / np.where(length > 0, length, 1.0))[:, None]
+    weights = np.asarray(contacts.weights, np.float64)[is_used]
+    foot = np.einsum("pk,pka->pa", weights, np.stack([a, b, c], axis=1))
+    height = np.sum((vertex - foot) * normal, axis=1)
+    depth = np.maximum(float(parameters.repulsion_thickness) - height, 0.0)
+    shares = np.concatenate([np.ones((len(weights), 1)), -weights], axis=1)
+    gradient = (shares[:, :, None] * normal[:, None, :]).reshape(-1, 12)
+    areas = np.asarray(garment.vertex_areas, np.float64)[table[:, 0]]
+    stiffness = 6.0 * float(parameters.repulsion_stiffness) * areas * depth
+    return stiffness[:, None, None] * gradient[:, :, None] * gradient[:, None, :]

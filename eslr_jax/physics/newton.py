@@ -69,7 +69,7 @@ def minimize_newton(
     problem, garment, material = to_float64((problem, garment, material))
     evaluate = _evaluator(problem, garment, material)
     is_free = _free_vertices(problem, garment)
-    bands = _find_bands(garment, is_free)
+    bands = _find_bands(garment, hessian.pair_table(problem.self_contacts), is_free)
     masses = material.density * garment.vertex_areas
     weight = float(problem.parameters.gravity) * np.linalg.norm(masses)
 
@@ -77,17 +77,16 @@ def minimize_newton(
     if problem.pin_targets is not None:
         x = np.where(np.asarray(garment.is_pinned)[:, None], problem.pin_targets, x)
     value, gradient = evaluate(x)
-    iteration = 0
-    for iteration in range(max_iterations):
-        if np.linalg.norm(gradient[is_free]) <= tolerance * weight:
-            break
+    iterations = 0
+    while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
         direction = _newton_direction(x, gradient, problem, garment, material, bands)
         found = _line_search(evaluate, x, value, gradient, direction)
+        iterations += 1
         if found is None:
             break
         x, value, gradient = found
-    residual = float(np.linalg.norm(gradient[is_free]) / weight)
-    return NewtonMinimum(x, value, residual, iteration, residual <= tolerance)
+    residual = float(np.linalg.norm(gradient) / weight)
+    return NewtonMinimum(x, value, residual, iterations, residual <= tolerance)
 
 
 def potential_float64(
@@ -129,40 +128,36 @@ def _free_vertices(problem: FrameProblem, garment: Garment) -> np.ndarray:
     return is_free
 
 
-def _find_bands(garment: Garment, is_free: np.ndarray) -> _Bands:
+def _find_bands(garment: Garment, pairs: np.ndarray, is_free: np.ndarray) -> _Bands:
     """Order the free vertices so that the matrix has a narrow band, and map the blocks' entries to it."""
     count = len(is_free)
-    faces, hinges = (np.asarray(table) for table in (garment.faces, garment.hinges))
-    hinges = hinges[np.asarray(garment.hinge_rest_areas) > 0]
-    rows, columns = (np.concatenate(part) for part in zip(_pairs(faces), _pairs(hinges), strict=True))
+    tables = (np.asarray(garment.faces), np.asarray(garment.hinges), pairs, np.arange(count)[:, None])
+    rows, columns = (np.concatenate(part) for part in zip(*map(_couples, tables), strict=True))
     links = scipy.sparse.csr_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count))
     ordered = reverse_cuthill_mckee(links, symmetric_mode=True)
     ordered = ordered[is_free[ordered]]
     place = np.full(count, -1)
     place[ordered] = np.arange(len(ordered))
 
-    tables = (faces, np.asarray(garment.hinges), np.arange(count)[:, None])
-    places = [_dof_pairs(place[table], place[table] >= 0) for table in tables]
-    row, column = (np.concatenate(part) for part in zip(*places, strict=True))
-    is_kept = (row >= column) & (column >= 0)
-    entries = np.flatnonzero(is_kept)
+    couples = [_dof_couples(place[table]) for table in tables]
+    row, column = (np.concatenate(part) for part in zip(*couples, strict=True))
+    entries = np.flatnonzero((row >= column) & (column >= 0))
     row, column = row[entries], column[entries]
-    # Padded hinges only name the padded vertex, which is not free, so no band is widened by them.
     shape = (int(np.max(row - column, initial=0)) + 1, 3 * len(ordered))
     order = (3 * ordered[:, None] + np.arange(3)).ravel()
     return _Bands(order, entries, (row - column) * shape[1] + column, shape)
 
 
-def _pairs(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _couples(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return all ordered pairs of the columns of a table, as rows and columns of a matrix."""
     corners = table.shape[1]
     return np.repeat(table, corners, axis=1).ravel(), np.tile(table, (1, corners)).ravel()
 
 
-def _dof_pairs(places: np.ndarray, is_free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _dof_couples(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrix rows and columns of all entries of the elements' blocks; -1 for fixed vertices."""
-    dofs = np.where(is_free[:, :, None], 3 * places[:, :, None] + np.arange(3), -1)
-    return _pairs(dofs.reshape(len(places), -1))
+    dofs = np.where(places[:, :, None] >= 0, 3 * places[:, :, None] + np.arange(3), -1)
+    return _couples(dofs.reshape(len(places), 3 * places.shape[1]))
 
 
 def _newton_direction(
@@ -177,6 +172,7 @@ def _newton_direction(
     blocks = (
         hessian.stretch_blocks(x, garment, material),
         hessian.bending_blocks(x, garment, material),
+        hessian.pair_blocks(x, problem, garment),
         hessian.vertex_blocks(x, problem, garment, material),
     )
     values = np.concatenate([block.ravel() for block in blocks])[bands.entries]

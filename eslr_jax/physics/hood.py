@@ -1,0 +1,319 @@
+"""Energy set `hood`: HOOD's published losses with every quirk, so that its tables can be compared.
+
+What differs from set `consistent` is listed side by side in `physics.potential`. Three readings of the same
+six terms exist in HOOD's code, and differ in which frame of the body they look at:
+
+| criterion    | collision: nearest centroid | collision: planes | friction: body motion | weight, eps |
+|--------------|-----------------------------|-------------------|-----------------------|-------------|
+| `postcvpr`   | x_t on the body at t        | at t + 1          | t - 1 to t, one late  | 5e3, 2 mm   |
+| `cvpr`       | x_t on the body at t - 1    | at t, one late    | t - 1 to t, one late  | 5e3, 2 mm   |
+| `metric`     | x_{t+1} on the body at t + 1| at t + 1          | t to t + 1            | 1, 1 mm     |
+
+The first two train; the last makes the tables. Torch's norms have a zero gradient at zero, and so have these.
+
+Source: HOOD (arXiv 2212.07242), repository at 9bc1076: criterions/{cvpr,postcvpr,aux}, utils/metrics.py.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.numerics import (
+    components,
+    cross3,
+    dot3,
+    masked_sum,
+    safe_norm,
+    safe_normalize,
+    sub3,
+)
+from eslr_jax.physics.bending import bending_energy
+from eslr_jax.physics.gravity import gravity_energy
+from eslr_jax.physics.inertia import inertia_energy, vertex_masses
+from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.physics.potential import PotentialTerms
+from eslr_jax.types import Garment, Material
+
+Criterion = Literal["postcvpr", "cvpr", "metric"]
+
+_CHUNK = 64  # garment vertices whose distances to all faces are held at once
+_FLOOR_AXIS = 2  # friction's "floor normal" is z although gravity acts along y
+_SINE_FLOOR = 1e-4  # added under the root of friction's slope factor
+
+
+@struct.dataclass
+class HoodParameters:
+    """Constants of HOOD's losses; the defaults are those of training before its collision ramp."""
+
+    collision_weight: Float[Array, ""] | float = 5e3  # [J/m^3] per vertex
+    collision_thickness: Float[Array, ""] | float = 2e-3  # [m]
+    friction_coefficient: Float[Array, ""] | float = 0.5
+    friction_radius: Float[Array, ""] | float = 3e-3  # compared with squared distances: 5.5 cm in truth
+    gravity: Float[Array, ""] | float = 9.81  # [m/s^2]
+
+
+METRIC_PARAMETERS = HoodParameters(collision_weight=1.0, collision_thickness=1e-3)
+"""Constants of HOOD's tables (configs/aux/metrics.yaml)."""
+
+
+class BodyFrames(NamedTuple):
+    """A body's vertices around one step [m]; all faces of the body take part, hands included."""
+
+    previous: Float[Array, "body_vertices 3"]  # at t - 1
+    current: Float[Array, "body_vertices 3"]  # at t
+    next: Float[Array, "body_vertices 3"]  # at t + 1
+
+
+class HoodMetrics(NamedTuple):
+    """What HOOD's evaluation reports of every frame from the third on."""
+
+    terms: PotentialTerms  # [J], each of shape [frames - 2]
+    penetrating_share: Float[Array, " steps"]  # of vertices within the thickness, HOOD's `perc`
+    gradient_norm: Float[Array, " steps"]  # mean over vertices of the total's gradient [N]
+
+
+def collision_weight(iteration: Int[Array, ""] | int) -> Float[Array, ""]:
+    """Return HOOD's weight after this many training samples: 5e3 up to 50k, rising to 5e5 at 150k [J/m^3]."""
+    ramp = jnp.clip((jnp.asarray(iteration, jnp.float32) - 50_000) / 100_000, 0.0, 1.0)
+    return 5e3 + (5e5 - 5e3) * ramp
+
+
+class _FacePlanes(NamedTuple):
+    """Centroids and unit normals of a body's faces."""
+
+    centers: Float[Array, "body_faces 3"]
+    normals: Float[Array, "body_faces 3"]
+
+
+def _face_planes(body: Float[Array, "body_vertices 3"], faces: Int[Array, "body_faces 3"]) -> _FacePlanes:
+    a, b, c = (components(body[faces[:, k]]) for k in range(3))
+    normals = jnp.stack(cross3(sub3(c, b), sub3(a, b)), axis=-1)
+    return _FacePlanes(body[faces].mean(axis=1), safe_normalize(normals))
+
+
+def nearest_centroid(
+    query: Float[Array, "vertices 3"], centers: Float[Array, "body_faces 3"]
+) -> tuple[Int[Array, " vertices"], Float[Array, " vertices"]]:
+    """Return the nearest face centroid of every point and its squared distance [m^2]; brute force.
+
+    Neither result carries a gradient; of several nearest the first is taken.
+    """
+    query, centers = jax.lax.stop_gradient((query, centers))
+    others = components(centers)
+
+    def nearest(point: Array) -> tuple[Array, Array]:
+        offset = tuple(other - point[axis] for axis, other in enumerate(others))
+        squared = dot3(offset, offset)  # type: ignore[arg-type]
+        least = jnp.min(squared)
+        # XLA's argmin is slow on a CPU.
+        index = jnp.min(jnp.where(squared <= least, jnp.arange(squared.shape[0]), squared.shape[0] - 1))
+        return index.astype(jnp.int32), least
+
+    return jax.lax.map(nearest, query, batch_size=_CHUNK)
+
+
+def hood_depths(
+    position: Float[Array, "vertices 3"],
+    query: Float[Array, "vertices 3"],
+    search_body: Float[Array, "body_vertices 3"],
+    body: Float[Array, "body_vertices 3"],
+    faces: Int[Array, "body_faces 3"],
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, " vertices"]:
+    """Return max(eps - d, 0) [m], d the height over the plane of the face with the nearest centroid.
+
+    Args:
+        position: Vertices whose height is taken [m].
+        query: Vertices whose nearest centroid is looked for [m].
+        search_body: Body on which it is looked for [m].
+        body: Body whose planes count [m].
+        faces: Of the body.
+        thickness: eps [m].
+    """
+    nearest, _ = nearest_centroid(query, _face_planes(search_body, faces).centers)
+    planes = _face_planes(body, faces)
+    height = jnp.sum((position - planes.centers[nearest]) * planes.normals[nearest], axis=-1)
+    return jnp.maximum(thickness - height, 0.0)
+
+
+def hood_friction_energy(
+    position: Float[Array, "vertices 3"],
+    start: Float[Array, "vertices 3"],
+    body_before: Float[Array, "body_vertices 3"],
+    body: Float[Array, "body_vertices 3"],
+    faces: Int[Array, "body_faces 3"],
+    masses: Float[Array, " vertices"],
+    parameters: HoodParameters,
+) -> Float[Array, ""]:
+    """Return mu g sum_v m_v s_v |Delta_T| [J] over the vertices near the body.
+
+    Delta is the cloth's motion minus that of the body face nearest to it at first, Delta_T its part across
+    the mean of that face's normal and the one nearest at last (not normalised again), and
+    s = sqrt(|1 - cos^2(Delta_T, z)| + 1e-4).
+
+    Args:
+        position: Predicted vertices [m].
+        start: Vertices one frame earlier [m].
+        body_before: Body at the start of its motion [m].
+        body: Body at the end of its motion [m].
+        faces: Of the body.
+        masses: [kg].
+        parameters: Coefficient mu, gravity g and radius.
+    """
+    before, after = _face_planes(body_before, faces), _face_planes(body, faces)
+    first, first_squared = nearest_centroid(start, before.centers)
+    last, last_squared = nearest_centroid(position, after.centers)
+    is_near = (first_squared < parameters.friction_radius) & (last_squared < parameters.friction_radius)
+    motion = position - start - (after.centers[first] - before.centers[first])
+    normal = 0.5 * (before.normals[first] + after.normals[last])
+    tangential = motion - jnp.sum(motion * normal, axis=-1, keepdims=True) * normal
+    cosine = safe_normalize(tangential)[:, _FLOOR_AXIS]
+    slope = jnp.sqrt(jnp.abs(1.0 - cosine * cosine) + _SINE_FLOOR)
+    per_vertex = masses * slope * safe_norm(tangential)
+    return parameters.friction_coefficient * parameters.gravity * masked_sum(per_vertex, is_near)
+
+
+def hood_terms(
+    position: Float[Array, "vertices 3"],
+    current: Float[Array, "vertices 3"],
+    previous: Float[Array, "vertices 3"],
+    bodies: BodyFrames | None,
+    body_faces: Int[Array, "body_faces 3"] | None,
+    garment: Garment,
+    material: Material,
+    timestep: Float[Array, ""] | float,
+    parameters: HoodParameters,
+    *,
+    criterion: Criterion = "postcvpr",
+) -> PotentialTerms:
+    """Return HOOD's six losses [J] of one step.
+
+    Sums over vertices, faces and edges, without means; gravity counts from the world's origin. In the two
+    training criteria pinned vertices have already moved when the losses are taken: they add a constant to
+    inertia.
+
+    Args:
+        position: Predicted vertices at t + 1 [m].
+        current: Vertices at t [m].
+        previous: Vertices at t - 1 [m]; `current` where HOOD starts with zero velocity.
+        bodies: The body around the step; None without one.
+        body_faces: Counter-clockwise seen from outside.
+        garment: Rest mesh.
+        material: Fabric; HOOD keeps thickness at 0.47 mm whatever the fabric.
+        timestep: 1/30 s, and 1/3 s in HOOD's first step [s].
+        parameters: Weights and thresholds; `METRIC_PARAMETERS` for `metric`.
+        criterion: Which frames of the body count (see the module); static.
+    """
+    masses = vertex_masses(garment, material)
+    if criterion != "metric":
+        is_pinned = garment.is_pinned[:, None]
+        previous = jnp.where(is_pinned, current, previous)
+        current = jnp.where(is_pinned, jax.lax.stop_gradient(position), current)
+        position = jnp.where(is_pinned, jax.lax.stop_gradient(position), position)
+    guess = current + (current - previous)
+    collision: Float[Array, ""] | float = 0.0
+    friction: Float[Array, ""] | float = 0.0
+    if bodies is not None:
+        assert body_faces is not None
+        depth = _criterion_depths(position, current, bodies, body_faces, parameters, criterion)
+        collision = parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask)
+        is_metric = criterion == "metric"
+        friction = hood_friction_energy(
+            position,
+            current,
+            bodies.current if is_metric else bodies.previous,
+            bodies.next if is_metric else bodies.current,
+            body_faces,
+            masses,
+            parameters,
+        )
+    return PotentialTerms(
+        stretch=stretch_energy(position, garment, material),
+        bending=bending_energy(position, garment, material, use_current_length=True),
+        inertia=inertia_energy(position, guess, masses, jnp.asarray(timestep, position.dtype)),
+        gravity=gravity_energy(position, None, masses, parameters.gravity),
+        collision=collision,
+        friction=friction,
+    )
+
+
+def _criterion_depths(
+    position: Float[Array, "vertices 3"],
+    current: Float[Array, "vertices 3"],
+    bodies: BodyFrames,
+    faces: Int[Array, "body_faces 3"],
+    parameters: HoodParameters,
+    criterion: Criterion,
+) -> Float[Array, " vertices"]:
+    """Return `hood_depths` with the frames that the criterion looks at."""
+    query, search_body, body = {
+        "postcvpr": (current, bodies.current, bodies.next),
+        "cvpr": (current, bodies.previous, bodies.current),
+        "metric": (position, bodies.next, bodies.next),
+    }[criterion]
+    return hood_depths(position, query, search_body, body, faces, parameters.collision_thickness)
+
+
+def hood_metrics(
+    positions: Float[Array, "frames vertices 3"],
+    body_positions: Float[Array, "frames body_vertices 3"],
+    body_faces: Int[Array, "body_faces 3"],
+    garment: Garment,
+    material: Material,
+    timestep: Float[Array, ""] | float,
+    *,
+    parameters: HoodParameters = METRIC_PARAMETERS,
+    criterion: Criterion = "metric",
+) -> HoodMetrics:
+    """Measure a trajectory as HOOD's tables do: every frame from the third on, with its two predecessors.
+
+    The paper's Total of a trajectory is the mean over frames of the sum of the terms. Its collision column is
+    most likely the training criterion at 5e3: `HoodParameters()` with "postcvpr".
+
+    Args:
+        positions: Garment vertices of all frames [m].
+        body_positions: Body vertices of the same frames [m].
+        body_faces: All faces of the body.
+        garment: Rest mesh.
+        material: Fabric; HOOD evaluates with `materials.COTTON`.
+        timestep: Duration of a frame [s].
+        parameters: Weights and thresholds.
+        criterion: Which frames of the body count; static.
+    """
+
+    def total(position, current, previous, bodies):
+        terms = hood_terms(
+            position,
+            current,
+            previous,
+            bodies,
+            body_faces,
+            garment,
+            material,
+            timestep,
+            parameters,
+            criterion=criterion,
+        )
+        terms = PotentialTerms(*(jnp.asarray(term, position.dtype) for term in terms))
+        return sum(terms), terms
+
+    def measure(frames):
+        (previous, current, position), bodies = frames
+        gradient, terms = jax.grad(total, has_aux=True)(position, current, previous, bodies)
+        depth = _criterion_depths(position, current, bodies, body_faces, parameters, criterion)
+        mask: Bool[Array, " vertices"] = garment.vertex_mask
+        count = jnp.sum(mask)
+        return HoodMetrics(
+            terms,
+            jnp.sum(mask & (depth > 0)) / count,
+            masked_sum(safe_norm(gradient), mask) / count,
+        )
+
+    cloth = (positions[:-2], positions[1:-1], positions[2:])
+    bodies = BodyFrames(body_positions[:-2], body_positions[1:-1], body_positions[2:])
+    return jax.lax.map(measure, (cloth, bodies))
