@@ -42,7 +42,7 @@ class ModelConfig:
     world_edge_radius: float = 0.03  # [m] (HOOD)
     world_edge_capacity: int | None = None  # rows for world edges; None is one per vertex
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
-    remat: bool = True  # recompute layers in the backward pass
+    remat: Literal["layers", "products", "none"] = "products"  # what a layer keeps for its backward pass
     seed: int = 0  # of the random attention features
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
+from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import SceneOptions, prepare_scene
@@ -46,13 +47,13 @@ def rollout(
 
     Raises:
         ConfigError: The network is asked for without weights or without its architecture.
+        CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
         CapacityError: A buffer was too small.
         MotionError: The motion is too short, or too fast to follow.
     """
     config = config or SimConfig(simulator="physics")
-    if config.simulator == "network" and (params is None or config.model is None):
-        raise ConfigError("the network needs weights and config.model; get both from load_model")
+    check_network(params, config)
     scene = prepare_scene(garment, poses, material=material, options=options)
     trajectory = simulate_scene(params, scene, parameters or PhysicsParameters(), config)
     raise_for_status(trajectory)
@@ -88,6 +89,7 @@ def rollout_in_chunks(
     Returns:
         The trajectory, with its status unchecked, and its timing.
     """
+    check_network(params, config)
     parameters = parameters or PhysicsParameters()
     total = scene.num_frames - 1
     chunk = min(chunk, total)
@@ -115,6 +117,20 @@ def rollout_in_chunks(
     frame_ms = (time.perf_counter() - began) * 1e3 / (chunk * len(done))
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
     return join_frames(scene.start, joined, state), Timing(compile_s, frame_ms)
+
+
+def check_network(params: Any, config: SimConfig) -> None:
+    """Check that weights and architecture are there and fit each other.
+
+    Raises:
+        ConfigError: The network is asked for without weights or without its architecture.
+        CheckpointError: The weights are for another architecture.
+    """
+    if config.simulator == "physics":
+        return
+    if params is None or config.model is None:
+        raise ConfigError("the network needs weights and config.model; get both from load_model")
+    check_params(config.model, params)
 
 
 def raise_for_status(trajectory: Trajectory) -> None:

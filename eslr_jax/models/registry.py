@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.config import ModelConfig
+from eslr_jax.errors import CheckpointError
 from eslr_jax.graph import features, normalizer
 from eslr_jax.graph.build import feature_sizes
 from eslr_jax.models.network import Encoded, EncodeProcessDecode
@@ -38,7 +39,7 @@ SMALL = ModelConfig(
     output="correction",
     output_scale=0.005,
     passes=6,
-    remat=False,
+    remat="none",
 )
 
 
@@ -51,7 +52,7 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
 
 
 MEDIUM = dataclasses.replace(SMALL, message_passing_steps=2, latent_size=64, attention_size=64, passes=4)
-DEEP = dataclasses.replace(MEDIUM, message_passing_steps=6, attention_blocks=2, passes=1, remat=True)
+DEEP = dataclasses.replace(MEDIUM, message_passing_steps=6, attention_blocks=2, passes=1, remat="products")
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
     "eslr-10": dataclasses.replace(PAPER, message_passing_steps=10, attention_blocks=3),
@@ -194,6 +195,28 @@ def update_statistics(
 def count_parameters(params: Params) -> int:
     """Return the number of trained weights."""
     return sum(leaf.size for leaf in jax.tree.leaves(params["params"]))
+
+
+def check_params(config: ModelConfig, params: Params) -> None:
+    """Compare weights with an architecture before they reach compiled code.
+
+    Raises:
+        CheckpointError: A weight is missing, unknown, or of another shape.
+    """
+    expected = _shapes(init_model(config))
+    given = _shapes(params)
+    for name in sorted(expected.keys() | given.keys()):
+        if expected.get(name) != given.get(name):
+            raise CheckpointError(
+                f"these weights are for another architecture: {name} is {given.get(name, 'missing')}, expected "
+                f"{expected.get(name, 'absent')}; load the weights and the configuration from the same model"
+            )
+
+
+def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every array by its path."""
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
 
 
 def _variables(params: Params) -> Params:

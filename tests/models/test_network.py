@@ -35,7 +35,7 @@ VARIANTS = {
     "fixed-body": dataclasses.replace(TINY, update_body=False),
     "fixed-body-edges-once": dataclasses.replace(TINY, update_body=False, readd_edges=False),
     "edges-once": dataclasses.replace(TINY, readd_edges=False, hidden_layers=1),
-    "mesh-smoothing": dataclasses.replace(TINY, smooth_world_edges=False, remat=False),
+    "mesh-smoothing": dataclasses.replace(TINY, smooth_world_edges=False, remat="none"),
     "no-residual": dataclasses.replace(TINY, residual=False),
     "meshgraphnet": dataclasses.replace(TINY, smoothing_steps=0, attention_blocks=0),
     "capacity": dataclasses.replace(TINY, world_edge_capacity=46),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError, MotionError, NonFiniteError
+from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import raise_for_status, rollout, rollout_in_chunks
@@ -112,6 +112,12 @@ def test_non_finite_positions_raise_with_the_frame(scene):
 def test_network_without_weights_is_refused(tshirt, walk):
     with pytest.raises(ConfigError, match="load_model"):
         rollout(None, tshirt, walk, config=NETWORK)
+
+
+def test_weights_of_another_architecture_are_refused(tshirt, walk, params):
+    wider = dataclasses.replace(NETWORK, model=dataclasses.replace(SMALL, latent_size=48))
+    with pytest.raises(CheckpointError, match="another architecture"):
+        rollout(params, tshirt, walk, config=wider)
 
 
 def test_single_frame_is_refused(tshirt, walk):
