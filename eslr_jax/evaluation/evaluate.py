@@ -15,7 +15,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
 from eslr_jax.evaluation.metrics import measure_frames
-from eslr_jax.geometry.padding import common_bucket, garment_bucket, pad_garment
+from eslr_jax.geometry.padding import pad_garment, stacking_bucket
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene, shared_surface
@@ -113,7 +113,7 @@ def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> li
         )
         for name in names
     ]
-    bucket = common_bucket([garment_bucket(cloth) for cloth in cloths])
+    bucket = stacking_bucket(cloths)
     return [to_device(pad_garment(cloth, bucket)) for cloth in cloths]
 
 

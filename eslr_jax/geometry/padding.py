@@ -65,10 +65,14 @@ def garment_bucket(garment: Garment) -> Bucket:
 
 
 def common_bucket(buckets: list[Bucket]) -> Bucket:
-    """Return the smallest bucket that holds all of these, with a vertex to spare for padding to point at."""
-    largest = Bucket(*(max(sizes) for sizes in zip(*buckets, strict=True)))
-    is_exact = all(bucket == largest for bucket in buckets)
-    return largest if is_exact else largest._replace(vertices=largest.vertices + 1)
+    """Return the smallest bucket that holds all of `buckets`, for several garments in one batch."""
+    return Bucket(*(max(sizes) for sizes in zip(*buckets, strict=True)))
+
+
+def stacking_bucket(garments: list[Garment]) -> Bucket:
+    """Return the smallest bucket that holds all garments, with a vertex to spare for padding to point at."""
+    bucket = common_bucket([garment_bucket(garment) for garment in garments])
+    return bucket._replace(vertices=bucket.vertices + 1)
 
 
 def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:

@@ -57,7 +57,9 @@ def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[st
         raise CheckpointError(f"{path} has no {path.stem}.json beside it; copy both files") from error
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path.with_suffix('.json')} is damaged; export the model again") from error
-    if not isinstance(version, int) or version > FORMAT:
+    if not isinstance(values, dict) or not isinstance(version, int):
+        raise CheckpointError(f"{path.with_suffix('.json')} is damaged; export the model again")
+    if version > FORMAT:
         raise CheckpointError(
             f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax"
         )

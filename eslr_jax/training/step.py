@@ -95,7 +95,7 @@ def make_train_step(config: TrainConfig, resolution: int) -> Callable:
             return physics_loss(weights, garment, slot.material, problem, slot.state, config)
 
         (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params["params"])
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         is_good = jnp.isfinite(loss) & jnp.isfinite(norm)
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, state.params["params"])
