@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
@@ -26,32 +28,38 @@ class _State(NamedTuple):
     x: Float[Array, " n"]
     value: Float[Array, ""]
     gradient: Float[Array, " n"]
-    steps: Float[Array, "memory n"]  # s_k, newest in slot `head`
+    steps: Float[Array, "memory n"]  # s_k, a ring whose newest row is `head`
     changes: Float[Array, "memory n"]  # y_k
-    curvatures: Float[Array, " memory"]  # 1 / (s_k . y_k); zero marks an empty slot
+    curvatures: Float[Array, " memory"]  # 1 / (s_k . y_k); zero marks an empty row
+    head: Int[Array, ""]
     scale: Float[Array, ""]
     iterations: Int[Array, ""]
+    is_stuck: Bool[Array, ""]  # not even the preconditioned gradient leads down
 
 
-def _direction(state: _State, inverse_diagonal: Float[Array, " n"]) -> Float[Array, " n"]:
+Inverse = Callable[[Float[Array, " n"]], Float[Array, " n"]]
+
+
+def _direction(state: _State, inverse: Inverse) -> Float[Array, " n"]:
     """Return minus the inverse-Hessian estimate times the gradient, by the two-loop recursion."""
     memory = state.steps.shape[0]
+    rows = [(state.head - age) % memory for age in range(memory)]
     q = state.gradient
     weights = []
-    for k in range(memory):
-        weight = state.curvatures[k] * jnp.dot(state.steps[k], q)
-        q = q - weight * state.changes[k]
+    for row in rows:
+        weight = state.curvatures[row] * jnp.dot(state.steps[row], q)
+        q = q - weight * state.changes[row]
         weights.append(weight)
-    q = state.scale * inverse_diagonal * q
-    for k in reversed(range(memory)):
-        q = q + state.steps[k] * (weights[k] - state.curvatures[k] * jnp.dot(state.changes[k], q))
+    q = state.scale * inverse(q)
+    for row, weight in zip(reversed(rows), reversed(weights), strict=True):
+        q = q + state.steps[row] * (weight - state.curvatures[row] * jnp.dot(state.changes[row], q))
     return -q
 
 
 def minimize(
     function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
     start: Float[Array, "vertices 3"],
-    diagonal: Float[Array, " vertices"],
+    diagonal: Float[Array, " vertices"] | Stiffness,
     *,
     iterations: int,
     memory: int = 8,
@@ -62,7 +70,9 @@ def minimize(
     Args:
         function: Energy [J] of positions; differentiable.
         start: Initial positions [m].
-        diagonal: Positive stiffness per vertex [N/m]; the initial Hessian of the recursion up to a scale.
+        diagonal: The initial Hessian of the recursion up to a scale: positive stiffness per vertex [N/m], or
+            with springs between neighbours, which costs a quarter more per iteration and needs two to three
+            times fewer of them.
         iterations: Upper bound of iterations; static.
         memory: Pairs of steps and gradient changes kept; static.
         residual_tolerance: Stop when the gradient norm [N] falls below it.
@@ -70,39 +80,36 @@ def minimize(
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
     shape = start.shape
-    inverse_diagonal = jnp.repeat(1.0 / diagonal, shape[1]).astype(start.dtype)
+    inverse = _make_inverse(diagonal, start)
     value_and_gradient = jax.value_and_grad(lambda x: function(x.reshape(shape)))
 
     def is_running(state: _State) -> Array:
         is_above = jnp.dot(state.gradient, state.gradient) > jnp.square(residual_tolerance)
-        return (state.iterations < iterations) & is_above
+        return (state.iterations < iterations) & is_above & ~state.is_stuck
 
     def iterate(state: _State) -> _State:
-        direction = _direction(state, inverse_diagonal)
+        direction = _direction(state, inverse)
         slope = jnp.dot(direction, state.gradient)
-        is_ascent = ~(slope < 0)
-        direction = jnp.where(is_ascent, -inverse_diagonal * state.gradient, direction)
-        slope = jnp.where(is_ascent, jnp.dot(direction, state.gradient), slope)
-        x, value, gradient = _backtrack(value_and_gradient, state, direction, slope)
-
+        x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
         step, change = x - state.x, gradient - state.gradient
         curvature = jnp.dot(step, change)
         is_useful = curvature > 1e-10 * jnp.sqrt(jnp.dot(step, step) * jnp.dot(change, change))
-        inverse_curvature = 1.0 / jnp.where(is_useful, curvature, 1.0)
-        weighted = jnp.dot(change, inverse_diagonal * change)
-
-        def shifted(history: Array, newest: Array) -> Array:
-            return jnp.where(is_useful, jnp.concatenate([newest[None], history[:-1]]), history)
-
+        inverse_curvature = jnp.where(is_useful, 1.0 / jnp.where(is_useful, curvature, 1.0), 0.0)
+        weighted = jnp.dot(change, inverse(change))
+        head = (state.head + 1) % memory
+        # Where no step along the direction leads down, the history is dropped and tried without.
+        curvatures = jnp.where(is_lower, state.curvatures.at[head].set(inverse_curvature), 0.0)
         return _State(
             x=x,
             value=value,
             gradient=gradient,
-            steps=shifted(state.steps, step),
-            changes=shifted(state.changes, change),
-            curvatures=shifted(state.curvatures, inverse_curvature),
+            steps=state.steps.at[head].set(step),
+            changes=state.changes.at[head].set(change),
+            curvatures=curvatures,
+            head=head,
             scale=jnp.where(is_useful, curvature / jnp.where(weighted > 0, weighted, 1.0), state.scale),
             iterations=state.iterations + 1,
+            is_stuck=~is_lower & jnp.all(state.curvatures == 0),
         )
 
     x = start.reshape(-1)
@@ -115,15 +122,31 @@ def minimize(
         steps=history,
         changes=history,
         curvatures=jnp.zeros(memory, x.dtype),
+        head=jnp.zeros((), jnp.int32),
         scale=jnp.ones((), x.dtype),
         iterations=jnp.zeros((), jnp.int32),
+        is_stuck=jnp.zeros((), bool),
     )
     final = jax.lax.while_loop(is_running, iterate, initial)
     return Minimum(final.x.reshape(shape), final.value, final.gradient.reshape(shape), final.iterations)
 
 
+def _make_inverse(
+    diagonal: Float[Array, " vertices"] | Stiffness, start: Float[Array, "vertices 3"]
+) -> Inverse:
+    """Return the map from forces to displacements, on raveled arrays."""
+    if isinstance(diagonal, Stiffness):
+        return lambda force: solve_stiffness(diagonal, force.reshape(start.shape)).reshape(-1)
+    inverse_diagonal = jnp.repeat(1.0 / diagonal, start.shape[1]).astype(start.dtype)
+    return lambda force: inverse_diagonal * force
+
+
 def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):
-    """Halve the step until the energy falls enough; keep the old point if it never does."""
+    """Halve the step until the energy falls enough; keep the old point if it never does.
+
+    Returns:
+        The point, its value and its gradient, and whether it is another point than before.
+    """
     slack = 4 * jnp.finfo(state.x.dtype).eps * jnp.abs(state.value)
 
     def trial(size):
@@ -143,9 +166,10 @@ def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, sl
     _, _, x, value, gradient = jax.lax.while_loop(
         is_rejected, halve, (one, jnp.zeros((), jnp.int32), *trial(one))
     )
-    is_kept = value <= state.value + slack
+    is_kept = (value <= state.value + slack) & (slope < 0)
     return (
         jnp.where(is_kept, x, state.x),
         jnp.where(is_kept, value, state.value),
         jnp.where(is_kept, gradient, state.gradient),
+        is_kept,
     )

@@ -49,6 +49,7 @@ def potential_terms(
     friction: Float[Array, ""] | float = 0.0
     if contacts is not None:
         assert problem.friction_load is not None
+        assert problem.collision_thickness is not None
         collision = collision_energy(
             position, contacts, garment, parameters.collision_stiffness, problem.collision_thickness
         )
@@ -96,6 +97,7 @@ def next_friction_load(
 ) -> Float[Array, " vertices"]:
     """Return the contact force at t + 1 [N], which loads the next frame's friction."""
     assert problem.contacts is not None
+    assert problem.collision_thickness is not None
     parameters = problem.parameters
     return contact_forces(
         position, problem.contacts, garment, parameters.collision_stiffness, problem.collision_thickness
@@ -103,7 +105,10 @@ def next_friction_load(
 
 
 def relative_residual(
-    gradient: Float[Array, "vertices 3"], garment: Garment, material: Material, gravity: Float[Array, ""] | float
+    gradient: Float[Array, "vertices 3"],
+    garment: Garment,
+    material: Material,
+    gravity: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Return the norm of the remaining force over the norm of the vertex weights, without unit."""
     weight = gravity * safe_norm(vertex_masses(garment, material))

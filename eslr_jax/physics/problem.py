@@ -91,7 +91,9 @@ def make_problem(
     )
 
 
-def pin(problem: FrameProblem, garment: Garment, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+def pin(
+    problem: FrameProblem, garment: Garment, position: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
     """Put pinned vertices where the body carries them."""
     if problem.pin_targets is None:
         return position
@@ -110,6 +112,7 @@ def push_out(
     contacts = problem.contacts
     if contacts is None:
         return position
+    assert problem.collision_thickness is not None
     height = jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=-1)
     lift = jnp.maximum(problem.collision_thickness - height, 0.0)
     lift = jnp.where(contacts.is_near, lift, 0.0)
