@@ -208,8 +208,8 @@ def check_params(config: ModelConfig, params: Params) -> None:
     for name in sorted(expected.keys() | given.keys()):
         if expected.get(name) != given.get(name):
             raise CheckpointError(
-                f"these weights are for another architecture: {name} is {given.get(name, 'missing')}, expected "
-                f"{expected.get(name, 'absent')}; load the weights and the configuration from the same model"
+                f"these weights are for another architecture: {name} is {given.get(name, 'missing')}, "
+                f"expected {expected.get(name, 'absent')}; load weights and configuration of the same model"
             )
 
 
