@@ -19,9 +19,7 @@ def dihedral_angles(
     A collapsed hinge has a zero gradient.
     """
     # Gathered once: XLA would repeat the gathers in every one of the twelve components of the gradient.
-    corners = jax.lax.optimization_barrier(
-        gather_corners(position, garment.hinges, garment.hinge_incidence)
-    )
+    corners = jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
     edge = sub3(corners[1], corners[0])
     return _corner_angles(*corners), dot3(edge, edge)
 
@@ -70,9 +68,7 @@ def _corner_angles_jvp(primals, tangents):
         left_part, right_part = by_left * normal_left[axis], by_right * normal_right[axis]
         end_part = -foot_left * left_part - foot_right * right_part
         parts = (-left_part - right_part - end_part, end_part, left_part, right_part)
-        change = change + sum(
-            part * tangent[axis] for part, tangent in zip(parts, tangents, strict=True)
-        )
+        change = change + sum(part * tangent[axis] for part, tangent in zip(parts, tangents, strict=True))
     return _corner_angles(*primals), change
 
 

@@ -1,4 +1,24 @@
-"""The incremental potential: the sum of the energies whose minimum is one step of implicit Euler."""
+"""The incremental potential: the sum of the energies whose minimum is one step of implicit Euler.
+
+This is energy set `consistent`, which simulates and trains. Set `hood` (`physics.hood`) reproduces HOOD's
+published losses for its tables. Side by side, from x_t to x_{t+1}:
+
+| term      | `consistent`                                     | `hood`                                         |
+|-----------|--------------------------------------------------|------------------------------------------------|
+| stretch   | StVK: A h (mu tr G^2 + lambda/2 tr(G)^2)         | the same                                       |
+| bending   | k l^2 / (4 sum A) theta^2 / 2, l at rest         | l of the predicted mesh, differentiated        |
+| inertia   | m abs(x - x_t - dt v)^2 / (2 dt^2), v any [m/s]  | the same with dt v = x_t - x_{t-1}; pins count |
+| gravity   | m g height above x_t                             | m g height above the world's origin            |
+| collision | k a max(eps - d, 0)^3, a the vertex area [J/m^5] | w max(eps - d, 0)^3 per vertex [J/m^3]         |
+|   plane   | of the closest point on the triangles, smooth    | of the face whose centroid is nearest          |
+|           | normal; found at t, carried to t + 1             | found at t or, in tables, at t + 1             |
+|   eps     | 2 mm plus the sagitta of the mesh's edges        | 2 mm in training, 1 mm in tables               |
+|   sides   | also the body part on the cloth's other side     | one                                            |
+| friction  | mu N (sqrt(u^2 + s^2) - s), N the contact force  | mu m g s abs(u) within 5.5 cm, whatever the    |
+|           | at t, u in the tangent plane                     | contact force; s a slope against the z axis    |
+|   motion  | of the body point under the vertex, t to t + 1   | of a face centroid, t - 1 to t in training     |
+| repulsion | between layers of cloth, on request              | none                                           |
+"""
 
 from __future__ import annotations
 
@@ -6,7 +26,6 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import collision_energy, contact_forces
 from eslr_jax.physics.friction import friction_energy
@@ -102,14 +121,3 @@ def next_friction_load(
     return contact_forces(
         position, problem.contacts, garment, parameters.collision_stiffness, problem.collision_thickness
     )
-
-
-def relative_residual(
-    gradient: Float[Array, "vertices 3"],
-    garment: Garment,
-    material: Material,
-    gravity: Float[Array, ""] | float,
-) -> Float[Array, ""]:
-    """Return the norm of the remaining force over the norm of the vertex weights, without unit."""
-    weight = gravity * safe_norm(vertex_masses(garment, material))
-    return safe_norm(gradient.reshape(-1)) / weight

@@ -101,9 +101,7 @@ def stiffness(
     )
 
 
-def solve_stiffness(
-    matrix: Stiffness, force: Float[Array, "vertices 3"]
-) -> Float[Array, "vertices 3"]:
+def solve_stiffness(matrix: Stiffness, force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
     """Return displacements [m] that nearly balance a force [N]: a fixed polynomial in D^-1 W times D^-1.
 
     Four terms of the Chebyshev semi-iteration on D - reach W, with diagonal D and springs W. The eigenvalues

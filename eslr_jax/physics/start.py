@@ -39,8 +39,8 @@ def spread_collapsed(
 ) -> Float[Array, "vertices 3"]:
     """Move vertices whose faces have all collapsed by a micrometre, each its own way.
 
-    The angle at a hinge without area is zero by convention, and jumps as soon as it has any: from cloth pressed
-    flat onto a line every step is uphill, and a line search would stay there for ever.
+    The angle at a hinge without area is zero by convention, and jumps as soon as it has any: from cloth
+    pressed flat onto a line every step is uphill, and a line search would stay there for ever.
     """
     corners = position[garment.faces]
     normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -53,6 +53,8 @@ def spread_collapsed(
     )
     row = jnp.arange(position.shape[0], dtype=position.dtype)
     # The golden angle and its like: offsets without a pattern along the mesh's numbering.
-    offset = jnp.stack([jnp.sin(2.399963 * row), jnp.sin(3.883222 * row + 1.0), jnp.cos(5.083204 * row)], axis=-1)
+    offset = jnp.stack(
+        [jnp.sin(2.399963 * row), jnp.sin(3.883222 * row + 1.0), jnp.cos(5.083204 * row)], axis=-1
+    )
     is_collapsed = (open_faces == 0) & garment.vertex_mask
     return pin(problem, garment, jnp.where(is_collapsed[:, None], position + _OFFSET * offset, position))

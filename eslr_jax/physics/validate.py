@@ -1,0 +1,113 @@
+"""Checks of materials, parameters and timesteps on the host, before anything is compiled."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from eslr_jax.errors import ConfigError
+
+if TYPE_CHECKING:
+    from eslr_jax.physics.problem import PhysicsParameters
+    from eslr_jax.types import Garment, Material
+
+
+class Range(NamedTuple):
+    """Smallest and largest value that is accepted, both included."""
+
+    low: float
+    high: float
+    unit: str
+
+
+# Wide on purpose: from the thinnest silk to leather, and an order of magnitude beyond HOOD's training ranges.
+MATERIAL_RANGES = {
+    "density": Range(1e-3, 10.0, "kg/m^2"),
+    "lame_mu": Range(1.0, 1e9, "Pa"),
+    "lame_lambda": Range(0.0, 1e9, "Pa"),
+    "bending_stiffness": Range(0.0, 1.0, "J"),
+    "thickness": Range(1e-6, 2e-2, "m"),
+}
+PARAMETER_RANGES = {
+    "gravity": Range(1e-2, 100.0, "m/s^2"),  # not zero: residuals are measured in weights
+    "collision_stiffness": Range(0.0, 1e12, "J/m^5"),
+    "collision_thickness": Range(0.0, 5e-2, "m"),
+    "friction_coefficient": Range(0.0, 10.0, ""),
+    "friction_speed": Range(1e-6, 1.0, "m/s"),  # not zero: it divides
+    "repulsion_stiffness": Range(0.0, 1e12, "J/m^5"),
+    "repulsion_thickness": Range(0.0, 5e-2, "m"),
+}
+TIMESTEP_RANGE = Range(1e-4, 1.0, "s")  # HOOD's first step takes a third of a second
+
+
+def validate_material(material: Material, garment: Garment | None = None) -> None:
+    """Check that every value of a fabric is finite and physical, and that arrays fit the garment.
+
+    Args:
+        material: Scalars, or one value per face (stretch, thickness), hinge (bending) or vertex (density).
+        garment: The garment it is for, padded if it will be; None skips the check of sizes.
+
+    Raises:
+        ConfigError: Names the field, its value and what is accepted.
+    """
+    for name, accepted in MATERIAL_RANGES.items():
+        values = _check_range(f"material {name}", getattr(material, name), accepted)
+        if garment is not None and values.ndim:
+            _check_shape(name, values, garment)
+
+
+def validate_parameters(parameters: PhysicsParameters) -> None:
+    """Check that the constants of a scene are finite scalars in their ranges.
+
+    Raises:
+        ConfigError: Names the parameter, its value and what is accepted.
+    """
+    for name, value in vars(parameters).items():
+        accepted = PARAMETER_RANGES.get(name, Range(-np.inf, np.inf, ""))
+        values = _check_range(name, value, accepted)
+        if values.ndim:
+            raise ConfigError(f"{name} has shape {values.shape}; give one number for the whole scene")
+
+
+def validate_timestep(timestep: Any) -> None:
+    """Check the duration of a frame [s].
+
+    Raises:
+        ConfigError: It is not a finite number in its range.
+    """
+    _check_range("timestep", timestep, TIMESTEP_RANGE)
+
+
+def _check_range(label: str, value: Any, accepted: Range) -> np.ndarray:
+    """Return `value` as an array; raise where it is not finite or out of range."""
+    try:
+        values = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{label} = {value!r} is not a number; give {_describe(accepted)}") from error
+    # In float32 a bound itself may lie a rounding error outside.
+    slack = 1.0 + np.finfo(np.float32).eps
+    is_good = np.isfinite(values) & (values * slack >= accepted.low) & (values <= accepted.high * slack)
+    if not is_good.all():
+        index = tuple(int(k) for k in np.argwhere(~is_good)[0])
+        place = f"[{', '.join(map(str, index))}]" if index else ""
+        raise ConfigError(f"{label}{place} = {values[index]:.6g}; give {_describe(accepted)}")
+    return values
+
+
+def _describe(accepted: Range) -> str:
+    if not np.isfinite(accepted.high):
+        return "a finite number"
+    return f"a value from {accepted.low:g} to {accepted.high:g} {accepted.unit}".rstrip()
+
+
+def _check_shape(name: str, values: np.ndarray, garment: Garment) -> None:
+    """Raise where an array of a fabric doesn't have one value per element of the garment."""
+    element, count = {
+        "density": ("vertex", garment.vertex_areas.shape[0]),
+        "bending_stiffness": ("hinge", garment.hinge_rest_areas.shape[0]),
+    }.get(name, ("face", garment.rest_areas.shape[0]))
+    if values.shape != (count,):
+        raise ConfigError(
+            f"material {name} has shape {values.shape}; give one number, or one per {element} ({count})"
+        )
