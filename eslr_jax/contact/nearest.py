@@ -66,7 +66,7 @@ def _nearest_vertex(
     point: Vector3,
     body: Vector3,
     surface: BodySurface,
-    is_excluded: Callable[[Vector3, Int[Array, "..."]], Bool[Array, "vertices _"]] | None = None,
+    is_excluded: Callable[[Vector3, Int[Array, ...]], Bool[Array, "vertices _"]] | None = None,
 ) -> Int[Array, " vertices"]:
     """Return the surface vertex nearest to each point, looking into the nearest patches.
 
@@ -197,7 +197,7 @@ def find_both_sides(
     point, body_points, facing = components(position), components(body), components(contacts.normals)
     normal = components(normals)
 
-    def is_excluded(candidates: Vector3, ids: Int[Array, "..."]) -> Bool[Array, "vertices _"]:
+    def is_excluded(candidates: Vector3, ids: Int[Array, ...]) -> Bool[Array, "vertices _"]:
         turned = sum(n[ids] * f[:, None] for n, f in zip(normal, facing, strict=True))
         ahead = sum((c - p[:, None]) * f[:, None] for c, p, f in zip(candidates, point, facing, strict=True))
         return (turned > _OPPOSED) | (ahead < 0)
