@@ -152,8 +152,10 @@ class Trajectory:
 
 
 def tree_cast(tree: object, dtype) -> object:
-    """Cast the floating-point leaves of a pytree, for float64 references."""
-    return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if jax.numpy.issubdtype(leaf.dtype, jax.numpy.floating) else leaf,
-        tree,
-    )
+    """Cast the floating-point arrays of a pytree, for float64 references; Python numbers stay as they are."""
+
+    def cast(leaf):
+        is_array = hasattr(leaf, "dtype") and jax.numpy.issubdtype(leaf.dtype, jax.numpy.floating)
+        return leaf.astype(dtype) if is_array else leaf
+
+    return jax.tree.map(cast, tree)
