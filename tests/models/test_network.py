@@ -70,7 +70,12 @@ def oracle(config, params, graph, garment):
     return plain_network(config, *(to_float64(tree) for tree in (params, graph, garment)))
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+def quick(names, *chosen):
+    """Parametrize by name; all but the chosen ones are slow: each compiles a network of its own."""
+    return [name if name in chosen else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", quick(VARIANTS, "paper", "gradient"))
 def test_network_matches_numpy(name):
     config = VARIANTS[name]
     scene = make_scene(8, 6)
@@ -91,7 +96,7 @@ def test_optimised_network_without_a_body_matches_numpy(name):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("name", ["paper", "gradient", "capacity"])
+@pytest.mark.parametrize("name", quick(["paper", "gradient", "capacity"], "paper"))
 def test_network_and_its_gradient_match_plain_code_in_float64(name):
     config = VARIANTS[name]
     scene = make_scene(8, 6)
