@@ -20,7 +20,7 @@ LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
 LAME_LAMBDA_RANGE = (3535.414406069427, 93333.73508005822)  # [Pa] (HOOD)
 BENDING_RANGE = (6.370782056371576e-8, 1.3139737991266374e-3)  # [J] (HOOD)
 REGULAR_TIMESTEP = 1 / 30  # [s] (HOOD)
-GRAVITY = 9.81  # [m/s^2]
+LEAST_GRAVITY = 1.0  # [m/s^2]; keeps the unit of force where a scene has no weight
 
 CLIP = 5.0  # scaled features outside are cut off
 VELOCITY_SCALE = 0.02  # [m per frame], 0.6 m/s at 30 frames a second
@@ -212,7 +212,7 @@ def frame_node_features(
     timestep: Float[Array, ""],
     edge_length: Float[Array, ""],
 ) -> Float[Array, "vertices 14"]:
-    """Velocity 3, normal 3, timestep, density, area over squared spacing, spacing, material 3, pinned."""
+    """Velocity 3, normal 3, timestep, density, area over squared spacing, spacing, pinned, material 3."""
     num_vertices = position.shape[0]
     density = jnp.broadcast_to(material.density, (num_vertices,))
     area = garment.vertex_areas / edge_length**2
@@ -248,15 +248,16 @@ def pass_node_features(
 ) -> Float[Array, "vertices 18"]:
     """Push-out 3, force 3 and its size, Jacobi step 3 and its size, last correction 3, last force 3 and size.
 
-    A force f enters by direction and asinh(|f| / (m g)) / 2. The Jacobi step is f over the diagonal
-    m / dt^2 + h (2 mu + lambda), in units of a tenth of the mesh spacing, through tanh; its size through
-    log1p. What the first pass does not know is zero.
+    A force f enters by direction and asinh(|f| / (m g)) / 2, with at least `LEAST_GRAVITY` for g. The Jacobi
+    step is f over the diagonal m / dt^2 + h (2 mu + lambda), in units of a tenth of the mesh spacing, through
+    tanh; its size through log1p. What the first pass does not know is zero.
     """
     if correction is None:
         correction = jnp.zeros_like(guess)
     if previous_gradient is None:
         previous_gradient = jnp.zeros_like(guess)
-    heaviness = jnp.maximum(weight, 1e-12)[:, None]
+    mass = vertex_masses(garment, material)
+    heaviness = jnp.maximum(jnp.maximum(weight, LEAST_GRAVITY * mass), 1e-12)[:, None]
 
     def force_features(force):
         size = jnp.arcsinh(safe_norm(force, keepdims=True) / heaviness) / 2
@@ -267,7 +268,7 @@ def pass_node_features(
         for value in (material.lame_mu, material.lame_lambda)
     )
     stiffness = jnp.mean(material.thickness) * (2 * mu + lam)
-    diagonal = weight / (GRAVITY * timestep**2) + stiffness
+    diagonal = mass / timestep**2 + stiffness
     step = -gradient / (diagonal[:, None] * JACOBI_SCALE * edge_length)
     force, force_size = force_features(-gradient)
     previous, previous_size = force_features(-previous_gradient)

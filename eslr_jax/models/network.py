@@ -17,6 +17,7 @@ import jraph
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import ModelConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.build import feature_sizes
 from eslr_jax.graph.normalizer import Normalizer, normalize
@@ -165,6 +166,7 @@ class EncodeProcessDecode(nn.Module):
         latents, _ = self.layers(latents, (encoded.mesh_tables, encoded.world_tables))
         hidden = self.decoder.start(latents.garment, 0, bias=True)
         if config.attention_blocks:
+            _check_embedding(config, garment)
             inputs = (garment.geodesic_embedding, garment.vertex_mask, self.projection.value)
             attended, _ = self.blocks(vertices, inputs)
             hidden = hidden + self.decoder.start(attended, config.latent_size)
@@ -222,6 +224,20 @@ def _stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Modu
         length=length,
     )
     return scanned(config)
+
+
+def _check_embedding(config: ModelConfig, garment: Garment) -> None:
+    """Compare the garment's geodesic embedding with the one that the network expects.
+
+    Raises:
+        ConfigError: They have different numbers of coordinates.
+    """
+    size = garment.geodesic_embedding.shape[1]
+    if size != config.embedding_size:
+        raise ConfigError(
+            f"the garment has {size} geodesic coordinates and the model embedding_size = "
+            f"{config.embedding_size}; prepare the garment with that embedding_size"
+        )
 
 
 def _projection(config: ModelConfig) -> Float[Array, "features size"]:

@@ -183,6 +183,12 @@ def test_the_first_pass_knows_no_correction(scene):
     np.testing.assert_array_equal(later.previous_gradient, first.gradient)
 
 
+def test_forces_keep_their_unit_where_there_is_no_weight(scene):
+    garment, material, inputs = scene
+    graph = build(GRADIENT, (garment, material, inputs.replace(weight=jnp.zeros_like(inputs.weight))))
+    assert np.abs(graph.nodes["garment"]).max() < 10
+
+
 def test_a_frame_joined_with_its_pass_is_the_whole_graph(scene, gradient_graph):
     @quick_jit
     def join(*scene):

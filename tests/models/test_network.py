@@ -11,6 +11,7 @@ import pytest
 from reference_models import layer_weights, make_scene, plain_layer, plain_network, quick_jit, to_float64
 
 from eslr_jax.config import ModelConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
 from eslr_jax.graph.operators import mesh_tables, sum_receivers, world_tables
 from eslr_jax.models import registry
@@ -258,6 +259,13 @@ def test_masked_world_rows_contribute_exactly_nothing():
     again = quick_jit(lambda *args: apply_model(config, *args))(params, graph, garment)
     np.testing.assert_array_equal(actual, again)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+def test_a_garment_with_another_embedding_is_refused():
+    garment, material, inputs = make_scene(8, 6)
+    garment = garment.replace(geodesic_embedding=garment.geodesic_embedding[:, :3])
+    with pytest.raises(ConfigError, match="embedding_size"):
+        run(TINY, init_model(TINY), garment, material, inputs)
 
 
 def test_reduced_precision_stays_close():
