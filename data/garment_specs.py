@@ -92,7 +92,7 @@ SPECS = {
         0.010, 0.006, trouser=Trouser(-0.875, 0.13, (0.014, 0.020, 0.024, 0.022, 0.028)), pin_depth=0.04
     ),
     "dress": GarmentSpec(
-        0.010, 0.030, neck=SCOOP, armhole=Armhole(), skirt_smoothing=0.12, pin_depth=0.10,
+        0.010, 0.030, neck=SCOOP, armhole=Armhole(), skirt_smoothing=0.12, pin_depth=0.12,
         drapes=(Drape(0.24, -0.52, 0.012, flare=0.20),),
     ),
     "kneepants": GarmentSpec(
