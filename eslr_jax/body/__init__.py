@@ -1,1 +1,1 @@
-"""TODO."""
+"""Rigged bodies: skinning in JAX; motions and retargeting on the host."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Where cloth meets the body, and itself."""

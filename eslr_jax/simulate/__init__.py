@@ -1,1 +1,1 @@
-"""TODO."""
+"""One frame, and rollouts of many: the jitted kernels."""
