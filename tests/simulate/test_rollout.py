@@ -76,6 +76,7 @@ def test_tolerance_stops_early(physical):
     assert int(physical.iterations[1:].max()) < 400
 
 
+@pytest.mark.slow
 def test_gradient_through_time_is_finite(scene):
     plain = dataclasses.replace(MODELS["mgn-small"], passes=1, latent_size=8)
     params = init_model(plain)
