@@ -16,7 +16,7 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.lbfgs import Minimum, minimize
 from eslr_jax.physics.potential import next_friction_load, potential
-from eslr_jax.physics.preconditioner import hessian_diagonal
+from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin
 from eslr_jax.physics.start import solver_start
 from eslr_jax.simulate.network import network_step
@@ -78,7 +78,7 @@ def solve(
     return minimize(
         lambda position: potential(position, problem, garment, material),
         start,
-        hessian_diagonal(problem, garment, material, start),
+        stiffness(problem, garment, material, start),
         iterations=iterations,
         memory=memory,
         residual_tolerance=tolerance * weight,
