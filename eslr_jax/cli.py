@@ -290,7 +290,7 @@ def info(
 def train(
     out: Path,
     config: Path | None = None,
-    set_: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = (),
+    set_: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = (),
     resume: bool = False,
 ) -> None:
     """Train a network on the physics loss; Ctrl-C or SIGTERM writes a checkpoint first.

@@ -36,8 +36,10 @@ class ModelConfig:
     embedding_size: int = 8  # open: k of the geodesic embedding
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
     features: Literal["hood", "gradient"] = "hood"  # HOOD's inputs, or those plus the potential's gradient
-    output: Literal["acceleration", "correction"] = "acceleration"  # of the state, or of the inertial guess
-    output_scale: float = 1.0  # metres per unit of output, for "correction"
+    # An acceleration of the state; a correction of the inertial guess; or a correction with a share of the
+    # preconditioned gradient step and of the last correction, gated per vertex ("descent").
+    output: Literal["acceleration", "correction", "descent"] = "acceleration"
+    output_scale: float = 1.0  # metres per unit of output, for corrections
     passes: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
     world_edge_capacity: int | None = None  # rows for world edges; None is one per vertex
@@ -65,8 +67,12 @@ class ModelConfig:
             raise ValueError("world_edge_capacity must be at least 1, or null for one row per vertex")
         if self.passes > 1 and self.features != "gradient":
             raise ValueError('passes > 1 needs features = "gradient": others are the same in every pass')
-        if self.passes > 1 and self.output != "correction":
-            raise ValueError('passes > 1 needs output = "correction": an acceleration has one pass')
+        if self.passes > 1 and self.output == "acceleration":
+            raise ValueError(
+                'passes > 1 needs output "correction" or "descent": an acceleration has one pass'
+            )
+        if self.output == "descent" and self.features != "gradient":
+            raise ValueError('output = "descent" needs features = "gradient", which hold the step')
 
 
 @dataclasses.dataclass(frozen=True)

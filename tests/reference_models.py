@@ -269,6 +269,7 @@ def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool 
         inertial_guess=position + velocity,
         guess=position + velocity + noise(0.002, 3),
         gradient=weight[:, None] * noise(1.0, 3),
+        step=noise(0.003, 3),
         weight=weight,
         correction=noise(0.002, 3),
         previous_gradient=weight[:, None] * noise(2.0, 3),

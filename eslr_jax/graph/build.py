@@ -116,7 +116,7 @@ def build_pass_graph(
     Raises:
         ValueError: A field of `inputs` that gradient features need is missing.
     """
-    for name in ("guess", "inertial_guess", "gradient", "weight"):
+    for name in ("guess", "inertial_guess", "gradient", "step", "weight"):
         if getattr(inputs, name) is None:
             raise ValueError(f'GraphInputs.{name} is required by features = "gradient"')
     edge_length = frame.globals["edge_length"]
@@ -127,8 +127,8 @@ def build_pass_graph(
             inputs.guess,
             inputs.inertial_guess,
             inputs.gradient,
+            inputs.step,
             inputs.weight,
-            inputs.timestep,
             edge_length,
             inputs.correction,
             inputs.previous_gradient,

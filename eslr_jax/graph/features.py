@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
+from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.types import Contacts, Garment, Material
 
 LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
@@ -31,7 +32,7 @@ DISTANCE_SCALE = 0.01  # [m], signed distance to the body
 CONTACT_SCALE = 0.002  # [m], width of the contact energy
 GUESS_SCALE = 0.01  # [m], push-out and corrections
 STRAIN_SCALE = 0.1
-JACOBI_SCALE = 0.1  # of the mean rest edge length
+STEP_SCALE = 0.1  # of the mean rest edge length
 
 TYPE_GARMENT, TYPE_BODY, TYPE_BODY_OMITTED, TYPE_PINNED = range(4)  # HOOD's vertex types
 NUM_TYPES = 9  # rows and columns of HOOD's embedding table
@@ -95,11 +96,6 @@ def material_inputs(garment: Garment, material: Material) -> Float[Array, "verti
         [log_scale(bending, *BENDING_RANGE), log_scale(mu, *LAME_MU_RANGE), (lam - low) / (high - low)],
         axis=1,
     )
-
-
-def vertex_masses(garment: Garment, material: Material) -> Float[Array, " vertices"]:
-    """Return the mass of every vertex [kg]; zero where padded."""
-    return material.density * garment.vertex_areas
 
 
 def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -240,17 +236,17 @@ def pass_node_features(
     guess: Float[Array, "vertices 3"],
     inertial_guess: Float[Array, "vertices 3"],
     gradient: Float[Array, "vertices 3"],
+    step: Float[Array, "vertices 3"],
     weight: Float[Array, " vertices"],
-    timestep: Float[Array, ""],
     edge_length: Float[Array, ""],
     correction: Float[Array, "vertices 3"] | None,
     previous_gradient: Float[Array, "vertices 3"] | None,
 ) -> Float[Array, "vertices 18"]:
-    """Push-out 3, force 3 and its size, Jacobi step 3 and its size, last correction 3, last force 3 and size.
+    """Push-out 3, force 3 and its size, descent step 3 and its size, last correction 3, last force 3 and size.
 
-    A force f enters by direction and asinh(|f| / (m g)) / 2, with at least `LEAST_GRAVITY` for g. The Jacobi
-    step is f over the diagonal m / dt^2 + h (2 mu + lambda), in units of a tenth of the mesh spacing, through
-    tanh; its size through log1p. What the first pass does not know is zero.
+    A force f enters by direction and asinh(|f| / (m g)) / 2, with at least `LEAST_GRAVITY` for g. The step
+    is in units of a tenth of the mesh spacing, through tanh; its size through log1p. What the first pass does
+    not know is zero.
     """
     if correction is None:
         correction = jnp.zeros_like(guess)
@@ -263,13 +259,7 @@ def pass_node_features(
         size = jnp.arcsinh(safe_norm(force, keepdims=True) / heaviness) / 2
         return safe_normalize(force) * size, size
 
-    mu, lam = (
-        to_vertices(value, garment, garment.rest_areas, garment.face_incidence, 3)
-        for value in (material.lame_mu, material.lame_lambda)
-    )
-    stiffness = jnp.mean(material.thickness) * (2 * mu + lam)
-    diagonal = mass / timestep**2 + stiffness
-    step = -gradient / (diagonal[:, None] * JACOBI_SCALE * edge_length)
+    scaled = step / (STEP_SCALE * edge_length)
     force, force_size = force_features(-gradient)
     previous, previous_size = force_features(-previous_gradient)
     return jnp.concatenate(
@@ -277,8 +267,8 @@ def pass_node_features(
             clip((guess - inertial_guess) / GUESS_SCALE),
             force,
             force_size,
-            jnp.tanh(step),
-            jnp.log1p(safe_norm(step, keepdims=True)) / 2,
+            jnp.tanh(scaled),
+            jnp.log1p(safe_norm(scaled, keepdims=True)) / 2,
             clip(correction / GUESS_SCALE),
             previous,
             previous_size,

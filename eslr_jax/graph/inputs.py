@@ -16,7 +16,7 @@ class GraphInputs:
     Lengths are in metres and velocities in metres per frame, the unit of HOOD's features. Pinned vertices
     carry their next target in `position` and the way to it in `velocity`.
 
-    `contacts` and `body_velocity` are None in a scene without a body. The last five fields are read only
+    `contacts` and `body_velocity` are None in a scene without a body. The fields from `guess` on are read only
     where `ModelConfig.features` is "gradient"; `correction` and `previous_gradient` are None, or zero, on the
     first pass of a frame.
     """
@@ -31,6 +31,7 @@ class GraphInputs:
         None  # current answer: pushed-out inertial guess, or last pass [m]
     )
     gradient: Float[Array, "vertices 3"] | None = None  # of the potential at `guess` [N]
+    step: Float[Array, "vertices 3"] | None = None  # preconditioned step down that gradient [m]
     weight: Float[Array, " vertices"] | None = None  # m g [N]
     correction: Float[Array, "vertices 3"] | None = None  # that led to `guess` [m]
     previous_gradient: Float[Array, "vertices 3"] | None = None  # before that correction [N]

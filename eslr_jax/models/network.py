@@ -36,6 +36,7 @@ from eslr_jax.models.mlp import MLP
 from eslr_jax.types import Garment
 
 CORRECTION_GAIN = 0.02  # a new network then hardly changes the guess that it corrects
+OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5}  # a vector, and two gates
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 Statistics = dict[str, Normalizer]
@@ -54,7 +55,7 @@ class Encoded(NamedTuple):
 
 
 class EncodeProcessDecode(nn.Module):
-    """The whole network, from a graph's features to three numbers per vertex."""
+    """The whole network, from a graph's features to a vector, and gates, per vertex."""
 
     config: ModelConfig
 
@@ -83,16 +84,16 @@ class EncodeProcessDecode(nn.Module):
         self.decoder = MLP(
             2 * size if config.attention_blocks else size,
             size,
-            3,
+            OUTPUT_SIZE[config.output],
             config.hidden_layers,
             norm=False,
-            output_gain=CORRECTION_GAIN if config.output == "correction" else 1.0,
+            output_gain=1.0 if config.output == "acceleration" else CORRECTION_GAIN,
             precision=config.precision,
         )
 
     def __call__(
         self, graph: jraph.GraphsTuple, garment: Garment, statistics: Statistics | None = None
-    ) -> Float[Array, "vertices 3"]:
+    ) -> Float[Array, "vertices outputs"]:
         """Apply the network to a full graph.
 
         Args:
@@ -146,7 +147,7 @@ class EncodeProcessDecode(nn.Module):
                 encoded = encoded._replace(world_reverse=encoded.world_reverse + world)
         return encoded
 
-    def process(self, encoded: Encoded, garment: Garment) -> Float[Array, "vertices 3"]:
+    def process(self, encoded: Encoded, garment: Garment) -> Float[Array, "vertices outputs"]:
         """Finish the encoders, run both stacks and decode."""
         config, has_body = self.config, encoded.world is not None
         vertices = self.garment_encoder.finish(encoded.garment)

@@ -36,7 +36,7 @@ SMALL = ModelConfig(
     attention_norm=True,
     attention_feedforward=True,
     features="gradient",
-    output="correction",
+    output="descent",
     output_scale=0.005,
     passes=6,
     remat="none",
@@ -94,7 +94,7 @@ def init_model(config: ModelConfig, seed: int = 0) -> Params:
 
 def apply_model(
     config: ModelConfig, params: Params, graph: jraph.GraphsTuple, garment: Garment
-) -> Float[Array, "vertices 3"]:
+) -> Float[Array, "vertices outputs"]:
     """Return the network's raw output, see `scale_output`.
 
     Args:
@@ -124,7 +124,7 @@ def apply_pass(
     encoded: Encoded,
     changing: jraph.GraphsTuple,
     garment: Garment,
-) -> Float[Array, "vertices 3"]:
+) -> Float[Array, "vertices outputs"]:
     """Return the raw output of one pass; equals `apply_model` on the joined graph.
 
     Args:
@@ -144,11 +144,11 @@ def apply_pass(
 def scale_output(
     config: ModelConfig, params: Params, output: Float[Array, "vertices 3"]
 ) -> Float[Array, "vertices 3"]:
-    """Return the output in physical units: metres, or for "acceleration" metres per frame squared.
+    """Return the output's vectors in physical units: metres, or for "acceleration" metres per frame squared.
 
     Source: HOOD's output normaliser, applied backwards, for accelerations.
     """
-    if config.output == "correction":
+    if config.output != "acceleration":
         return output * config.output_scale
     return normalizer.inverse(params["statistics"]["output"], output)
 

@@ -14,6 +14,7 @@ from eslr_jax.graph.inputs import GraphInputs, next_pass
 from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.potential import potential
+from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
 from eslr_jax.physics.problem import FrameProblem, pin, start_guess
 from eslr_jax.types import ClothState, Garment, Material
 
@@ -68,7 +69,8 @@ def correction_passes(
 ) -> tuple[Float[Array, "passes vertices 3"], Int[Array, ""]]:
     """Correct the pushed-out inertial guess, pass by pass, and return every answer and status bits.
 
-    Before each pass the potential's gradient is taken at the last answer.
+    Before each pass the potential's gradient, and the preconditioned step down it, are taken at the last
+    answer.
 
     Args:
         params: Weights.
@@ -76,26 +78,43 @@ def correction_passes(
         material: Fabric.
         problem: The frame's problem.
         inputs: Of `graph_inputs`.
-        config: With `output` "correction"; static.
+        config: With `output` "correction" or "descent"; static.
         detach: Stop gradients between passes, so that each is trained to do its best from where it starts.
     """
     graph = build_frame_graph(garment, material, inputs, config)
     guess = start_guess(problem, garment)
     zeros = jnp.zeros_like(guess)
-    inputs = inputs.replace(guess=guess, gradient=zeros, correction=zeros, previous_gradient=zeros)
+    inputs = inputs.replace(
+        guess=guess, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
+    )
     encoded = encode_frame(config, params, graph, garment)
 
     def one_pass(carry: GraphInputs, _):
         gradient = jax.grad(potential)(carry.guess, problem, garment, material)
-        inputs = carry.replace(gradient=gradient)
+        matrix = stiffness(problem, garment, material, carry.guess)
+        inputs = carry.replace(gradient=gradient, step=solve_stiffness(matrix, -gradient))
         changing = build_pass_graph(garment, material, inputs, graph)
         output = apply_pass(config, params, encoded, changing, garment)
-        answer = pin(problem, garment, inputs.guess + scale_output(config, params, output))
+        answer = pin(problem, garment, inputs.guess + correct(config, params, output, inputs))
         onward = jax.lax.stop_gradient(answer) if detach else answer
         return next_pass(inputs, onward, gradient), answer
 
     _, answers = jax.lax.scan(one_pass, inputs, None, length=config.passes)
     return answers, graph.globals["status"]
+
+
+def correct(
+    config: ModelConfig, params: Any, output: Float[Array, "vertices outputs"], inputs: GraphInputs
+) -> Float[Array, "vertices 3"]:
+    """Return the way from the guess to the answer of a pass [m].
+
+    For "descent" the network adds to a preconditioned gradient method with momentum: one gate per vertex
+    scales the step (1 + gate), another the last correction. A new network is plain preconditioned descent.
+    """
+    correction = scale_output(config, params, output[:, :3])
+    if config.output != "descent":
+        return correction
+    return correction + (1.0 + output[:, 3:4]) * inputs.step + output[:, 4:5] * inputs.correction
 
 
 def network_step(

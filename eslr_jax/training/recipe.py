@@ -27,10 +27,11 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
         raise ConfigError(f"no config file {path}; give an existing TOML file") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
-    if isinstance(values.get("model"), str):
-        values["model"] = {"base": values["model"]}
-    apply_overrides(values, overrides or {})
-    model = values.get("model")
+    overrides = dict(overrides or {})
+    model = overrides.pop("model", values.get("model"))
+    values["model"] = {"base": model} if isinstance(model, str) else model
+    apply_overrides(values, overrides)
+    model = values["model"]
     if isinstance(model, dict) and "base" in model:
         base = model.pop("base")
         if base not in MODELS:
