@@ -27,6 +27,7 @@ _PUBLIC = {
     "prepare_garment": "eslr_jax.geometry.prepare",
     "prepare_scene": "eslr_jax.scene",
     "rollout": "eslr_jax.rollout",
+    "rollout_batch": "eslr_jax.rollout",
 }
 
 __all__ = ["__version__", *_PUBLIC]
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from eslr_jax.errors import EslrError
     from eslr_jax.geometry.prepare import prepare_garment
     from eslr_jax.physics.problem import PhysicsParameters
-    from eslr_jax.rollout import rollout
+    from eslr_jax.rollout import rollout, rollout_batch
     from eslr_jax.scene import SceneOptions, prepare_scene
     from eslr_jax.types import Material, Trajectory
 

@@ -102,6 +102,7 @@ class TrainConfig:
     final_learning_rate: float = 1e-5  # end of the cosine
     warmup: int = 100  # iterations of linear warm-up
     clip_norm: float = 1.0  # of the global gradient (HOOD)
+    batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment
     horizon: int = 60  # longest trajectory [frames]
     horizon_growth: int = 60  # iterations per frame of horizon
@@ -124,6 +125,7 @@ class TrainConfig:
         """
         for name in (
             "iterations",
+            "batch_size",
             "slots_per_garment",
             "horizon",
             "horizon_growth",
@@ -135,6 +137,9 @@ class TrainConfig:
         for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        pool = len(self.garments) * self.slots_per_garment
+        if self.batch_size > pool:
+            raise ValueError(f"batch_size = {self.batch_size} is more than the pool of {pool} trajectories")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
 

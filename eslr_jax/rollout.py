@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
+from eslr_jax.geometry.padding import choose_bucket
 from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import SceneOptions, prepare_scene
+from eslr_jax.scene import SceneOptions, prepare_scene, prepare_scenes
+from eslr_jax.simulate.batch import SCENES, simulate_scenes, stack_scenes
 from eslr_jax.simulate.scan import frame_inputs, join_frames, scan_frames, simulate_scene
 from eslr_jax.simulate.step import FrameInput
 from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
@@ -58,6 +61,75 @@ def rollout(
     trajectory = simulate_scene(params, scene, parameters or PhysicsParameters(), config)
     raise_for_status(trajectory)
     return trajectory
+
+
+def rollout_batch(
+    params: Any,
+    garments: Sequence[Garment],
+    poses: Sequence[BodyMotion],
+    *,
+    config: SimConfig | None = None,
+    material: Material = COTTON,
+    parameters: PhysicsParameters | None = None,
+    options: SceneOptions | None = None,
+    batch_size: int = 1,
+    devices: Sequence[jax.Device] | None = None,
+) -> list[Trajectory]:
+    """Simulate garment i on motion i for every i; scenes of like size share one compiled rollout.
+
+    Garments are padded to the bucket of their vertex count, and those of one bucket are simulated together.
+
+    Args:
+        params: Weights of the network; None for the physics simulator.
+        garments: Of `load_garment` or `prepare_garment`; any sizes.
+        poses: As many motions, of `pose_body`.
+        config: Which simulator, and how; the physics simulator by default.
+        material: Fabric of all.
+        parameters: Physical constants of all.
+        options: What the scenes leave out or add.
+        batch_size: Scenes per step on a device, see `simulate_scenes`.
+        devices: Devices to spread the scenes over; by default the first alone.
+
+    Returns:
+        Trajectories in the order given, with the vertices of each garment. Their status is not checked: one
+        bad scene shall not cost the others; see `raise_for_status`.
+
+    Raises:
+        ConfigError: As many motions as garments are needed; or the network lacks weights.
+        CheckpointError: The weights are for another architecture.
+        MotionError: A motion has fewer than two frames.
+    """
+    config = config or SimConfig(simulator="physics")
+    check_network(params, config)
+    if len(garments) != len(poses):
+        raise ConfigError(f"{len(garments)} garments and {len(poses)} motions; give one motion per garment")
+    devices = list(devices or [])
+    mesh = Mesh(np.array(devices), (SCENES,)) if len(devices) > 1 else None
+    parameters = parameters or PhysicsParameters()
+    done: dict[int, Trajectory] = {}
+    for group in _group_alike(garments, poses):
+        scenes = prepare_scenes(
+            [garments[i] for i in group], [poses[i] for i in group], material=material, options=options
+        )
+        # Devices get equal shares: the last scene is repeated, and what is simulated twice is dropped.
+        missing = -len(scenes) % max(len(devices), 1)
+        stacked = stack_scenes(scenes + scenes[-1:] * missing)
+        together = simulate_scenes(params, stacked, parameters, config, batch_size=batch_size, mesh=mesh)
+        for row, i in enumerate(group):
+            one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
+            count = garments[i].vertex_mask.shape[0]
+            done[i] = one.replace(positions=one.positions[:, :count], velocities=one.velocities[:, :count])
+    return [done[i] for i in range(len(garments))]
+
+
+def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> list[list[int]]:
+    """Group scenes that can be stacked: like vertex counts, frame counts and bodies."""
+    groups: dict[tuple, list[int]] = {}
+    for i, (garment, motion) in enumerate(zip(garments, poses, strict=True)):
+        body = hash(np.asarray(motion.faces).tobytes())
+        key = (choose_bucket(garment).vertices, motion.positions.shape[0], body)
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())
 
 
 class Timing(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from eslr_jax.body.motion import skin_garment
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import MotionError
+from eslr_jax.geometry.padding import choose_bucket, common_bucket, pad_garment
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
@@ -83,6 +86,40 @@ def prepare_scene(
     )
 
 
+def prepare_scenes(
+    garments: Sequence[Garment],
+    poses: Sequence[BodyMotion],
+    *,
+    material: Material = COTTON,
+    options: SceneOptions | None = None,
+) -> list[Scene]:
+    """Prepare scenes that can be stacked: padded to one bucket, over one part of the body.
+
+    What one of them needs, all of them model: pins, and the body faces near any garment at rest, whatever the
+    motion: other motions of the same garments then run the same compiled rollout.
+
+    Args:
+        garments: Unpadded garments of like sizes.
+        poses: As many motions of bodies with the same faces and of the same length.
+        material: Fabric of all.
+        options: What to leave out or add.
+    """
+    options = options or SceneOptions()
+    bucket = common_bucket([choose_bucket(garment) for garment in garments])
+    padded = [to_device(pad_garment(garment, bucket)) for garment in garments]
+    surface = shared_surface(padded, poses[0]) if options.has_body else None
+    scenes = [
+        prepare_scene(garment, motion, material=material, options=options, surface=surface)
+        for garment, motion in zip(padded, poses, strict=True)
+    ]
+    if all(scene.pin_targets is None for scene in scenes):
+        return scenes
+    return [
+        scene.replace(pin_targets=skin_garment(scene.garment, motion.joint_transforms))
+        for scene, motion in zip(scenes, poses, strict=True)
+    ]
+
+
 def initial_state(position: jax.Array, velocity: jax.Array) -> ClothState:
     """Return a cloth state without history."""
     return ClothState(
@@ -111,7 +148,7 @@ def reachable_faces(garment: Garment, skinned: jax.Array, poses: BodyMotion, rea
     return faces[is_near[faces].any(axis=1) & np.asarray(poses.is_obstacle)]
 
 
-def shared_surface(garments: list[Garment], body: Body, reach: float = 0.15) -> BodySurface:
+def shared_surface(garments: Sequence[Garment], body: Body | BodyMotion, reach: float = 0.15) -> BodySurface:
     """Return the obstacle faces within `reach` [m] of any of the garments in the rest pose."""
     points = np.concatenate([np.asarray(g.rest_positions)[np.asarray(g.vertex_mask)] for g in garments])
     rest = np.asarray(body.rest_positions)

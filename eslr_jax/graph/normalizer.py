@@ -37,43 +37,40 @@ def init_normalizer(size: int, dtype=jnp.float32) -> Normalizer:
     )
 
 
-def update(
-    normalizer: Normalizer,
-    rows: Float[Array, "rows features"],
-    mask: Bool[Array, " rows"] | None = None,
-) -> Normalizer:
-    """Merge a batch of rows into the statistics.
+def measure(rows: Float[Array, "rows features"], mask: Bool[Array, " rows"] | None = None) -> Normalizer:
+    """Return the statistics of one batch of rows.
+
+    Args:
+        rows: Shape [rows, features].
+        mask: Rows that count; the others may be anything, also NaN.
+    """
+    mask = jnp.ones(rows.shape[0], bool) if mask is None else mask
+    count = jnp.sum(mask).astype(rows.dtype)
+    reference = rows[jnp.argmax(mask)]  # makes the mean of a constant feature exact
+    offsets = jnp.where(mask[:, None], rows - reference[None], 0)
+    mean = jnp.where(count > 0, reference + jnp.sum(offsets, axis=0) / jnp.maximum(count, 1), 0)
+    deviations = jnp.sum(jnp.where(mask[:, None], rows - mean[None], 0) ** 2, axis=0)
+    return Normalizer(count, mean, deviations, (count > 0).astype(jnp.int32))
+
+
+def merge(seen: Normalizer, new: Normalizer) -> Normalizer:
+    """Join the statistics of two sets of rows, until `MAX_UPDATES` sets were seen.
 
     With n rows of mean m and squared deviations s, and N, M, S seen before, delta = m - M:
     M' = M + delta n / (N + n) and S' = S + s + delta^2 N n / (N + n).
 
-    Args:
-        normalizer: Statistics so far.
-        rows: New rows, shape [rows, features].
-        mask: Rows that count; the others may be anything, also NaN.
-
     Source: Chan, Golub and LeVeque (1979), eq. 2.1.
     """
-    mask = jnp.ones(rows.shape[0], bool) if mask is None else mask
-    count = jnp.sum(mask).astype(normalizer.count.dtype)
-    safe_count = jnp.maximum(count, 1)
-    reference = rows[jnp.argmax(mask)]  # makes the mean of a constant feature exact
-    mean = reference + jnp.sum(jnp.where(mask[:, None], rows - reference[None], 0), axis=0) / safe_count
-    deviations = jnp.sum(jnp.where(mask[:, None], rows - mean[None], 0) ** 2, axis=0)
-    total = normalizer.count + count
-    fraction = count / jnp.maximum(total, 1)
-    delta = mean - normalizer.mean
-    grown_mean = jnp.where(normalizer.count > 0, normalizer.mean + delta * fraction, mean)
-    is_open = (normalizer.num_updates < MAX_UPDATES) & (count > 0)
+    total = seen.count + new.count
+    fraction = new.count / jnp.maximum(total, 1)
+    delta = new.mean - seen.mean
+    spread = seen.squared_deviations + new.squared_deviations + delta**2 * seen.count * fraction
+    is_open = (seen.num_updates < MAX_UPDATES) & (new.count > 0)
     return Normalizer(
-        count=jnp.where(is_open, total, normalizer.count),
-        mean=jnp.where(is_open, grown_mean, normalizer.mean),
-        squared_deviations=jnp.where(
-            is_open,
-            normalizer.squared_deviations + deviations + delta**2 * normalizer.count * fraction,
-            normalizer.squared_deviations,
-        ),
-        num_updates=normalizer.num_updates + is_open.astype(jnp.int32),
+        count=jnp.where(is_open, total, seen.count),
+        mean=jnp.where(is_open, jnp.where(seen.count > 0, seen.mean + delta * fraction, new.mean), seen.mean),
+        squared_deviations=jnp.where(is_open, spread, seen.squared_deviations),
+        num_updates=seen.num_updates + jnp.where(is_open, new.num_updates, 0),
     )
 
 

@@ -153,14 +153,14 @@ def scale_output(
     return normalizer.inverse(params["statistics"]["output"], output)
 
 
-def update_statistics(
+def measure_statistics(
     config: ModelConfig,
     params: Params,
     graph: jraph.GraphsTuple,
     garment: Garment,
     acceleration: Float[Array, "vertices 3"] | None = None,
-) -> Params:
-    """Return weights whose normalisers have seen one more graph; training only.
+) -> dict[str, normalizer.Normalizer]:
+    """Return what the normalisers see in one graph; training only.
 
     Args:
         config: Architecture; static. Features of the "gradient" kind have no statistics.
@@ -171,8 +171,8 @@ def update_statistics(
 
     Source: HOOD's `utils/normalization.py`.
     """
-    statistics = dict(params["statistics"])
-    if "garment" in statistics:
+    measured = {}
+    if config.features == "hood":
         nodes = EncodeProcessDecode(config).apply(_variables(params), graph, method="with_types")
         nodes = jax.lax.stop_gradient(nodes)
         masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
@@ -185,11 +185,17 @@ def update_statistics(
         for name, group, num_static in groups:
             if group:
                 rows, mask = _stack_rows(group, masks)
-                changing = rows[:, : rows.shape[1] - num_static]
-                statistics[name] = normalizer.update(statistics[name], changing, mask)
-    if acceleration is not None and "output" in statistics:
-        statistics["output"] = normalizer.update(statistics["output"], acceleration, garment.vertex_mask)
-    return {**params, "statistics": statistics}
+                measured[name] = normalizer.measure(rows[:, : rows.shape[1] - num_static], mask)
+    if config.output == "acceleration" and acceleration is not None:
+        measured["output"] = normalizer.measure(acceleration, garment.vertex_mask)
+    return measured
+
+
+def merge_statistics(params: Params, measured: dict[str, normalizer.Normalizer]) -> Params:
+    """Return weights whose normalisers have also seen what `measure_statistics` measured."""
+    seen = params["statistics"]
+    merged = {name: normalizer.merge(seen[name], new) for name, new in measured.items()}
+    return {**params, "statistics": {**seen, **merged}}
 
 
 def count_parameters(params: Params) -> int:

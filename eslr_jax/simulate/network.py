@@ -10,8 +10,10 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
+from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.inputs import GraphInputs, next_pass
 from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
+from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
@@ -88,11 +90,12 @@ def correction_passes(
         guess=guess, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
     )
     encoded = encode_frame(config, params, graph, garment)
+    longest = mean_edge_length(garment)
 
     def one_pass(carry: GraphInputs, _):
         gradient = jax.grad(potential)(carry.guess, problem, garment, material)
-        matrix = stiffness(problem, garment, material, carry.guess)
-        inputs = carry.replace(gradient=gradient, step=solve_stiffness(matrix, -gradient))
+        step = descent_step(problem, garment, material, carry.guess, gradient, longest)
+        inputs = carry.replace(gradient=gradient, step=step)
         changing = build_pass_graph(garment, material, inputs, graph)
         output = apply_pass(config, params, encoded, changing, garment)
         answer = pin(problem, garment, inputs.guess + correct(config, params, output, inputs))
@@ -101,6 +104,24 @@ def correction_passes(
 
     _, answers = jax.lax.scan(one_pass, inputs, None, length=config.passes)
     return answers, graph.globals["status"]
+
+
+def descent_step(
+    problem: FrameProblem,
+    garment: Garment,
+    material: Material,
+    guess: Float[Array, "vertices 3"],
+    gradient: Float[Array, "vertices 3"],
+    longest: Float[Array, ""],
+) -> Float[Array, "vertices 3"]:
+    """Return the preconditioned step down a gradient [m], no vertex farther than `longest`.
+
+    The stretch energy grows with the fourth power of a displacement: from a torn-up state, full steps would
+    overshoot further each time. The bound is a trust region of one mesh spacing.
+    """
+    step = solve_stiffness(stiffness(problem, garment, material, guess), -gradient)
+    length = safe_norm(step, keepdims=True)
+    return step * (longest / jnp.maximum(length, longest))
 
 
 def correct(

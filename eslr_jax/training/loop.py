@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, NonFiniteError
@@ -19,7 +21,7 @@ from eslr_jax.io.atomic import ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
 from eslr_jax.training.data import load_training_data
-from eslr_jax.training.step import TrainState, init_train_state, make_train_step
+from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
 Progress = Callable[[int, int, dict[str, float]], None]
 
@@ -45,17 +47,20 @@ def train(
         CheckpointError: `out` holds another run, or none to resume.
         NonFiniteError: Too many updates had to be skipped; the last good checkpoint is kept.
     """
+    mesh = make_mesh(config)
     checkpoints = _open_run(config, ensure_output_dir(out), resume)
     datasets = tuple(load_training_data(config, vertices) for vertices in config.vertices)
     state = init_train_state(config, datasets)
+    datasets, state = replicate(datasets, mesh), replicate(state, mesh)
     if initial_params is not None:
-        state = state.replace(params=jax.tree.map(jax.numpy.array, initial_params))
+        state = state.replace(params=replicate(jax.tree.map(jax.numpy.array, initial_params), mesh))
     if resume:
         state = checkpoints.restore(state)
-    steps = [make_train_step(config, resolution) for resolution in range(len(datasets))]
+    steps = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.iteration)
-    with (out / "metrics.jsonl").open("a") as log, _stop_requested() as is_stopping:
+    metrics_file = out / "metrics.jsonl" if _is_first_process() else Path(os.devnull)
+    with metrics_file.open("a") as log, _stop_requested() as is_stopping:
         for iteration in range(first, config.iterations):
             resolution = iteration % len(steps)
             state, metrics = steps[resolution](state, datasets[resolution])
@@ -72,12 +77,12 @@ def train(
                 _check_skipped(state, config, checkpoints, out)
             if done % config.checkpoint_every == 0 or done == config.iterations:
                 checkpoints.save(state)
-            if is_stopping():
+            if is_stopping(done):
                 if done % config.checkpoint_every:
                     checkpoints.save(state)
                 break
     checkpoints.close()
-    if int(state.iteration) >= config.iterations:
+    if int(state.iteration) >= config.iterations and _is_first_process():
         export(state, config, out)
     return state
 
@@ -96,11 +101,16 @@ def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
         before = read_run_config(out)
         if before != config:
             raise CheckpointError(f"{out} holds a run with another configuration; resume it with its own")
-    elif (out / "config.json").exists():
+    elif _is_first_process() and (out / "config.json").exists():
         raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
-    else:
+    if _is_first_process() and not resume:
         write_run_config(out, config)
     return Checkpoints(out)
+
+
+def _is_first_process() -> bool:
+    """Return whether this process writes what all processes share."""
+    return jax.process_index() == 0
 
 
 def _means(window: list[dict[str, jax.Array]]) -> dict[str, float]:
@@ -126,8 +136,14 @@ def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoi
 
 
 @contextlib.contextmanager
-def _stop_requested() -> Iterator[Callable[[], bool]]:
-    """Turn SIGTERM and Ctrl-C into a question that the loop asks; a second signal acts at once."""
+def _stop_requested() -> Iterator[Callable[[int], bool]]:
+    """Turn SIGTERM and Ctrl-C into a question that the loop asks; a second signal acts at once.
+
+    Several processes must stop after the same iteration; jax.distributed then catches the signal.
+    """
+    if jax.process_count() > 1:
+        yield multihost_utils.reached_preemption_sync_point
+        return
     received: list[int] = []
     before = {}
 
@@ -140,7 +156,7 @@ def _stop_requested() -> Iterator[Callable[[], bool]]:
         for which in (signal.SIGTERM, signal.SIGINT):
             before[which] = signal.signal(which, remember)
     try:
-        yield lambda: bool(received)
+        yield lambda done: bool(received)
     finally:
         for which, handler in before.items():
             signal.signal(which, handler)

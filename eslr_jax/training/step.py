@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from eslr_jax.config import TrainConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import build_graph
-from eslr_jax.models.registry import init_model, update_statistics
+from eslr_jax.graph.normalizer import Normalizer
+from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.simulate.network import graph_inputs
@@ -25,6 +29,7 @@ from eslr_jax.training.pool import Slot, empty_pool, skin, start_trajectory
 from eslr_jax.types import Garment
 
 _TIMESTEP = 1 / 30  # [s]
+BATCH = "batch"  # axis of the device mesh
 
 
 @struct.dataclass
@@ -68,51 +73,76 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
     )
 
 
-def make_train_step(config: TrainConfig, resolution: int) -> Callable:
+def make_mesh(config: TrainConfig) -> Mesh | None:
+    """Return all devices as one axis that a batch is spread over; None for a single device.
+
+    Raises:
+        ConfigError: The batch cannot be spread evenly.
+    """
+    devices = jax.devices()
+    if len(devices) == 1 or (config.batch_size == 1 and jax.process_count() == 1):
+        return None
+    if config.batch_size % len(devices):
+        raise ConfigError(
+            f"batch_size = {config.batch_size} does not spread over {len(devices)} devices; "
+            "make it a multiple of their number"
+        )
+    return Mesh(np.array(devices), (BATCH,))
+
+
+def replicate(tree: Any, mesh: Mesh | None) -> Any:
+    """Put a copy of every array on every device of the mesh."""
+    return tree if mesh is None else jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+class _Sample(NamedTuple):
+    """What one trajectory's frame contributes."""
+
+    slot: Slot
+    metrics: dict[str, Array]
+    statistics: dict[str, Normalizer]
+
+
+def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = None) -> Callable:
     """Return the jitted step on one resolution's pool: (state, data) -> (state, metrics); state is donated.
 
     Args:
         config: The run.
         resolution: Index of the pool and of the data that the step works on.
+        mesh: Devices to spread the batch over, of `make_mesh`; state and data are on all of them.
     """
+    everywhere = None if mesh is None else NamedSharding(mesh, PartitionSpec())
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, out_shardings=everywhere)
     def train_step(state: TrainState, data: TrainingData) -> tuple[TrainState, dict[str, Array]]:
         pool = state.pools[resolution]
-        count = pool.is_done.shape[0]
-        index = (state.iteration // len(config.vertices)) % count
-        garment = data.garment(index % data.num_garments)
-        key = jax.random.wrap_key_data(state.key)
-        key, start_key = jax.random.split(key)
-        slot = jax.tree.map(lambda leaf: leaf[index], pool)
-        slot = jax.lax.cond(
-            slot.is_done, lambda: start_trajectory(start_key, data, garment, config), lambda: slot
-        )
-        problem = _problem(slot, data, garment, config)
-
-        def loss_of(trained):
-            weights = {**state.params, "params": trained}
-            return physics_loss(weights, garment, slot.material, problem, slot.state, config)
-
-        (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params["params"])
+        count, size = pool.is_done.shape[0], config.batch_size
+        turn = state.iteration // len(config.vertices)
+        indices = (turn * size + jnp.arange(size)) % count
+        key, start_key = jax.random.split(jax.random.wrap_key_data(state.key))
+        slots = jax.tree.map(lambda leaf: leaf[indices], pool)
+        batch = (indices, jax.random.split(start_key, size), slots)
+        run = partial(_batch_gradient, config=config)
+        if mesh is not None:
+            run = jax.shard_map(
+                partial(run, axis=BATCH),
+                mesh=mesh,
+                in_specs=(PartitionSpec(), PartitionSpec(), PartitionSpec(), PartitionSpec(BATCH)),
+                out_specs=(PartitionSpec(), PartitionSpec(BATCH)),
+                check_vma=False,
+            )
+        gradient, samples = run(state.params, data, state.iteration, batch)
         norm = optax.tree.norm(gradient)
-        is_good = jnp.isfinite(loss) & jnp.isfinite(norm)
+        is_good = jnp.isfinite(norm) & jnp.all(jnp.isfinite(samples.metrics["loss"]))
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, state.params["params"])
         trained = optax.apply_updates(state.params["params"], updates)
         keep = partial(jax.tree.map, lambda new, old: jnp.where(is_good, new, old))
         params = {**state.params, "params": keep(trained, state.params["params"])}
-        if config.model.features == "hood" or config.model.output == "acceleration":
-            params = _with_statistics(params, slot, problem, garment, config)
-        slot = _advance(slot, problem, garment, report, data, config, state.iteration)
-        pool = jax.tree.map(lambda all_, one: all_.at[index].set(one), pool, slot)
-        metrics = {
-            "loss": loss,
-            "gradient_norm": norm,
-            "start": report.start,
-            "resets": slot.is_done.astype(jnp.float32),
-            **report.terms._asdict(),
-        }
+        for sample in range(size if samples.statistics else 0):
+            params = merge_statistics(params, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023
+        pool = jax.tree.map(lambda all_, some: all_.at[indices].set(some), pool, samples.slot)
+        metrics = {name: jnp.mean(values) for name, values in samples.metrics.items()}
         return (
             TrainState(
                 params=params,
@@ -122,10 +152,65 @@ def make_train_step(config: TrainConfig, resolution: int) -> Callable:
                 iteration=state.iteration + 1,
                 skipped=state.skipped + ~is_good,
             ),
-            metrics,
+            {**metrics, "gradient_norm": norm},
         )
 
     return train_step
+
+
+def _batch_gradient(
+    params: Any,
+    data: TrainingData,
+    iteration: Int[Array, ""],
+    batch: tuple[Int[Array, " batch"], Array, Slot],
+    *,
+    config: TrainConfig,
+    axis: str | None = None,
+) -> tuple[Any, _Sample]:
+    """Return the mean gradient over a batch, or over all devices' parts of it, and every sample's share.
+
+    The samples go one after the other: on a device of its own, one garment fills the machine.
+    """
+
+    def add(total, entry):
+        gradient, sample = _sample_gradient(params, data, iteration, *entry, config=config)
+        return jax.tree.map(jnp.add, total, gradient), sample
+
+    zeros = jax.tree.map(jnp.zeros_like, params["params"])
+    total, samples = jax.lax.scan(add, zeros, batch)
+    if axis is not None:
+        total = jax.lax.psum(total, axis)
+    return jax.tree.map(lambda leaf: leaf / config.batch_size, total), samples
+
+
+def _sample_gradient(
+    params: Any,
+    data: TrainingData,
+    iteration: Int[Array, ""],
+    index: Int[Array, ""],
+    key: Array,
+    slot: Slot,
+    *,
+    config: TrainConfig,
+) -> tuple[Any, _Sample]:
+    """Return one trajectory's gradient, and move it on by a frame."""
+    garment = data.garment(index % data.num_garments)
+    slot = jax.lax.cond(slot.is_done, lambda: start_trajectory(key, data, garment, config), lambda: slot)
+    problem = _problem(slot, data, garment, config)
+
+    def loss_of(trained):
+        weights = {**params, "params": trained}
+        return physics_loss(weights, garment, slot.material, problem, slot.state, config)
+
+    (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(params["params"])
+    statistics = {}
+    if params["statistics"]:
+        statistics = _statistics(params, slot, problem, garment, config)
+    slot = _advance(slot, problem, garment, report, data, config, iteration)
+    resets = slot.is_done.astype(jnp.float32)
+    terms = {name: jnp.asarray(value) for name, value in report.terms._asdict().items()}
+    metrics = {"loss": loss, "start": report.start, "resets": resets, **terms}
+    return gradient, _Sample(slot, metrics, statistics)
 
 
 def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig):
@@ -157,12 +242,14 @@ def _advance(
     return slot.replace(state=state, frame=frame, age=age, is_done=is_done)
 
 
-def _with_statistics(params: Any, slot: Slot, problem, garment: Garment, config: TrainConfig) -> Any:
-    """Let the normalisers see this frame (HOOD); accelerations are those of the frame's start."""
+def _statistics(
+    params: Any, slot: Slot, problem, garment: Garment, config: TrainConfig
+) -> dict[str, Normalizer]:
+    """Return what the normalisers see in this frame (HOOD); accelerations are those of the frame's start."""
     inputs = graph_inputs(problem, garment, slot.material, slot.state)
     graph = build_graph(garment, slot.material, inputs, config.model)
     acceleration = None
     if config.model.output == "acceleration":
         guess = problem.pin_targets if problem.pin_targets is not None else problem.inertial_guess
         acceleration = guess - problem.inertial_guess
-    return update_statistics(config.model, params, graph, garment, acceleration)
+    return measure_statistics(config.model, params, graph, garment, acceleration)

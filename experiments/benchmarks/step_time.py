@@ -84,12 +84,14 @@ def load(model: str, size: str) -> tuple:
     from reference_models import make_scene
 
     from eslr_jax.graph.build import build_graph
-    from eslr_jax.models.registry import MODELS, init_model, update_statistics
+    from eslr_jax.models.registry import MODELS, init_model, measure_statistics, merge_statistics
 
     config = MODELS[model]
     scene = make_scene(*SIZES[size])
     graph = jax.jit(lambda *scene: build_graph(*scene, config))(*scene)
-    params = update_statistics(config, init_model(config), graph, scene[0], scene[2].velocity)
+    params = init_model(config)
+    measured = measure_statistics(config, params, graph, scene[0], scene[2].velocity)
+    params = merge_statistics(params, measured)
     return config, params, graph, scene[0]
 
 

@@ -11,9 +11,10 @@ from eslr_jax.graph.normalizer import (
     MAX_UPDATES,
     init_normalizer,
     inverse,
+    measure,
+    merge,
     normalize,
     standard_deviation,
-    update,
 )
 
 
@@ -26,7 +27,7 @@ def batches(seed=0, sizes=(7, 1, 40, 3)):
 def accumulate(rows, dtype=jnp.float32):
     normalizer = init_normalizer(3, dtype)
     for batch in rows:
-        normalizer = update(normalizer, jnp.asarray(batch, dtype))
+        normalizer = merge(normalizer, measure(jnp.asarray(batch, dtype)))
     return normalizer
 
 
@@ -53,8 +54,10 @@ def test_statistics_match_numpy_in_float64():
 def test_masked_rows_do_not_count_even_when_nan():
     rows = np.concatenate(batches())
     spoiled = np.concatenate([np.full((2, 3), np.nan), rows])
-    masked = update(init_normalizer(3), jnp.asarray(spoiled, jnp.float32), jnp.arange(len(spoiled)) >= 2)
-    plain = update(init_normalizer(3), jnp.asarray(rows, jnp.float32))
+    masked = merge(
+        init_normalizer(3), measure(jnp.asarray(spoiled, jnp.float32), jnp.arange(len(spoiled)) >= 2)
+    )
+    plain = merge(init_normalizer(3), measure(jnp.asarray(rows, jnp.float32)))
     for first, second in zip(jax.tree.leaves(masked), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-5)
 
@@ -73,13 +76,13 @@ def test_a_new_normalizer_changes_nothing():
 def test_a_constant_feature_normalizes_to_zero():
     normalizer = init_normalizer(1)
     for _ in range(3):
-        normalizer = update(normalizer, jnp.full((11, 1), 1 / 30))
+        normalizer = merge(normalizer, measure(jnp.full((11, 1), 1 / 30)))
     np.testing.assert_array_equal(normalize(normalizer, jnp.full((2, 1), 1 / 30)), jnp.zeros((2, 1)))
 
 
 def test_many_updates_keep_their_precision():
     """A sum of squares in float32 would have lost the variance of 1 +- 1e-3 after a few thousand rows."""
-    step = jax.jit(lambda state, rows: (update(state, rows), None))
+    step = jax.jit(lambda state, rows: (merge(state, measure(rows)), None))
     generator = np.random.default_rng(0)
     rows = jnp.asarray(1 + 1e-3 * generator.standard_normal((400, 5000, 1)), jnp.float32)
     normalizer, _ = jax.lax.scan(step, init_normalizer(1), rows)
@@ -89,5 +92,5 @@ def test_many_updates_keep_their_precision():
 
 def test_statistics_freeze_after_the_last_update_and_ignore_empty_batches():
     full = init_normalizer(3).replace(num_updates=jnp.int32(MAX_UPDATES))
-    assert update(full, jnp.ones((4, 3))).count == 0
-    assert update(init_normalizer(3), jnp.ones((4, 3)), jnp.zeros(4, bool)).num_updates == 0
+    assert merge(full, measure(jnp.ones((4, 3)))).count == 0
+    assert merge(init_normalizer(3), measure(jnp.ones((4, 3)), jnp.zeros(4, bool))).num_updates == 0

@@ -61,7 +61,8 @@ def run(config, params, garment, material, inputs, jit=quick_jit):
     @jit
     def build_and_apply(params, garment, material, inputs):
         graph = build_graph(garment, material, inputs, config)
-        params = registry.update_statistics(config, params, graph, garment, inputs.velocity)
+        measured = registry.measure_statistics(config, params, graph, garment, inputs.velocity)
+        params = registry.merge_statistics(params, measured)
         return params, graph, apply_model(config, params, graph, garment)
 
     return build_and_apply(params, garment, material, inputs)

@@ -36,10 +36,10 @@ def one_clip_and_one_compilation():
     steps = {}
     make = loop.make_train_step
 
-    def make_once(config, resolution):
+    def make_once(config, resolution, mesh):
         key = dataclasses.replace(config, seed=0)
         if key not in steps:
-            steps[key] = make(config, resolution)
+            steps[key] = make(config, resolution, mesh)
         return steps[key]
 
     patch.setattr(loop, "make_train_step", make_once)
