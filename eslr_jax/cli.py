@@ -292,14 +292,25 @@ def train(
     config: Path | None = None,
     set_: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = (),
     resume: bool = False,
+    tensorboard: bool = False,
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
 ) -> None:
     """Train a network on the physics loss; Ctrl-C or SIGTERM writes a checkpoint first.
+
+    A batch (`--set batch_size=8`) is spread over all devices of this machine, and with --coordinator over
+    those of several machines: start the same command once on each.
 
     Args:
         out: Folder of metrics, checkpoints and the exported model.
         config: TOML file of a training configuration; not needed with --resume.
         set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
         resume: Go on from the newest checkpoint of the folder.
+        tensorboard: Write event files for TensorBoard too.
+        coordinator: Address of the first process as HOST:PORT, or "auto" under Slurm.
+        num_processes: Number of processes; not needed with "auto".
+        process_id: Number of this process, from 0; not needed with "auto".
     """
     from eslr_jax.config import parse_override
     from eslr_jax.errors import ConfigError
@@ -315,8 +326,12 @@ def train(
     else:
         chosen = load_recipe(config, dict(parse_override(text) for text in set_))
     _use_compile_cache()
-    with _training_progress(chosen.iterations) as show:
+    if coordinator is not None:
+        _join_processes(coordinator, num_processes, process_id)
+    with _training_progress(chosen.iterations, out if tensorboard else None) as show:
         state = run(chosen, out, resume=resume, on_progress=show)
+    if _is_other_process():
+        return
     plot_curves(out)
     done = int(state.iteration)
     if done < chosen.iterations:
@@ -328,9 +343,51 @@ def train(
         print(out / "model.npz")
 
 
+def _join_processes(coordinator: str, num_processes: int | None, process_id: int | None) -> None:
+    """Connect with the other processes of a training run.
+
+    Raises:
+        ConfigError: The processes are not all told, or do not answer.
+    """
+    import jax
+
+    from eslr_jax.errors import ConfigError
+
+    is_automatic = coordinator == "auto"
+    if not is_automatic and (num_processes is None or process_id is None):
+        raise ConfigError("--coordinator HOST:PORT needs --num-processes and --process-id too")
+    try:
+        jax.distributed.initialize(None if is_automatic else coordinator, num_processes, process_id)
+    except (RuntimeError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
+
+
+def _is_other_process() -> bool:
+    """Return whether another process of the run does the writing."""
+    import jax
+
+    return jax.process_index() > 0
+
+
 @contextlib.contextmanager
-def _training_progress(total: int) -> Iterator[Any]:
-    """Show iterations per second, the loss and the time left."""
+def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
+    """Show iterations per second, the loss, its terms and the time left.
+
+    Raises:
+        ConfigError: TensorBoard's event files are asked for and its writer is not installed.
+    """
+    events = None
+    if tensorboard is not None:
+        from eslr_jax.errors import ConfigError
+
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise ConfigError(
+                '--tensorboard needs tensorboardX; pip install "eslr-jax[tensorboard]"'
+            ) from error
+        events = SummaryWriter(str(tensorboard / "events"))
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -343,10 +400,17 @@ def _training_progress(total: int) -> Iterator[Any]:
         task = progress.add_task("training", total=total, text="compiling")
 
         def show(done: int, total: int, metrics: dict[str, float]) -> None:
-            text = f"{metrics['its']:.1f} it/s, loss {metrics['loss']:.4f}"
+            terms = ("stretch", "bending", "inertia", "collision", "friction")
+            shares = ", ".join(f"{name} {metrics[name]:.4f}" for name in terms)
+            text = f"{metrics['its']:.1f} it/s, loss {metrics['loss']:.4f} ({shares} J)"
             progress.update(task, completed=done, total=total, text=text)
+            if events is not None:
+                for name, value in metrics.items():
+                    events.add_scalar(name, value, done)
 
         yield show
+    if events is not None:
+        events.close()
 
 
 @app.command

@@ -12,17 +12,20 @@ import numpy as np
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax.errors import ConfigError, MissingExtraError
 from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
 from eslr_jax.evaluation.metrics import measure_frames
+from eslr_jax.evaluation.referee import Referee
 from eslr_jax.geometry.padding import pad_garment, stacking_bucket
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene, shared_surface
 from eslr_jax.simulate.scan import simulate_scene
-from eslr_jax.types import Garment
+from eslr_jax.types import Garment, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
+_REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the drop from the optimum
+_JUDGED_EVERY = 30  # frames; the referee takes a tenth of a second for each
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
 
@@ -179,14 +182,22 @@ def _summarize(measured: list[Excess]) -> dict[str, Any]:
 
 
 def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:
-    """Return the measures of one free rollout."""
-    parameters = PhysicsParameters()
-    trajectory = simulate_scene(params, scene, parameters, config)
-    measures = jax.device_get(measure_frames(trajectory, scene, parameters))
+    """Return the measures of one free rollout, beside those of the solver's on the same scene."""
+    measured = _measure_rollout(simulate_scene(params, scene, PhysicsParameters(), config), scene)
+    near_optimum = SimConfig(simulator="physics", solver_iterations=_REFERENCE_ITERATIONS)
+    reference = simulate_scene(None, scene, PhysicsParameters(), near_optimum)
+    return {**measured, "optimum": _measure_rollout(reference, scene)}
+
+
+def _measure_rollout(trajectory: Trajectory, scene) -> dict[str, Any]:
+    """Return the measures of one trajectory."""
+    measures = jax.device_get(measure_frames(trajectory, scene, PhysicsParameters()))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in measures.terms._asdict().items()}
     depth = -np.asarray(measures.distances)[:, is_real]
+    body = np.asarray(scene.body_positions)
+    jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
     return {
         "finite": bool(np.isfinite(positions).all()),
         "num_frames": int(scene.num_frames),
@@ -194,7 +205,30 @@ def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:
         "total": sum(terms.values()),
         "stretch_p99": float(np.quantile(measures.max_stretch, 0.99)),
         "penetration_p999_mm": float(max(np.quantile(depth, 0.999), 0.0) * 1e3),
-        "coverage": _coverage(positions[-1], np.asarray(scene.body_positions)[-1]),
+        "jitter_m_s3": float(np.median(np.linalg.norm(jerk, axis=-1))),
+        "coverage": _coverage(positions[-1], body[-1]),
+        "intersections": _intersections(np.asarray(trajectory.positions), body, scene),
+    }
+
+
+def _intersections(positions: np.ndarray, body: np.ndarray, scene) -> dict[str, float] | None:
+    """Return intersecting pairs of triangles per frame, by the referee; None where it is not installed."""
+    garment = scene.garment
+    is_real = np.asarray(garment.rest_areas) > 0
+    try:
+        referee = Referee(
+            np.asarray(garment.faces)[is_real],
+            len(positions[0]),
+            np.asarray(scene.surface.faces),
+            len(body[0]),
+        )
+    except MissingExtraError:
+        return None
+    frames = range(_JUDGED_EVERY, len(positions), _JUDGED_EVERY)
+    verdicts = [referee.judge(positions[frame], body[frame]) for frame in frames]
+    return {
+        name: float(np.mean([getattr(verdict, name) for verdict in verdicts]))
+        for name in ("cloth_cloth", "cloth_body")
     }
 
 
@@ -217,12 +251,25 @@ def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float
 
 
 def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return means, and the worst where a bar is on the worst."""
-    names = scenes[0]["terms"]
-    return {
+    """Return means, and the worst where a bar is on the worst; `optimum` holds the same of the solver."""
+    pooled = {
         "finite": all(scene["finite"] for scene in scenes),
-        "total": float(np.mean([scene["total"] for scene in scenes])),
-        "terms": {name: float(np.mean([scene["terms"][name] for scene in scenes])) for name in names},
         "stretch_p99": float(np.max([scene["stretch_p99"] for scene in scenes])),
         "penetration_p999_mm": float(np.max([scene["penetration_p999_mm"] for scene in scenes])),
+        **{
+            name: float(np.mean([scene[name] for scene in scenes]))
+            for name in ("total", "jitter_m_s3", "coverage")
+        },
+        **{
+            group: {
+                name: float(np.mean([scene[group][name] for scene in scenes])) for name in scenes[0][group]
+            }
+            for group in ("terms", "intersections")
+            if scenes[0][group] is not None
+        },
     }
+    if "optimum" in scenes[0]:
+        ratios = [scene["coverage"] / max(scene["optimum"]["coverage"], 1e-9) for scene in scenes]
+        pooled["coverage_worst_ratio"] = float(np.min(ratios))
+        pooled["optimum"] = _pool_rollouts([scene["optimum"] for scene in scenes])
+    return pooled

@@ -17,7 +17,7 @@ from jax.experimental import multihost_utils
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, NonFiniteError
-from eslr_jax.io.atomic import ensure_output_dir
+from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
 from eslr_jax.training.data import load_training_data
@@ -56,6 +56,7 @@ def train(
         state = state.replace(params=replicate(jax.tree.map(jax.numpy.array, initial_params), mesh))
     if resume:
         state = checkpoints.restore(state)
+        _forget_after(out / "metrics.jsonl", int(state.iteration))
     steps = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.iteration)
@@ -106,6 +107,16 @@ def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
     if _is_first_process() and not resume:
         write_run_config(out, config)
     return Checkpoints(out)
+
+
+def _forget_after(metrics: Path, iteration: int) -> None:
+    """Drop the records of iterations that a killed run did after its last checkpoint: they come again."""
+    if not _is_first_process() or not metrics.exists():
+        return
+    lines = metrics.read_text().splitlines()
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["iteration"] <= iteration]
+    with atomic_write(metrics) as temporary:
+        temporary.write_text("".join(line + "\n" for line in kept))
 
 
 def _is_first_process() -> bool:
