@@ -113,7 +113,7 @@ def broken():
     ("name", "content"), list(broken()), ids=lambda value: value if isinstance(value, str) else ""
 )
 def test_broken_pickles_are_named_in_one_line(tmp_path, name, content):
-    with pytest.raises(AssetError, match="test file .*content.pkl can't be read as a pickle") as caught:
+    with pytest.raises(AssetError, match=r"test file .*content\.pkl can't be read as a pickle") as caught:
         read_pickle(dump(tmp_path, content), content="test")
     assert "\n" not in str(caught.value)
 
