@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,27 +19,40 @@ from trimesh.exchange.stl import load_stl
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.npz import read_arrays
 
-Mesh = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
-
 POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an archive, first match
+MAX_FILE_BYTES = 1 << 30  # of a mesh; no garment comes near
 
 
-def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh without repairing it.
+@dataclasses.dataclass(frozen=True)
+class MeshFile:
+    """A mesh as its file has it, in the file's units and axes."""
+
+    positions: Float[np.ndarray, "vertices 3"]  # float64
+    faces: Int[np.ndarray, "faces 3"]  # int64, unvalidated
+    corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None  # texture coordinates of each face's corners
+    face_parts: Int[np.ndarray, " faces"] | None = None  # index into part_names
+    part_names: tuple[str, ...] = ()  # materials, or else groups, or else objects
+
+
+def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Read the positions [vertices, 3] and faces [faces, 3] of a mesh file; see `read_mesh_file`."""
+    mesh = read_mesh_file(path)
+    return mesh.positions, mesh.faces
+
+
+def read_mesh_file(path: str | Path) -> MeshFile:
+    """Read a mesh without repairing it; polygons are cut into triangles.
 
     OBJ, PLY and NPZ keep their vertices and order. STL can't share a vertex between faces, and GLB splits
     vertices where normals or texture coordinates differ, so there vertices at bit-identical positions
     become one.
 
     Args:
-        path: A .obj, .ply, .stl, .glb or .npz file, in metres, Y up.
-
-    Returns:
-        Positions [m], float64, shape [vertices, 3], and faces, int64, shape [faces, 3]; unvalidated.
+        path: A .obj, .ply, .stl, .glb or .npz file.
 
     Raises:
         AssetError: The file is missing, unreadable or of an unknown kind.
-        MeshError: The file has faces that are not triangles.
+        MeshError: A PLY file has faces that are not triangles.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -44,36 +62,105 @@ def read_mesh(path: str | Path) -> Mesh:
     if not path.is_file():
         cause = "is a folder" if path.is_dir() else "doesn't exist"
         raise AssetError(f"mesh file {path} {cause}; check the path")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise AssetError(
+            f"mesh file {path} is larger than {MAX_FILE_BYTES >> 20} MiB; export less of the scene"
+        )
     try:
-        positions, faces = _READERS[suffix](path)
+        mesh = _READERS[suffix](path)
+        return dataclasses.replace(
+            mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
+        )
     except (AssetError, MeshError):
         raise
+    except OSError as error:
+        raise AssetError(
+            f"mesh file {path} can't be read: {error.strerror or error}; check the path"
+        ) from error
     except Exception as error:  # a parser may raise anything on a damaged file
-        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        reason = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
         raise AssetError(f"mesh file {path} can't be read ({reason}); export it again") from error
-    return np.array(positions, np.float64), np.array(faces)
 
 
-def _read_obj(path: Path) -> Mesh:
-    """Read vertices and faces of an OBJ file; normals, texture coordinates and materials are skipped."""
-    positions, faces = [], []
+def _read_obj(path: Path) -> MeshFile:
+    """Read vertices, faces, texture coordinates and part names of an OBJ file; normals are skipped."""
+    positions: list[list[float]] = []
+    uvs: list[list[float]] = []
+    polygons: list[list[tuple[int, int]]] = []  # corners as (vertex, texture coordinate or -1)
+    names: dict[str, list[str]] = {"usemtl": [], "g": [], "o": []}
+    current = dict.fromkeys(names, "")
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         key, _, rest = line.partition("#")[0].strip().partition(" ")
         if key == "v":
             positions.append([float(value) for value in rest.split()[:3]])
+        elif key == "vt":
+            uvs.append([float(value) for value in rest.split()[:2]])
         elif key == "f":
-            corners = [int(word.partition("/")[0]) for word in rest.split()]
-            if len(corners) != 3:
-                raise MeshError(
-                    f"{path}, line {number}: a face of {len(corners)} vertices; triangulate the mesh"
-                )
-            # OBJ counts from one; negative indices count back from the vertices read so far
-            faces.append([index - 1 if index > 0 else len(positions) + index for index in corners])
-    return np.array(positions, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+            polygon = [_corner(word, len(positions), len(uvs)) for word in rest.split()]
+            if len(polygon) < 3:
+                raise MeshError(f"{path}, line {number}: a face of {len(polygon)} vertices; remove it")
+            polygons.append(polygon)
+            for kind, chosen in names.items():
+                chosen.append(current[kind])
+        elif key in current:
+            current[key] = rest.strip()
+    points = np.array(positions, np.float64).reshape(-1, 3)
+    triangles, owner = _cut_polygons(points, polygons)
+    faces = np.array(triangles, np.int64).reshape(-1, 3, 2)
+    has_uvs = len(faces) > 0 and bool(np.all((faces[..., 1] >= 0) & (faces[..., 1] < len(uvs))))
+    face_parts, part_names = _parts([[chosen[k] for k in owner] for chosen in names.values()])
+    return MeshFile(
+        positions=points,
+        faces=faces[..., 0],
+        corner_uvs=np.array(uvs, np.float64)[faces[..., 1]] if has_uvs else None,
+        face_parts=face_parts,
+        part_names=part_names,
+    )
 
 
-def _read_ply(path: Path) -> Mesh:
+def _corner(word: str, num_positions: int, num_uvs: int) -> tuple[int, int]:
+    """Read v, v/vt, v//vn or v/vt/vn; OBJ counts from one, negative indices back from the last read."""
+    vertex, _, rest = word.partition("/")
+    uv = rest.partition("/")[0]
+    return _from_zero(int(vertex), num_positions), _from_zero(int(uv), num_uvs) if uv else -1
+
+
+def _from_zero(index: int, count: int) -> int:
+    """Turn an OBJ index into one that counts from zero."""
+    return index - 1 if index > 0 else count + index
+
+
+def _cut_polygons(
+    points: np.ndarray, polygons: list[list[tuple[int, int]]]
+) -> tuple[list[list[tuple[int, int]]], list[int]]:
+    """Cut polygons into triangles, quads along their shorter diagonal, and return whose triangle each is."""
+    triangles, owner = [], []
+    for k, polygon in enumerate(polygons):
+        if len(polygon) == 4:
+            ids = [corner[0] for corner in polygon]
+            if min(ids) >= 0 and max(ids) < len(points):
+                lengths = np.linalg.norm(points[ids[:2]] - points[ids[2:]], axis=1)
+                if lengths[1] < lengths[0]:
+                    polygon = polygon[1:] + polygon[:1]
+        for i in range(1, len(polygon) - 1):
+            triangles.append([polygon[0], polygon[i], polygon[i + 1]])
+            owner.append(k)
+    return triangles, owner
+
+
+def _parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return the part of every face, and names, from the first way of naming that tells faces apart."""
+    for names in choices:
+        distinct = tuple(dict.fromkeys(names))
+        if len(distinct) > 1:
+            index = {name: k for k, name in enumerate(distinct)}
+            return np.array([index[name] for name in names]), tuple(name or "unnamed" for name in distinct)
+    return None, ()
+
+
+def _read_ply(path: Path) -> MeshFile:
     """Read a PLY file, text or binary."""
+    _check_ply_header(path)
     with path.open("rb") as stream:
         content = load_ply(stream, fix_texture=False, skip_materials=True)
     positions = np.asarray(content.get("vertices", np.empty((0, 3))))
@@ -82,24 +169,86 @@ def _read_ply(path: Path) -> Mesh:
     num_polygons = content.get("metadata", {}).get("_ply_raw", {}).get("face", {}).get("length", 0)
     if faces.shape[1:] != (3,) or len(faces) != num_polygons:
         raise MeshError(f"{path}: not all of its {num_polygons} faces are triangles; triangulate the mesh")
-    return positions, faces.astype(np.int64)
+    return MeshFile(positions, faces.astype(np.int64))
 
 
-def _read_stl(path: Path) -> Mesh:
+def _check_ply_header(path: Path) -> None:
+    """Raise on element counts that the file has no bytes for: the parser would allocate them."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        for line in stream.read(1 << 16).partition(b"end_header")[0].splitlines():
+            words = line.split()
+            if words[:1] == [b"element"] and not (len(words) == 3 and 0 <= int(words[2]) <= size):
+                raise ValueError(f"impossible header line {line.decode('latin1')[:60]!r}")
+
+
+def _read_stl(path: Path) -> MeshFile:
     """Read an STL file and share the corners that have bit-identical positions."""
     with path.open("rb") as stream:
         content = load_stl(stream)
     content = next(iter(content.get("geometry", {}).values()), content)  # text files nest their solids
-    return _share_vertices(np.asarray(content["vertices"]), np.asarray(content["faces"], np.int64))
+    return MeshFile(*_share_vertices(np.asarray(content["vertices"]), np.asarray(content["faces"], np.int64)))
 
 
-def _read_glb(path: Path) -> Mesh:
+def _read_glb(path: Path) -> MeshFile:
     """Read all meshes of a glTF binary into one, in the scene's frame, sharing split vertices."""
-    mesh = load_scene(path, process=False).to_mesh()
-    return _share_vertices(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
+    scene = load_scene(_geometry_only(path), file_type="glb", process=False)
+    names, meshes = [], []
+    for name, mesh in scene.geometry.items():  # in the file's order; the graph's is arbitrary
+        for node in sorted(scene.graph.geometry_nodes.get(name, ())) if hasattr(mesh, "faces") else ():
+            names.append(str(name))
+            meshes.append(mesh.copy().apply_transform(scene.graph[node][0]))
+    if not meshes:
+        return MeshFile(np.empty((0, 3)), np.empty((0, 3), np.int64))
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    corners = np.concatenate([m.faces + offset for m, offset in zip(meshes, offsets[:-1], strict=True)])
+    uvs = [getattr(mesh.visual, "uv", None) for mesh in meshes]
+    has_uvs = all(
+        uv is not None and len(uv) == len(mesh.vertices) for uv, mesh in zip(uvs, meshes, strict=True)
+    )
+    positions = np.concatenate([np.asarray(mesh.vertices) for mesh in meshes])
+    face_parts, part_names = _parts(
+        [[name for name, mesh in zip(names, meshes, strict=True) for _ in range(len(mesh.faces))]]
+    )
+    return MeshFile(
+        *_share_vertices(positions, corners.astype(np.int64)),
+        corner_uvs=np.concatenate([np.asarray(uv, np.float64) for uv in uvs])[corners] if has_uvs else None,
+        face_parts=face_parts,
+        part_names=part_names,
+    )
 
 
-def _read_npz(path: Path) -> Mesh:
+def _geometry_only(path: Path) -> io.BytesIO:
+    """Return a glTF binary without pictures: one plain material, so that texture coordinates are kept.
+
+    Raises:
+        ValueError: It is damaged, refers to other files, or counts more than its bytes hold.
+    """
+    data = path.read_bytes()
+    magic, version, length, chunk, kind = struct.unpack_from("<4sIIII", data)
+    if magic != b"glTF" or kind != 0x4E4F534A or length > len(data) or 20 + chunk > len(data):
+        raise ValueError("no glTF binary, or truncated")
+    content: dict[str, Any] = json.loads(data[20 : 20 + chunk])
+    for accessor in content.get("accessors", []):
+        if not 0 <= accessor["count"] <= len(data) or "bufferView" not in accessor:
+            raise ValueError("an accessor counts more than the file holds")
+    if any("uri" in buffer for buffer in content.get("buffers", [])):
+        raise ValueError("it refers to other files; embed them")
+    for key in ("images", "textures", "samplers", "animations"):
+        content.pop(key, None)
+    content["materials"] = [{}]
+    for mesh in content.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + chunk : length]
+    return io.BytesIO(
+        struct.pack("<4sIIII", magic, version, 20 + len(text) + len(rest), len(text), kind) + text + rest
+    )
+
+
+def _read_npz(path: Path) -> MeshFile:
     """Read `faces` and one of `POSITION_KEYS` from a NumPy archive."""
     arrays = read_arrays(path, content="mesh")
     key = next((key for key in POSITION_KEYS if key in arrays), None)
@@ -108,10 +257,10 @@ def _read_npz(path: Path) -> Mesh:
             f"mesh file {path} has the arrays {', '.join(sorted(arrays)) or 'none'}; "
             f"it needs faces and {' or '.join(POSITION_KEYS)}"
         )
-    return arrays[key], arrays["faces"]
+    return MeshFile(arrays[key], arrays["faces"])
 
 
-def _share_vertices(positions: np.ndarray, faces: np.ndarray) -> Mesh:
+def _share_vertices(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mesh with bit-identical positions made one vertex, in order of first appearance."""
     if not len(positions):
         return positions.reshape(-1, 3), faces.reshape(-1, 3)
@@ -121,7 +270,7 @@ def _share_vertices(positions: np.ndarray, faces: np.ndarray) -> Mesh:
     return positions[np.sort(first)], rank[inverse.ravel()][faces]
 
 
-_READERS: dict[str, Callable[[Path], Mesh]] = {
+_READERS: dict[str, Callable[[Path], MeshFile]] = {
     ".obj": _read_obj,
     ".ply": _read_ply,
     ".stl": _read_stl,

@@ -1,12 +1,14 @@
 """Mesh files of every kind come back as written; broken ones are named."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
 
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
-from eslr_jax.io.mesh import read_mesh
+from eslr_jax.io.mesh import read_mesh, read_mesh_file
 
 POSITIONS = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.25], [0, 0.5, 0.125], [0.25, 0.75, 0]])
 FACES = np.array([[0, 1, 2], [2, 3, 0], [3, 2, 4]])
@@ -66,10 +68,14 @@ def test_glb_scene_transforms_are_applied(tmp_path):
     assert_same(read_mesh(tmp_path / "scarf.glb"), POSITIONS + np.array([0, 1, 0]))
 
 
-def test_quads_are_named(tmp_path):
+def test_polygons_of_obj_are_cut_and_those_of_ply_named(tmp_path):
     path = tmp_path / "quad.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
-    with pytest.raises(MeshError, match="line 5: a face of 4 vertices; triangulate"):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 3 1 0\nv 0 1 0\nf 1 2 3 4\nf 1 2 3 4 4\n")
+    faces = read_mesh(path)[1]
+    assert faces.tolist() == [[1, 2, 3], [1, 3, 0], [0, 1, 2], [0, 2, 3], [0, 3, 3]]  # the shorter diagonal
+    path = tmp_path / "edge.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nf 1 2\n")
+    with pytest.raises(MeshError, match="line 3: a face of 2 vertices"):
         read_mesh(path)
     path = tmp_path / "quad.ply"
     path.write_text(
@@ -79,6 +85,52 @@ def test_quads_are_named(tmp_path):
     )
     with pytest.raises(MeshError, match="not all of its 1 faces are triangles"):
         read_mesh(path)
+
+
+def test_obj_texture_coordinates_and_parts(tmp_path):
+    path = tmp_path / "scarf.obj"
+    path.write_text(
+        "o scarf\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvt .5 .5\n"
+        "usemtl silk\nf 1/1 2/2 3/3\nusemtl wool\nf 2/2 4/4 3/-2\n"
+    )
+    mesh = read_mesh_file(path)
+    assert mesh.part_names == ("silk", "wool")
+    assert mesh.face_parts.tolist() == [0, 1]
+    assert mesh.corner_uvs.tolist() == [[[0, 0], [1, 0], [0, 1]], [[1, 0], [0.5, 0.5], [0, 1]]]
+
+
+def test_glb_parts_and_texture_coordinates(tmp_path):
+    uv = np.arange(10.0).reshape(5, 2) / 10
+    scene = trimesh.Scene()
+    for name, shift in (("left", 0.0), ("right", 3.0)):
+        visual = trimesh.visual.TextureVisuals(uv=uv)
+        scene.add_geometry(
+            trimesh.Trimesh(POSITIONS + shift, FACES, visual=visual, process=False), geom_name=name
+        )
+    scene.export(tmp_path / "scarf.glb")
+    mesh = read_mesh_file(tmp_path / "scarf.glb")
+    assert mesh.part_names == ("left", "right")
+    np.testing.assert_allclose(mesh.corner_uvs[: len(FACES)], uv[FACES], atol=1e-6)
+    np.testing.assert_allclose(mesh.positions[mesh.faces[len(FACES) :]], POSITIONS[FACES] + 3.0, atol=1e-6)
+
+
+def test_bombs_are_named(tmp_path):
+    path = tmp_path / "bomb.ply"
+    path.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
+    )
+    with pytest.raises(AssetError, match="impossible header line"):
+        read_mesh(path)
+    trimesh.Trimesh(POSITIONS, FACES, process=False).export(tmp_path / "bomb.glb")
+    data = (tmp_path / "bomb.glb").read_bytes()
+    (tmp_path / "bomb.glb").write_bytes(
+        re.sub(rb'"count":\d+', lambda m: b'"count":9e9'.ljust(len(m[0])), data)
+    )
+    with pytest.raises(AssetError, match="can't be read"):
+        read_mesh(tmp_path / "bomb.glb")
+    (tmp_path / "bomb.glb").write_bytes(data[:40])
+    with pytest.raises(AssetError, match="truncated"):
+        read_mesh(tmp_path / "bomb.glb")
 
 
 def test_mesh_without_faces_reads_as_empty(tmp_path):
