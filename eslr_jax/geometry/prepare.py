@@ -24,6 +24,7 @@ def prepare_garment(
     skin_weights: Float[np.ndarray, "vertices influences"],
     skin_indices: Int[np.ndarray, "vertices influences"],
     is_pinned: Bool[np.ndarray, " vertices"] | None = None,
+    sewn_positions: Float[np.ndarray, "vertices 3"] | None = None,
     embedding_size: int = 8,
     embedding_mode: EmbeddingMode = "canonical",
     anchors: Float[np.ndarray, "anchors 3"] | None = None,
@@ -39,6 +40,8 @@ def prepare_garment(
         skin_weights: Joint weights, normalised to rows that sum to one, shape [vertices, influences].
         skin_indices: Joint of every weight, shape [vertices, influences].
         is_pinned: Vertices that follow their skinned position; none by default, shape [vertices].
+        sewn_positions: The shape that lengths, areas and angles are measured on [m], where the rest positions
+            were taken out of the body or into another pose; the rest positions by default, shape [vertices, 3].
         embedding_size: Coordinates of the geodesic embedding.
         embedding_mode: See `embedding.geodesic_embedding`.
         anchors: Body points of embedding mode `landmarks` [m].
@@ -56,6 +59,11 @@ def prepare_garment(
     validate_mesh(rest_positions, faces, name=name, allow_components=allow_components)
     validate_orientation(rest_positions, faces, name=name)
     positions = np.asarray(rest_positions, np.float64)
+    sewn = positions
+    if sewn_positions is not None:
+        validate_mesh(sewn_positions, faces, name=f"{name}, as sewn", allow_components=allow_components)
+        sewn = np.asarray(sewn_positions, np.float64)
+        _check_sewn(name, positions, sewn)
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
     is_pinned = np.zeros(num_vertices, bool) if is_pinned is None else np.asarray(is_pinned, bool)
@@ -63,7 +71,7 @@ def prepare_garment(
     skin_indices = np.asarray(skin_indices)
     _check_rows(name, num_vertices, skin_weights, skin_indices, is_pinned)
 
-    areas = topology.face_areas(positions, faces)
+    areas = topology.face_areas(sewn, faces)
     hinges, hinge_faces = topology.find_hinges(faces)
     senders, receivers, reverse = topology.directed_edges(topology.unique_edges(faces))
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
@@ -71,10 +79,10 @@ def prepare_garment(
         rest_positions=positions,
         faces=faces,
         rest_areas=areas,
-        inverse_rest_frames=topology.inverse_rest_frames(positions, faces),
+        inverse_rest_frames=topology.inverse_rest_frames(sewn, faces),
         hinges=hinges,
         hinge_rest_areas=areas[hinge_faces].sum(axis=1),
-        hinge_rest_angles=topology.hinge_angles(positions, hinges),
+        hinge_rest_angles=topology.hinge_angles(sewn, hinges),
         vertex_areas=topology.vertex_areas(areas, faces, num_vertices),
         senders=senders,
         receivers=receivers,
@@ -98,6 +106,15 @@ def to_device(garment: Garment) -> Garment:
     """Return a garment with float32, int32 and bool JAX leaves."""
     dtypes = {"f": jnp.float32, "i": jnp.int32, "u": jnp.int32, "b": jnp.bool_}
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtypes[leaf.dtype.kind]), garment)
+
+
+def _check_sewn(name: str, positions: np.ndarray, sewn: np.ndarray) -> None:
+    """Raise where the sewn shape is not that of the rest positions."""
+    if sewn.shape != positions.shape:
+        raise MeshError(
+            f"{name}: sewn positions {sewn.shape} do not fit rest positions {positions.shape}; "
+            "give one row per vertex"
+        )
 
 
 def _check_rows(

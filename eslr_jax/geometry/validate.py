@@ -51,7 +51,7 @@ def validate_mesh(
             inconsistent orientation, or several components.
     """
     positions, faces = np.asarray(positions), np.asarray(faces)
-    _check_arrays(positions, faces, name)
+    check_arrays(positions, faces, name)
     _check_scale(positions, name)
     _check_vertices(positions, faces, name)
     _check_faces(positions, faces, name)
@@ -68,7 +68,7 @@ def validate_mesh(
         )
 
 
-def _check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
+def check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
     """Raise on empty arrays, wrong shapes or dtypes, non-finite positions and indices out of range."""
     if positions.size == 0 or faces.size == 0:
         raise MeshError(

@@ -1,35 +1,111 @@
-"""Garment files: a rest mesh with skin weights and pins in a NumPy archive."""
+"""Garment files: the project's own archive, and what is known about a garment from anyone else's file."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from eslr_jax.errors import AssetError
+from eslr_jax.io.mesh import MeshFile, read_mesh_file
 from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.io.pickle import read_pickle
+
+_HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
 
 
 @dataclasses.dataclass(frozen=True)
 class GarmentFile:
-    """The arrays of a garment file, as `prepare_garment` takes them."""
+    """The arrays of a garment file, as `prepare_garment` takes them, and what links them to their source."""
 
-    rest_positions: Float[np.ndarray, "vertices 3"]  # [m], float64
+    rest_positions: Float[np.ndarray, "vertices 3"]  # [m], float64, in the body's rest pose
     faces: Int[np.ndarray, "faces 3"]
     skin_weights: Float[np.ndarray, "vertices influences"]
     skin_indices: Int[np.ndarray, "vertices influences"]
     is_pinned: Bool[np.ndarray, " vertices"]
+    sewn_positions: Float[np.ndarray, "vertices 3"] | None = None
+    """[m]: the shape that lengths, areas and angles are measured on, where it is not the rest pose's."""
+    corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None
+    face_parts: Int[np.ndarray, " faces"] | None = None
+    part_names: tuple[str, ...] = ()
+    vertex_map: Int[np.ndarray, " source_vertices"] | None = None  # vertex of every source vertex; -1: dropped
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # fabrics, how it was fitted, ...
+
+
+@dataclasses.dataclass(frozen=True)
+class GarmentSource:
+    """A garment of a user, not yet fitted."""
+
+    mesh: MeshFile
+    name: str
+    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # where the file says so
+    is_metric: bool = False  # the format prescribes metres and Y up
+
+
+def is_garment_file(path: str | Path) -> bool:
+    """Tell a file that `write_garment_npz` wrote from a mesh that has to be fitted."""
+    return Path(path).suffix.lower() == ".npz" and "skin_weights" in read_arrays(path, content="garment")
+
+
+def read_garment_source(text: str | Path) -> GarmentSource:
+    """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
+
+    Args:
+        text: Path of a .obj, .ply, .stl, .glb, .npz or .pkl file; `FILE.pkl#NAME` picks one of several.
+
+    Raises:
+        AssetError: The file is missing, damaged or of an unknown kind.
+        MeshError: It has faces that can't be triangulated.
+    """
+    file, _, name = str(text).partition("#")
+    if Path(file).suffix.lower() == ".pkl":
+        return _read_hood(file, name)
+    path = Path(text)
+    return GarmentSource(read_mesh_file(path), path.stem, is_metric=path.suffix.lower() == ".glb")
+
+
+def _read_hood(path: str, name: str) -> GarmentSource:
+    """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name.
+
+    Source: HOOD, `utils/mesh_creation.py`.
+    """
+    garments = read_pickle(path, content="garment")
+    if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
+        raise AssetError(f"garment file {path} holds no garments by name; give HOOD's garments_dict.pkl")
+    names = [str(key) for key in garments]
+    if not name and len(names) != 1:
+        raise AssetError(f"{path} holds the garments {', '.join(names)[:300]}; name one, as in {path}#NAME")
+    name = name or names[0]
+    if name not in names:
+        raise AssetError(f"{path} has no garment {name!r}; it has {', '.join(names)[:300]}")
+    entry = garments[name]
+    arrays = {}
+    for key in ("rest_pos", "faces"):
+        value = entry.get(key)
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+            raise AssetError(f"garment {name} of {path} has no array {key}; give HOOD's garments_dict.pkl")
+        arrays[key] = value
+    positions = arrays["rest_pos"].astype(np.float64)
+    is_pinned = None
+    if entry.get("node_type") is not None:
+        kinds = np.ravel(entry["node_type"])
+        if kinds.shape != positions.shape[:1]:
+            raise AssetError(f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices")
+        is_pinned = kinds == _HOOD_PINNED
+    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:
     """Read a garment file with the arrays rest_positions, faces, skin_weights, skin_indices and pinned.
 
-    `pinned` may be absent: then nothing is pinned.
+    `pinned` may be absent: then nothing is pinned. So may everything else that `write_garment_npz` writes.
 
     Raises:
-        AssetError: The file is missing or damaged, or an array is missing.
+        AssetError: The file is missing or damaged, or an array is missing or does not fit the others.
     """
     arrays = read_arrays(path, content="garment")
     missing = [
@@ -39,13 +115,57 @@ def read_garment_npz(path: str | Path) -> GarmentFile:
         raise AssetError(
             f"garment file {path} lacks {', '.join(missing)}; it has {', '.join(sorted(arrays))}"
         )
+    _check_shapes(arrays, path)
+    try:
+        metadata = json.loads(str(arrays["metadata"])) if "metadata" in arrays else {}
+    except (ValueError, RecursionError) as error:
+        raise AssetError(f"garment file {path} has damaged metadata; fit the garment again") from error
+    sewn = arrays.get("sewn_positions")
+    uvs = arrays.get("corner_uvs")
     return GarmentFile(
         rest_positions=arrays["rest_positions"].astype(np.float64),
         faces=arrays["faces"].astype(np.int64),
         skin_weights=arrays["skin_weights"].astype(np.float64),
         skin_indices=arrays["skin_indices"].astype(np.int64),
         is_pinned=arrays.get("pinned", np.zeros(len(arrays["rest_positions"]))).astype(bool),
+        sewn_positions=None if sewn is None else sewn.astype(np.float64),
+        corner_uvs=None if uvs is None else uvs.astype(np.float64),
+        face_parts=arrays.get("face_parts"),
+        part_names=tuple(str(name) for name in arrays.get("part_names", ())),
+        vertex_map=arrays.get("vertex_map"),
+        metadata=metadata if isinstance(metadata, dict) else {},
     )
+
+
+def _check_shapes(arrays: dict[str, np.ndarray], path: str | Path) -> None:
+    """Raise on arrays whose kinds or numbers of rows do not fit; what they hold is checked when prepared."""
+    vertices, faces = arrays["rest_positions"].shape[:1], arrays["faces"].shape[:1]
+    expected = {
+        "rest_positions": ("f", (*vertices, 3)),
+        "faces": ("iu", (*faces, 3)),
+        "skin_weights": ("f", (*vertices, None)),
+        "skin_indices": ("iu", (*vertices, None)),
+        "pinned": ("biuf", vertices),
+        "sewn_positions": ("f", (*vertices, 3)),
+        "corner_uvs": ("f", (*faces, 3, 2)),
+        "face_parts": ("iu", faces),
+        "part_names": ("U", (None,)),
+        "vertex_map": ("iu", (None,)),
+    }
+    for key, (kinds, shape) in expected.items():
+        if key not in arrays:
+            continue
+        array = arrays[key]
+        fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+        if array.dtype.kind not in kinds or not fits:
+            raise AssetError(
+                f"garment file {path}: {key} is {array.dtype} {array.shape} for {vertices} vertices and {faces} "
+                "faces; write the file again"
+            )
+    if "face_parts" in arrays and arrays["face_parts"].size:
+        parts, count = arrays["face_parts"], len(arrays.get("part_names", ()))
+        if parts.min() < 0 or parts.max() >= count:
+            raise AssetError(f"garment file {path}: face_parts name part {parts.max()} of {count}; fit it again")
 
 
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
@@ -54,11 +174,22 @@ def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
     Raises:
         AssetError: The file can't be written.
     """
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "rest_positions": garment.rest_positions.astype(np.float32),
         "faces": garment.faces.astype(np.int32),
         "skin_weights": garment.skin_weights.astype(np.float32),
         "skin_indices": garment.skin_indices.astype(np.int16),
         "pinned": garment.is_pinned,
     }
+    if garment.sewn_positions is not None:
+        arrays["sewn_positions"] = garment.sewn_positions.astype(np.float32)
+    if garment.corner_uvs is not None:
+        arrays["corner_uvs"] = garment.corner_uvs.astype(np.float32)
+    if garment.face_parts is not None:
+        arrays["face_parts"] = garment.face_parts.astype(np.int32)
+        arrays["part_names"] = np.array(garment.part_names)
+    if garment.vertex_map is not None:
+        arrays["vertex_map"] = garment.vertex_map.astype(np.int32)
+    if garment.metadata:
+        arrays["metadata"] = np.array(json.dumps(garment.metadata))
     write_arrays(path, arrays, is_compressed=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -17,3 +18,60 @@ _COTTON: dict[str, Any] = {
 }
 COTTON = Material(**_COTTON)
 """The fabric of SNUG (Santesteban et al. 2022) with which HOOD and the paper evaluate."""
+
+_WANG = "Wang, O'Brien, Ramamoorthi 2011, doi:10.1145/2010324.1964966, data of ARCSim"
+_POISSON = 0.3  # of woven and knitted cloth along its threads; Wang et al. measure 0.1 to 0.6
+
+
+@dataclasses.dataclass(frozen=True)
+class Fabric:
+    """What is measured of a fabric, as one isotropic sheet."""
+
+    density: float  # [kg/m^2]
+    stretch_stiffness: float  # [N/m] tension per width and strain, at the start and along the first thread
+    bending_stiffness: float  # [J] at small curvature, along the first thread; ARCSim's convention is HOOD's
+    what: str
+    source: str
+
+
+FABRICS: dict[str, Fabric] = {
+    "jersey": Fabric(0.187, 68.95, 2.3192e-5, "T-shirt knit, 60 % cotton 40 % polyester", f"{_WANG}: gray interlock"),
+    "rib-knit": Fabric(0.276, 130.3, 4.6242e-5, "95 % cotton 5 % spandex", f"{_WANG}: ivory rib knit"),
+    "sweatshirt": Fabric(0.224, 24.98, 5.9467e-5, "96 % polyester 4 % spandex", f"{_WANG}: navy sparkle sweat"),
+    "ponte": Fabric(0.284, 88.06, 3.6349e-5, "double knit, 60 % polyester 40 % rayon", f"{_WANG}: camel ponte roma"),
+    "swimwear": Fabric(0.204, 209.2, 6.0243e-5, "87 % nylon 13 % spandex", f"{_WANG}: white swim solid"),
+    "satin": Fabric(0.113, 342.8, 1.4289e-5, "100 % polyester", f"{_WANG}: tango red jet set"),
+    "brocade": Fabric(0.228, 489.7, 1.1710e-4, "100 % polyester", f"{_WANG}: pink ribbon brown"),
+    "denim": Fabric(0.324, 2027.8, 6.4198e-5, "11 oz, 99 % cotton 1 % spandex", f"{_WANG}: 11oz black denim"),
+    "crepe": Fabric(0.128, 4055.0, 5.1707e-5, "100 % polyester", f"{_WANG}: white dots on black"),
+    "suiting": Fabric(0.220, 4070.0, 1.2545e-4, "65 % cotton 35 % polyester", f"{_WANG}: royal target"),
+    "silk": Fabric(0.0694, 342.8, 3e-6, "crepe de chine of 16 momme",
+                   "estimate: 1 momme = 4.340 g/m^2; bending of 0.03 gf cm^2/cm, the order that the Kawabata "
+                   "system gives for dress silk; stretch as the satin's"),
+}  # fmt: skip
+"""Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain."""
+
+
+def fabric_names() -> tuple[str, ...]:
+    """Return the names that `fabric_material` knows."""
+    return ("cotton", *FABRICS)
+
+
+def fabric_material(name: str) -> Material:
+    """Return a named fabric; KeyError if there is no such name.
+
+    With E the stretch stiffness and nu = 0.3, mu h = E / (2 (1 + nu)) and lambda h = E nu / (1 - nu^2), those of
+    plane stress. The thickness h is cotton's: only products with it enter the energies, and the network reads
+    the Lame constants on the scale of a sheet of that thickness.
+    """
+    if name == "cotton":
+        return COTTON
+    fabric, thickness = FABRICS[name], _COTTON["thickness"]
+    values: dict[str, Any] = {
+        "density": np.float32(fabric.density),
+        "lame_mu": np.float32(fabric.stretch_stiffness / (2.0 * (1.0 + _POISSON)) / thickness),
+        "lame_lambda": np.float32(fabric.stretch_stiffness * _POISSON / (1.0 - _POISSON**2) / thickness),
+        "bending_stiffness": np.float32(fabric.bending_stiffness),
+        "thickness": thickness,
+    }
+    return Material(**values)
