@@ -28,6 +28,7 @@ from rich.progress import (
 from rich.table import Table
 
 from eslr_jax.errors import AssetError, EslrError
+from eslr_jax.fit.options import FitOptions
 
 app = tyro.extras.SubcommandApp()
 _stderr = Console(stderr=True)
@@ -61,6 +62,7 @@ def simulate(
     simulator: Literal["network", "physics"] = "network",
     model: str | None = None,
     vertices: Literal["1k", "4k", "10k"] = "1k",
+    fabric: tuple[str, ...] = (),
     frames: int | None = None,
     iterations: int = 100,
     corrector_steps: int = 0,
@@ -71,12 +73,15 @@ def simulate(
     """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
 
     Args:
-        garment: Name of a bundled garment (see `eslr assets`), or a mesh file in the body's rest pose.
+        garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
+            see `eslr fit` where recognition fails.
         motion: Name of a bundled motion, or a motion file.
         body: Name of a bundled body, or a body file.
         simulator: The trained network, or the physics solver.
         model: Name of a bundled network or an exported file; the default network if not given.
         vertices: Resolution of a bundled garment.
+        fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
+            density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
         frames: Simulate this many frames, the start included; all if not given.
         iterations: Solver iterations per frame of the physics simulator.
         corrector_steps: Solver iterations behind the network.
@@ -93,11 +98,14 @@ def simulate(
 
     import numpy as np
 
-    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.assets import load_body, load_garment_file, load_model, load_motion, prepare_stored
     from eslr_jax.assets.load import default_model
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.fabric import garment_material
+    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.io.garment import write_garment_npz
     from eslr_jax.rollout import raise_for_status, rollout_in_chunks
     from eslr_jax.scene import prepare_scene
 
@@ -113,9 +121,13 @@ def simulate(
                 "embedding_size": architecture.embedding_size,
                 "embedding_mode": architecture.embedding_mode,
             }
-        cloth = load_garment(garment, vertices=vertices, body=rig, **options)
+        stored = load_garment_file(garment, vertices=vertices, body=rig)
+        cloth = prepare_stored(stored, name=Path(garment).name, **options)
+        material = garment_material(fabric, cloth, stored)
         poses = pose_body(rig, clip, num_frames=frames)
-        scene = prepare_scene(cloth, poses)
+        scene = prepare_scene(cloth, poses, material=material)
+    if "fit" in stored.metadata:
+        _stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
     config = SimConfig(
         simulator=simulator,
         model=architecture,
@@ -128,6 +140,7 @@ def simulate(
     with _stderr.status("measuring"):
         report = {
             "garment": garment,
+            "fabric": list(fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
             "simulator": simulator,
             "model": model,
@@ -139,6 +152,7 @@ def simulate(
     positions = np.asarray(trajectory.positions)
     with _stderr.status("writing files"):
         _write_motion(out, positions, np.asarray(trajectory.velocities), cloth, rig, poses, report)
+        write_garment_npz(out / "garment.npz", stored)
     if pictures:
         _write_sheet(out, positions, cloth, poses)
     with atomic_write(out / "report.json") as temporary:
@@ -224,8 +238,80 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
 
 
 @app.command
+def fit(
+    garment: tyro.conf.Positional[str],
+    out: Path,
+    body: str = "anny",
+    options: Annotated[FitOptions, tyro.conf.arg(name="")] = FitOptions(),  # noqa: B008 - frozen
+    fabric: tuple[str, ...] = (),
+    picture: bool = True,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Fit a garment of your own to a body once, for `eslr simulate --garment OUT`.
+
+    What is not given is recognised: unit, axes, place, and the pose of the arms. Beside OUT stands a picture,
+    before on the left and after on the right.
+
+    Args:
+        garment: A mesh (obj, ply, stl, glb, npz), or FILE.pkl#NAME of HOOD's garments.
+        out: The garment file to write, such as shirt.npz.
+        body: Name of a bundled body, or a body file.
+        options: What is not left to recognition.
+        fabric: What it is made of, as for `eslr simulate`; kept in the file.
+        picture: Render the picture (extra `render`).
+        json_: Print the report as JSON.
+    """
+    import dataclasses
+
+    from eslr_jax.assets import load_body, load_garment_file, prepare_stored
+    from eslr_jax.fabric import garment_material
+    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.io.garment import write_garment_npz
+
+    if out.suffix != ".npz":
+        raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
+    _use_compile_cache()
+    with _stderr.status("fitting"):
+        rig = load_body(body)
+        stored = load_garment_file(garment, body=rig, fit=options)
+        if "fit" not in stored.metadata:
+            raise AssetError(f"{garment} is fitted already; give it to eslr simulate, or fit its mesh again")
+        stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
+        garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
+    write_garment_npz(out, stored)
+    if picture:
+        _write_before_and_after(out.with_suffix(".png"), stored, rig)
+    report = stored.metadata["fit"]
+    if json_:
+        print(json.dumps(report, indent=2))
+    else:
+        print(describe_fit(report))
+        print(out)
+
+
+def _write_before_and_after(path: Path, stored, rig) -> None:
+    """Render the garment as it came and as it was fitted; without the extra `render` say so and go on."""
+    import numpy as np
+
+    from eslr_jax.errors import MissingExtraError
+    from eslr_jax.render import render_frame, side_by_side, write_png
+
+    body = np.asarray(rig.rest_positions), np.asarray(rig.faces)
+    try:
+        with _stderr.status("rendering"):
+            pictures = [
+                render_frame(*body, positions, stored.faces, camera=25.0, size=(420, 560))
+                for positions in (stored.sewn_positions, stored.rest_positions)
+            ]
+    except MissingExtraError as error:
+        _stderr.print(f"no picture: {error}", markup=False, highlight=False)
+        return
+    write_png(path, side_by_side(pictures, ("before", "after")))
+
+
+@app.command
 def assets(
-    kind: Literal["all", "body", "garment", "motion", "model"] = "all",
+    kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
     verify: bool = False,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
@@ -240,6 +326,9 @@ def assets(
 
     from eslr_jax.assets.catalog import is_intact, list_assets
 
+    if kind == "fabric":
+        _list_fabrics(json_)
+        return
     chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
     if verify:
         damaged = [asset.file for asset in chosen if not is_intact(asset)]
@@ -251,6 +340,31 @@ def assets(
     table = Table("kind", "name", "what", "licence", box=None)
     for asset in chosen:
         table.add_row(asset.kind, asset.name, asset.description, asset.licence)
+    Console().print(table, markup=False)
+
+
+def _list_fabrics(as_json: bool) -> None:
+    """Print the table of fabrics."""
+    import dataclasses
+
+    from eslr_jax.physics.materials import FABRICS, fabric_names
+
+    if as_json:
+        rows = {name: dataclasses.asdict(fabric) for name, fabric in FABRICS.items()}
+        print(json.dumps({"cotton": {"source": "SNUG (Santesteban et al. 2022)"}} | rows, indent=2))
+        return
+    table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
+    table.add_row(
+        "cotton", "0.200", "29", "4.0e-05", "of SNUG, HOOD and the paper", "Santesteban et al. 2022"
+    )
+    for name in fabric_names()[1:]:
+        fabric = FABRICS[name]
+        numbers = (
+            f"{fabric.density:.3f}",
+            f"{fabric.stretch_stiffness:.0f}",
+            f"{fabric.bending_stiffness:.1e}",
+        )
+        table.add_row(name, *numbers, fabric.what, fabric.source)
     Console().print(table, markup=False)
 
 

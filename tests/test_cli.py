@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from garment_files import scanned_tshirt
 
 
 def eslr(*arguments, cwd=None):
@@ -39,7 +40,7 @@ def test_simulate_writes_everything(tmp_path):
     assert report["num_frames"] == 4
     assert json.loads((tmp_path / "report.json").read_text()) == report
     assert {path.name for path in tmp_path.iterdir()} == {
-        "trajectory.npz", "animation.glb", "sheet.png", "report.json",
+        "trajectory.npz", "garment.npz", "animation.glb", "sheet.png", "report.json",
     }  # fmt: skip
 
 
@@ -71,15 +72,53 @@ def test_unwritable_output_is_refused(tmp_path):
 
 
 def test_broken_mesh_is_refused(tmp_path):
-    mesh = trimesh.creation.icosphere(radius=20.0)
-    path = tmp_path / "large.obj"
-    mesh.export(path)
-    refused(eslr("simulate", "--garment", path, "--simulator", "physics", "--out", tmp_path / "out"), "scale")
-    empty = tmp_path / "empty.obj"
-    empty.write_text("")
-    refused(
-        eslr("simulate", "--garment", empty, "--simulator", "physics", "--out", tmp_path / "out"), "empty.obj"
-    )
+    def simulate(path):
+        return eslr("simulate", "--garment", path, "--simulator", "physics", "--out", tmp_path / "out")
+
+    mesh = trimesh.creation.icosphere(radius=2e4)
+    mesh.export(tmp_path / "large.obj")
+    refused(simulate(tmp_path / "large.obj"), "no garment's in m, cm, mm, in")
+    (tmp_path / "empty.obj").write_text("")
+    refused(simulate(tmp_path / "empty.obj"), "empty")
+
+
+def test_fit_refuses_what_it_cannot_do(tmp_path, body):
+    scan = scanned_tshirt(tmp_path / "shirt.obj", body)
+    refused(eslr("fit", scan, "--out", tmp_path / "shirt.obj"), "npz")
+    refused(eslr("fit", scan, "--out", tmp_path / "a.npz", "--pin", "part:collar"), "front", "no such part")
+    refused(eslr("fit", scan, "--out", tmp_path / "a.npz", "--fabric", "denin"), "did you mean denim")
+    assert not (tmp_path / "a.npz").exists()
+
+
+@pytest.mark.slow
+def test_scanned_shirt_to_a_stable_simulation_in_one_command(tmp_path, body):
+    """An OBJ with seams, in centimetres, Z up, 5 mm inside the body: no option but the file."""
+    scan = scanned_tshirt(tmp_path / "shirt.obj", body)
+    result = eslr("simulate", "--garment", scan, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["finite"]
+    assert report["num_frames"] > 100
+    assert report["max_principal_stretch"] < 1.4
+    assert report["penetration_max_mm"] < 1.0
+    assert "inside the body: 19 vertices, 5.0 mm deep, before; 0, 0.0 mm, after" in result.stderr
+
+
+@pytest.mark.slow
+def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
+    scan = scanned_tshirt(tmp_path / "shirt.obj", body)
+    options = ("--pin", "loop:top", "--fabric", "silk", "front:denim", "--json")
+    result = eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["pinned"] > 10
+    assert (tmp_path / "fitted.png").stat().st_size > 10_000
+    run = ("--simulator", "physics", "--frames", 4, "--no-pictures", "--json", "--out", tmp_path / "run")
+    result = eslr("simulate", "--garment", tmp_path / "fitted.npz", *run)
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["fabric"] == ["silk", "front:denim"]
+    assert report["finite"]
+    assert (tmp_path / "run" / "garment.npz").exists()
 
 
 def test_broken_motion_is_refused(tmp_path):

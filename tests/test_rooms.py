@@ -9,11 +9,11 @@ PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 
 # From the top of the house down; a room may import itself and what stands before it.
 ROOMS = [
-    "errors", "types", "config", "numerics", "io", "geometry", "body", "assets", "contact", "physics",
-    "graph", "models", "scene", "simulate", "rollout", "training", "render", "evaluation", "cli",
+    "errors", "types", "config", "numerics", "io", "geometry", "body", "fit", "assets", "contact", "physics",
+    "graph", "models", "fabric", "scene", "simulate", "rollout", "training", "render", "evaluation", "cli",
 ]  # fmt: skip
 KERNELS = {"numerics", "contact", "graph", "models", "physics", "simulate"}
-HOST = {"io", "geometry", "assets", "scene", "rollout", "render", "cli"}
+HOST = {"io", "geometry", "fit", "assets", "fabric", "scene", "rollout", "render", "cli"}
 DOORS = {"jraph": {"graph", "models"}, "orbax": {"training"}, "mitsuba": {"render"}, "flax.linen": {"models"}}
 
 

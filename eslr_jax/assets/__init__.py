@@ -1,7 +1,14 @@
 """What is in the box: a name, or the path of a file, to a body, garment, motion or model."""
 
 from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits
-from eslr_jax.assets.load import load_body, load_garment, load_model, load_motion
+from eslr_jax.assets.load import (
+    load_body,
+    load_garment,
+    load_garment_file,
+    load_model,
+    load_motion,
+    prepare_stored,
+)
 
 __all__ = [
     "Asset",
@@ -10,7 +17,9 @@ __all__ = [
     "list_assets",
     "load_body",
     "load_garment",
+    "load_garment_file",
     "load_model",
     "load_motion",
     "load_splits",
+    "prepare_stored",
 ]

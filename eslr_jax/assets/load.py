@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from eslr_jax.assets.cache import cached_arrays, content_key
 from eslr_jax.assets.catalog import asset_names, find_asset
 from eslr_jax.body.motion import Motion
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.geometry.skinning import transfer_skin_weights
-from eslr_jax.geometry.validate import validate_mesh, validate_orientation
+from eslr_jax.fit.fit import fit_garment
+from eslr_jax.fit.options import FitOptions
+from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.io.body import read_body
-from eslr_jax.io.garment import read_garment_npz
-from eslr_jax.io.mesh import read_mesh
+from eslr_jax.io.garment import (
+    GarmentFile,
+    garment_arrays,
+    garment_from_arrays,
+    is_garment_file,
+    read_garment_npz,
+    read_garment_source,
+)
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
 Resolution = Literal["1k", "4k", "10k"]
-
-_SKIN_SMOOTHING = 3  # Laplacian steps over transferred skin weights, as for the bundled shirts
 
 
 def _is_path(name: str) -> bool:
@@ -49,55 +55,107 @@ def load_garment(
     *,
     vertices: Resolution = "1k",
     body: Body | None = None,
+    fit: FitOptions | None = None,
     pad: bool = False,
+    cache: bool = True,
     **options: Any,
 ) -> Garment:
-    """Load a garment and prepare it for simulation.
+    """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation.
 
     Args:
-        name: Name of a bundled garment, or path of a mesh (obj, ply, stl, glb) in the body's rest pose, or of
-            an npz file in the bundled format.
+        name: Name of a bundled garment; or path of a file that `eslr fit` wrote; or of a mesh (obj, ply, stl,
+            glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`), which is fitted first.
         vertices: Resolution of a bundled garment.
-        body: Body whose skin weights a mesh file takes over; the bundled one by default.
+        body: Body that a mesh is fitted to; the bundled one by default.
+        fit: How a mesh is fitted, where that is not left to recognition.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
+        cache: Keep what was computed for the next time.
         options: Passed on to `prepare_garment`.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
+        MeshError: The mesh can't be simulated, or does not fit the body.
+    """
+    stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
+    return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
+
+
+def load_garment_file(
+    name: str | Path = "tshirt",
+    *,
+    vertices: Resolution = "1k",
+    body: Body | None = None,
+    fit: FitOptions | None = None,
+    cache: bool = True,
+) -> GarmentFile:
+    """Load a garment as arrays on the host, fitted to the body if it is a mesh; see `load_garment`."""
+    if not _is_path(str(name)):
+        return read_garment_npz(find_asset("garment", f"{name}_{vertices}"))
+    path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
+    if path.is_file() and is_garment_file(path):
+        return read_garment_npz(path)
+    source = read_garment_source(name)
+    rig, options = load_body() if body is None else body, fit or FitOptions()
+    if not cache:
+        return fit_garment(source, rig, options)
+    key = content_key("fit", path.read_bytes(), str(name), options, *_body_arrays(rig))
+    arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
+    return garment_from_arrays(arrays, source.name)
+
+
+def prepare_stored(
+    stored: GarmentFile, *, pad: bool = False, cache: bool = True, name: str = "garment", **options: Any
+) -> Garment:
+    """Prepare a garment file for simulation.
+
+    Args:
+        stored: Of `load_garment_file`.
+        pad: Pad to a bucket of sizes.
+        cache: Keep what was computed for the next time.
+        name: What messages call the garment.
+        options: Passed on to `prepare_garment`.
+
+    Raises:
         MeshError: The mesh can't be simulated.
     """
-    label = Path(name).name
-    if _is_path(str(name)) and Path(name).suffix != ".npz":
-        positions, faces = read_mesh(name)
-        body = load_body() if body is None else body
-        body_rest, body_faces = np.asarray(body.rest_positions), np.asarray(body.faces)
-        validate_mesh(positions, faces, name=label)
-        validate_orientation(positions, faces, body_rest, body_faces)
-        weights, indices = transfer_skin_weights(
-            positions,
-            body_rest,
-            body_faces,
-            np.asarray(body.skin_weights),
-            np.asarray(body.skin_indices),
-            smoothing_steps=_SKIN_SMOOTHING,
-            faces=faces,
+    options.setdefault("allow_components", "fit" in stored.metadata)
+
+    def make() -> dict[str, np.ndarray]:
+        garment = prepare_garment(
+            stored.rest_positions,
+            stored.faces,
+            skin_weights=stored.skin_weights,
+            skin_indices=stored.skin_indices,
+            is_pinned=stored.is_pinned,
+            sewn_positions=stored.sewn_positions,
+            pad=pad,
+            name=name,
+            **options,
         )
-        is_pinned = None
-    else:
-        path = Path(name) if _is_path(str(name)) else find_asset("garment", f"{name}_{vertices}")
-        stored = read_garment_npz(path)
-        positions, faces, is_pinned = stored.rest_positions, stored.faces, stored.is_pinned
-        weights, indices = stored.skin_weights, stored.skin_indices
-    return prepare_garment(
-        positions,
-        faces,
-        skin_weights=weights,
-        skin_indices=indices,
-        is_pinned=is_pinned,
-        pad=pad,
-        name=label,
-        **options,
+        return {field.name: np.asarray(getattr(garment, field.name)) for field in dataclasses.fields(Garment)}
+
+    if not cache:
+        return to_device(Garment(**make()))
+    own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
+    return to_device(
+        Garment(**cached_arrays(content_key("prepare", pad, sorted(options.items()), *own), make))
     )
+
+
+def _body_arrays(body: Body) -> list[np.ndarray]:
+    """Return what of a body a fit depends on."""
+    return [
+        np.asarray(array)
+        for array in (
+            body.rest_positions,
+            body.faces,
+            body.skin_weights,
+            body.skin_indices,
+            body.is_obstacle,
+            body.joint_rest_positions,
+            np.array(body.parents),
+        )
+    ]
 
 
 @lru_cache(maxsize=4)

@@ -11,7 +11,7 @@ from eslr_jax.geometry.skinning import smooth
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
 MAX_DEPTH = 0.06  # [m] that a vertex is taken out from; deeper ones are in another limb
-_MARGIN = 0.15  # [m] around the garment within which body faces count
+_MARGIN = 0.15  # [m] within which distances are exact
 _ROUNDS = 12
 _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
 
@@ -21,8 +21,19 @@ def body_heights(
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
     """Return the exact signed distance of points to the touchable skin [m], and the skin's outward normals.
 
-    The sign is that of the interpolated vertex normal at the closest point.
+    The sign is that of the interpolated vertex normal at the closest point. Beyond `_MARGIN` distances are those
+    to the nearest vertex, and normals zero.
     """
+    heights = posture.heights(points)
+    normals = np.zeros_like(points)
+    close = np.abs(heights) < _MARGIN
+    if close.any():
+        heights[close], normals[close] = _exact_heights(points[close], posture)
+    return heights, normals
+
+
+def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `body_heights` does, for points within its margin."""
     faces = posture.faces[posture.is_obstacle]
     low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
     centers = posture.positions[faces].mean(axis=1)
@@ -80,5 +91,8 @@ def push_out(
         heights[active], normals[active] = body_heights(result[active], posture)
     after = penetration(heights)
     moved = np.linalg.norm(result - positions, axis=1)
-    report = {"moved": int(np.sum(moved > 1e-4)), "moved_max_mm": round(float(moved.max(initial=0.0)) * 1e3, 3)}
+    report = {
+        "moved": int(np.sum(moved > 1e-4)),
+        "moved_max_mm": round(float(moved.max(initial=0.0)) * 1e3, 3),
+    }
     return result, {"before": before, "after": after, "push_out": report}

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from eslr_jax.errors import MeshError
 from eslr_jax.fit.clearance import push_out
+from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
-from eslr_jax.fit.placement import Axis, Placement, Unit, find_placement
+from eslr_jax.fit.placement import Placement, find_placement
 from eslr_jax.fit.postures import Posture, arm_postures, rest_posture, unpose
 from eslr_jax.fit.remesh import remesh
 from eslr_jax.geometry.repair import (
-    WELD_TOLERANCE,
     Cleaned,
     consistent_orientation,
     join_components,
@@ -22,7 +22,7 @@ from eslr_jax.geometry.repair import (
     weld,
 )
 from eslr_jax.geometry.skinning import transfer_skin_weights
-from eslr_jax.geometry.topology import face_cross_products, vertex_components
+from eslr_jax.geometry.topology import face_areas, face_cross_products, vertex_components
 from eslr_jax.geometry.validate import check_arrays, validate_mesh
 from eslr_jax.io.garment import GarmentFile, GarmentSource
 from eslr_jax.types import Body
@@ -31,40 +31,6 @@ _SMOOTHING = 3  # Laplacian steps over transferred skin weights, as for the bund
 _LOOSE_SMOOTHING = 20  # for skirts, or the two legs tear them, as for the bundled dresses
 _LOOSE = 0.05  # [m] from the body; with a tenth of the vertices farther away a garment is loose
 _MAX_COORDINATE = 1e6  # beyond which no unit makes a garment
-_JOIN_GAP = 0.01  # [m] across which parts are joined: a seam allowance
-
-
-@dataclasses.dataclass(frozen=True)
-class FitOptions:
-    """What is not left to recognition.
-
-    Attributes:
-        units: Unit of the file, or metres per unit.
-        up: The file's axis that points up.
-        front: The file's axis that the wearer faces.
-        keep_place: Do not move the garment along the body; its origin is the body's.
-        arms: Recognise the pose of the arms that the garment was modelled in, or take the body's rest pose.
-        components: What becomes of separate parts: keep them, join their open edges, keep the largest, or
-            refuse them.
-        join_gap: Distance across which `join` sews parts together [m].
-        weld: Distance within which the vertices of open edges are one, relative to the garment's size.
-        edge_length: Remesh to this mean edge length [m] (extra `remesh`).
-        pin: Vertices that follow the body: vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or
-            loop:top|bottom|left|right|front|back.
-        push_out: Move vertices that lie inside the body out of it.
-    """
-
-    units: Unit | float = "auto"
-    up: Axis = "auto"
-    front: Axis = "auto"
-    keep_place: bool = False
-    arms: Literal["auto", "rest"] = "auto"
-    components: Literal["keep", "join", "largest", "refuse"] = "keep"
-    join_gap: float = _JOIN_GAP
-    weld: float = WELD_TOLERANCE
-    edge_length: float | None = None
-    pin: tuple[str, ...] = ()
-    push_out: bool = True
 
 
 def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = None) -> GarmentFile:
@@ -88,8 +54,9 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
     options = options or FitOptions()
     mesh, name = source.mesh, source.name
     check_arrays(mesh.positions, mesh.faces, name=name)
-    if np.abs(mesh.positions).max() > _MAX_COORDINATE:
-        raise MeshError(f"{name}: coordinates up to {np.abs(mesh.positions).max():.3g} are no garment's; check it")
+    largest = float(np.abs(mesh.positions).max())
+    if largest > _MAX_COORDINATE:
+        raise MeshError(f"{name}: coordinates up to {largest:.3g} are no garment's; check the file")
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(body) if options.arms == "auto" else [rest_posture(body)]
     placement = find_placement(
@@ -158,8 +125,10 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
 def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
     """Weld open edges and say what became of the mesh."""
     clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
-    if not len(clean.faces):
-        raise MeshError("no face is left once coincident vertices are one; check the mesh, or the weld distance")
+    if not face_areas(clean.positions, clean.faces).sum() > 0:
+        raise MeshError(
+            "no face with an area is left once coincident vertices are one; check the mesh, or the weld distance"
+        )
     num_used = len(np.unique(faces))
     report = {
         "source_vertices": len(positions),

@@ -11,8 +11,17 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.topology import boundary_loops
 
 _COMPARISON = re.compile(r"\s*([xyz])\s*([<>])\s*(-?[\d.]+(?:e-?\d+)?)\s*")
-_SIDES = {"top": (1, 1), "bottom": (1, -1), "left": (0, 1), "right": (0, -1), "front": (2, 1), "back": (2, -1)}
-PIN_FORMS = "vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or loop:top|bottom|left|right|front|back"
+_SIDES = {
+    "top": (1, 1),
+    "bottom": (1, -1),
+    "left": (0, 1),
+    "right": (0, -1),
+    "front": (2, 1),
+    "back": (2, -1),
+}
+PIN_FORMS = (
+    "vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or loop:top|bottom|left|right|front|back"
+)
 
 
 def select_vertices(
@@ -45,7 +54,9 @@ def select_vertices(
         chosen[_numbered(text, rest, vertex_map)] = True
     elif kind == "part":
         if face_parts is None or rest not in part_names:
-            raise ConfigError(f"pin {text!r}: there is no such part; parts: {', '.join(part_names) or 'none'}")
+            raise ConfigError(
+                f"pin {text!r}: there is no such part; parts: {', '.join(part_names) or 'none'}"
+            )
         chosen[faces[face_parts == part_names.index(rest)]] = True
     elif kind == "region":
         chosen = _region(text, rest, positions)
@@ -91,9 +102,8 @@ def _loop(text: str, rest: str, positions: np.ndarray, faces: np.ndarray) -> np.
         axis, sign = _SIDES[rest]
         return max(loops, key=lambda loop: sign * positions[loop, axis].mean())
     if not rest.isdigit() or int(rest) >= len(loops):
-        raise ConfigError(
-            f"pin {text!r}: the garment has the open edges 0 to {len(loops) - 1}; or name one of {', '.join(_SIDES)}"
-        )
+        sides = ", ".join(_SIDES)
+        raise ConfigError(f"pin {text!r}: there are open edges 0 to {len(loops) - 1}; or name one of {sides}")
     return loops[int(rest)]
 
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import MeshError
+from eslr_jax.fit.options import Axis, Unit
 from eslr_jax.fit.postures import Posture
 from eslr_jax.geometry.topology import face_areas, vertex_areas
-
-Unit = Literal["auto", "m", "cm", "mm", "in"]
-Axis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}  # metres per unit
 _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from a scarf to a long coat
@@ -22,14 +19,24 @@ _SAMPLES = 160  # garment points whose distances are looked at
 _INSIDE, _MAX_INSIDE = 0.01, 0.06  # [m] of depth that costs one, and beyond which nothing more is learnt
 _OUTSIDE, _MAX_OUTSIDE = 0.05, 0.10  # [m] likewise outside, where cloth may hang loose
 _SLIDE_STEP = 0.04  # [m] between tried heights
-_MISFIT = 2.2  # mean cost above which nothing was recognised: most points are at a limit
+_MISFIT = 1.7  # mean cost above which nothing was recognised; 2 is a garment in the air, a wide dress has 1.4
 # What is usual costs less: factors on the mean cost.
-_FEET, _SLID = 1.1, 1.4  # origin on the floor between the feet; origin anywhere
+_FEET, _SLID = 1.1, 1.25  # origin on the floor between the feet; origin anywhere
 _TURNED = 1.3  # facing elsewhere than its up axis makes usual
 _RAISED = 1.05  # arms at another angle than the body's
 _INCHES = 1.1
-_GOOD = 0.5  # mean cost of a garment as it is, below which no other place is tried
-_VECTORS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+_GOOD = (
+    1.5  # mean cost of a known place beyond which the garment is moved along the body to look for a better
+)
+_LIMBS_INSIDE = 0.03  # share of points deep inside the body, likewise: a limb pierces a garment out of place
+_VECTORS = {
+    "x": (1, 0, 0),
+    "y": (0, 1, 0),
+    "z": (0, 0, 1),
+    "-x": (-1, 0, 0),
+    "-y": (0, -1, 0),
+    "-z": (0, 0, -1),
+}
 _USUAL_FRONT = {"y": "z", "z": "-y", "x": "y", "-y": "z", "-z": "-y", "-x": "y"}
 
 
@@ -80,24 +87,27 @@ def find_placement(
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits.
     """
+    factors = _factors(positions, units, name)
     sample = _sample(positions, faces)
     tried = []
-    for factor, (rotation, axes, is_usual) in itertools.product(
-        _factors(positions, units, name), _rotations(up, front)
-    ):
+    for factor, (rotation, axes, is_usual) in itertools.product(factors, _rotations(up, front)):
         turned = factor * sample @ rotation.T
-        base = (1.0 if is_usual else _TURNED) * (_INCHES if factor == UNITS["in"] and units == "auto" else 1.0)
+        base = (1.0 if is_usual else _TURNED) * (
+            _INCHES if factor == UNITS["in"] and units == "auto" else 1.0
+        )
         for k, posture in enumerate(postures):
             weight = base * (1.0 if k == 0 else _RAISED)
             for offset, extra in _known_places(posture, keep_place):
                 cost = weight * extra * _cost(posture.heights(turned + offset))
                 tried.append((cost, Placement(factor, rotation, offset, k, *axes, cost)))
     best = min(tried, key=lambda item: item[0])[1]
-    if best.cost > _GOOD and not keep_place:
+    deep = float(np.mean(postures[best.posture].heights(best.apply(sample)) < -_INSIDE))
+    if not keep_place and (best.cost > _GOOD or deep > _LIMBS_INSIDE):
         best = min([best, *_slide(sample, tried, postures)], key=lambda placement: placement.cost)
-    if best.cost > _MISFIT:
+    misfit = _cost(postures[best.posture].heights(best.apply(sample)))
+    if misfit > _MISFIT:
         raise MeshError(
-            f"{name}: does not fit the body in any unit, axis or place (the best is off by {best.cost:.1f} of "
+            f"{name}: does not fit the body in any unit, axis or place (the best is off by {misfit:.1f} of "
             f"{_MISFIT}); give --units, --up and --front, or move it onto the body and give --keep-place"
         )
     return best
@@ -111,7 +121,9 @@ def _known_places(posture: Posture, keep_place: bool) -> list[tuple[np.ndarray, 
     return places
 
 
-def _slide(sample: np.ndarray, tried: list[tuple[float, Placement]], postures: list[Posture]) -> list[Placement]:
+def _slide(
+    sample: np.ndarray, tried: list[tuple[float, Placement]], postures: list[Posture]
+) -> list[Placement]:
     """Move the garment along the body, for each orientation in the two extreme postures; refine the best."""
     orientations = {(p.factor, p.up, p.front): p for _, p in tried}
     angles = [90.0 if posture.arm_angle is None else posture.arm_angle for posture in postures]

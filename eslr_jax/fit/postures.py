@@ -70,7 +70,8 @@ def arm_postures(body: Body) -> list[Posture]:
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
     posed = np.asarray(skin_garment(body, transforms), np.float64)
     turned = [
-        _posture(body, posed[k], np.asarray(transforms[k], np.float64), angle) for k, angle in enumerate(angles)
+        _posture(body, posed[k], np.asarray(transforms[k], np.float64), angle)
+        for k, angle in enumerate(angles)
     ]
     return [rest_posture(body), *turned]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -44,7 +47,15 @@ def remesh(
             'remeshing needs pyacvd, which is not installed: pip install "eslr-jax[remesh]"'
         ) from error
     source = pyvista.PolyData.from_regular_faces(positions, faces)
-    clustering = pyacvd.Clustering(source)
+    with warnings.catch_warnings():  # pyacvd 0.4 reads an attribute that pyvista 0.49 deprecates
+        warnings.simplefilter("ignore")
+        return _clusterings(pyacvd.Clustering(source), positions, faces, count, edge_length)
+
+
+def _clusterings(
+    clustering: Any, positions: np.ndarray, faces: np.ndarray, count: int, edge_length: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cluster until a clean mesh comes out; see `remesh`."""
     clustering.subdivide(max(1, min(4, int(np.ceil(np.log(25 * count / len(positions)) / np.log(4.0))))))
     cause = ""
     for attempt in range(_ATTEMPTS):
@@ -60,15 +71,21 @@ def remesh(
             continue
         nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
         return points, triangles, nearest
-    raise MeshError(f"no clean mesh with edges of {edge_length:g} m was found ({cause}); choose another length")
+    raise MeshError(
+        f"no clean mesh with edges of {edge_length:g} m was found ({cause}); choose another length"
+    )
 
 
-def _oriented(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _oriented(
+    points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
     """Turn triangles so that they face where the source does."""
     turn = consistent_orientation(points, triangles)
     triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
     nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
-    agreement = np.sum(face_cross_products(points, triangles) * face_cross_products(positions, faces)[nearest])
+    agreement = np.sum(
+        face_cross_products(points, triangles) * face_cross_products(positions, faces)[nearest]
+    )
     return triangles if agreement > 0 else np.ascontiguousarray(triangles[:, ::-1])
 
 
@@ -82,7 +99,9 @@ def _onto_open_edges(
         if not loops:
             break
         middle = points[loop].mean(axis=0)
-        target = positions[min(loops, key=lambda other: np.linalg.norm(positions[other].mean(axis=0) - middle))]
+        target = positions[
+            min(loops, key=lambda other: np.linalg.norm(positions[other].mean(axis=0) - middle))
+        ]
         start, end = target, np.roll(target, -1, axis=0)
         along = end - start
         share = np.einsum("lsx,sx->ls", points[loop][:, None] - start, along) / np.sum(along**2, axis=1)

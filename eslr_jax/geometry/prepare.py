@@ -61,9 +61,9 @@ def prepare_garment(
     positions = np.asarray(rest_positions, np.float64)
     sewn = positions
     if sewn_positions is not None:
-        validate_mesh(sewn_positions, faces, name=f"{name}, as sewn", allow_components=allow_components)
         sewn = np.asarray(sewn_positions, np.float64)
         _check_sewn(name, positions, sewn)
+        validate_mesh(sewn, faces, name=f"{name}, as sewn", allow_components=allow_components)
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
     is_pinned = np.zeros(num_vertices, bool) if is_pinned is None else np.asarray(is_pinned, bool)

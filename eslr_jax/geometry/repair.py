@@ -12,8 +12,6 @@ from scipy.spatial import KDTree
 
 from eslr_jax.geometry.topology import face_areas, half_edges, vertex_components
 
-WELD_TOLERANCE = 1e-5  # of the bounding box's diagonal: ten micrometres on a shirt, more than text rounds off
-
 
 @dataclasses.dataclass(frozen=True)
 class Cleaned:
@@ -29,7 +27,7 @@ def weld(
     positions: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     *,
-    tolerance: float = WELD_TOLERANCE,
+    tolerance: float = 1e-5,
 ) -> Cleaned:
     """Join coincident vertices of open edges, then drop collapsed and repeated faces and loose vertices.
 

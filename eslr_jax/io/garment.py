@@ -32,7 +32,9 @@ class GarmentFile:
     corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None
     face_parts: Int[np.ndarray, " faces"] | None = None
     part_names: tuple[str, ...] = ()
-    vertex_map: Int[np.ndarray, " source_vertices"] | None = None  # vertex of every source vertex; -1: dropped
+    vertex_map: Int[np.ndarray, " source_vertices"] | None = (
+        None  # vertex of every source vertex; -1: dropped
+    )
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # fabrics, how it was fitted, ...
 
 
@@ -94,7 +96,9 @@ def _read_hood(path: str, name: str) -> GarmentSource:
     if entry.get("node_type") is not None:
         kinds = np.ravel(entry["node_type"])
         if kinds.shape != positions.shape[:1]:
-            raise AssetError(f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices")
+            raise AssetError(
+                f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
+            )
         is_pinned = kinds == _HOOD_PINNED
     return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
 
@@ -107,7 +111,15 @@ def read_garment_npz(path: str | Path) -> GarmentFile:
     Raises:
         AssetError: The file is missing or damaged, or an array is missing or does not fit the others.
     """
-    arrays = read_arrays(path, content="garment")
+    return garment_from_arrays(read_arrays(path, content="garment"), path)
+
+
+def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> GarmentFile:
+    """Return the garment of a file's arrays; see `read_garment_npz`.
+
+    Raises:
+        AssetError: An array is missing or does not fit the others.
+    """
     missing = [
         key for key in ("rest_positions", "faces", "skin_weights", "skin_indices") if key not in arrays
     ]
@@ -156,7 +168,9 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: str | Path) -> None:
         if key not in arrays:
             continue
         array = arrays[key]
-        fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+        fits = array.ndim == len(shape) and all(
+            b in (None, a) for a, b in zip(array.shape, shape, strict=True)
+        )
         if array.dtype.kind not in kinds or not fits:
             raise AssetError(
                 f"garment file {path}: {key} is {array.dtype} {array.shape} for {vertices} vertices and {faces} "
@@ -165,7 +179,9 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: str | Path) -> None:
     if "face_parts" in arrays and arrays["face_parts"].size:
         parts, count = arrays["face_parts"], len(arrays.get("part_names", ()))
         if parts.min() < 0 or parts.max() >= count:
-            raise AssetError(f"garment file {path}: face_parts name part {parts.max()} of {count}; fit it again")
+            raise AssetError(
+                f"garment file {path}: face_parts name part {parts.max()} of {count}; fit it again"
+            )
 
 
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
@@ -174,6 +190,11 @@ def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
     Raises:
         AssetError: The file can't be written.
     """
+    write_arrays(path, garment_arrays(garment), is_compressed=True)
+
+
+def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
+    """Return the arrays that stand in a garment's file."""
     arrays: dict[str, np.ndarray] = {
         "rest_positions": garment.rest_positions.astype(np.float32),
         "faces": garment.faces.astype(np.int32),
@@ -192,4 +213,4 @@ def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
         arrays["vertex_map"] = garment.vertex_map.astype(np.int32)
     if garment.metadata:
         arrays["metadata"] = np.array(json.dumps(garment.metadata))
-    write_arrays(path, arrays, is_compressed=True)
+    return arrays

@@ -34,21 +34,33 @@ class Fabric:
     source: str
 
 
+def _measured(density: float, stretch: float, bending: float, what: str, name: str) -> Fabric:
+    """Return a fabric of the ten that were measured."""
+    return Fabric(density, stretch, bending, what, f"{_WANG}: {name}")
+
+
 FABRICS: dict[str, Fabric] = {
-    "jersey": Fabric(0.187, 68.95, 2.3192e-5, "T-shirt knit, 60 % cotton 40 % polyester", f"{_WANG}: gray interlock"),
-    "rib-knit": Fabric(0.276, 130.3, 4.6242e-5, "95 % cotton 5 % spandex", f"{_WANG}: ivory rib knit"),
-    "sweatshirt": Fabric(0.224, 24.98, 5.9467e-5, "96 % polyester 4 % spandex", f"{_WANG}: navy sparkle sweat"),
-    "ponte": Fabric(0.284, 88.06, 3.6349e-5, "double knit, 60 % polyester 40 % rayon", f"{_WANG}: camel ponte roma"),
-    "swimwear": Fabric(0.204, 209.2, 6.0243e-5, "87 % nylon 13 % spandex", f"{_WANG}: white swim solid"),
-    "satin": Fabric(0.113, 342.8, 1.4289e-5, "100 % polyester", f"{_WANG}: tango red jet set"),
-    "brocade": Fabric(0.228, 489.7, 1.1710e-4, "100 % polyester", f"{_WANG}: pink ribbon brown"),
-    "denim": Fabric(0.324, 2027.8, 6.4198e-5, "11 oz, 99 % cotton 1 % spandex", f"{_WANG}: 11oz black denim"),
-    "crepe": Fabric(0.128, 4055.0, 5.1707e-5, "100 % polyester", f"{_WANG}: white dots on black"),
-    "suiting": Fabric(0.220, 4070.0, 1.2545e-4, "65 % cotton 35 % polyester", f"{_WANG}: royal target"),
-    "silk": Fabric(0.0694, 342.8, 3e-6, "crepe de chine of 16 momme",
-                   "estimate: 1 momme = 4.340 g/m^2; bending of 0.03 gf cm^2/cm, the order that the Kawabata "
-                   "system gives for dress silk; stretch as the satin's"),
-}  # fmt: skip
+    "jersey": _measured(
+        0.187, 68.95, 2.3192e-5, "T-shirt knit, 60 % cotton 40 % polyester", "gray interlock"
+    ),
+    "rib-knit": _measured(0.276, 130.3, 4.6242e-5, "95 % cotton 5 % spandex", "ivory rib knit"),
+    "sweatshirt": _measured(0.224, 24.98, 5.9467e-5, "96 % polyester 4 % spandex", "navy sparkle sweat"),
+    "ponte": _measured(0.284, 88.06, 3.6349e-5, "double knit, 60 % polyester 40 % rayon", "camel ponte roma"),
+    "swimwear": _measured(0.204, 209.2, 6.0243e-5, "87 % nylon 13 % spandex", "white swim solid"),
+    "satin": _measured(0.113, 342.8, 1.4289e-5, "100 % polyester", "tango red jet set"),
+    "brocade": _measured(0.228, 489.7, 1.1710e-4, "100 % polyester", "pink ribbon brown"),
+    "denim": _measured(0.324, 2027.8, 6.4198e-5, "11 oz, 99 % cotton 1 % spandex", "11oz black denim"),
+    "crepe": _measured(0.128, 4055.0, 5.1707e-5, "100 % polyester", "white dots on black"),
+    "suiting": _measured(0.220, 4070.0, 1.2545e-4, "65 % cotton 35 % polyester", "royal target"),
+    "silk": Fabric(
+        0.0694,
+        342.8,
+        3e-6,
+        "crepe de chine of 16 momme",
+        "estimate: 1 momme = 4.340 g/m^2; bending of 0.03 gf cm^2/cm, the order that the Kawabata system gives "
+        "for dress silk; stretch as the satin's",
+    ),
+}
 """Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain."""
 
 

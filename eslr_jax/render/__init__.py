@@ -1,6 +1,6 @@
 """Pictures and video without a display or a GPU (extra `render`)."""
 
 from eslr_jax.render.files import write_png, write_video
-from eslr_jax.render.pictures import contact_sheet, render_frame, render_frames
+from eslr_jax.render.pictures import contact_sheet, render_frame, render_frames, side_by_side
 
-__all__ = ["contact_sheet", "render_frame", "render_frames", "write_png", "write_video"]
+__all__ = ["contact_sheet", "render_frame", "render_frames", "side_by_side", "write_png", "write_video"]

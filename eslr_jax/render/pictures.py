@@ -194,6 +194,17 @@ def contact_sheet(
     return _tile(pictures, columns)
 
 
+def side_by_side(pictures: Sequence[np.ndarray], labels: Sequence[str]) -> np.ndarray:
+    """Return pictures of one size in a row, each with a label in its corner.
+
+    Args:
+        pictures: sRGB pictures, uint8, each of shape [height, width, 3].
+        labels: A short text each.
+    """
+    labelled = [_label(picture, text) for picture, text in zip(pictures, labels, strict=True)]
+    return _tile(labelled, len(labelled))
+
+
 @dataclasses.dataclass(frozen=True)
 class _Moving:
     """A checked mesh over time."""

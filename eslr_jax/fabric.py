@@ -10,7 +10,7 @@ import numpy as np
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.physics.materials import COTTON, FABRICS, fabric_material, fabric_names
+from eslr_jax.physics.materials import COTTON, fabric_material, fabric_names
 from eslr_jax.types import Garment, Material
 
 _NUMBERS = tuple(field.name for field in dataclasses.fields(Material))
@@ -59,7 +59,8 @@ def parse_fabric(text: str) -> Material:
         if text not in fabric_names():
             close = difflib.get_close_matches(text, fabric_names(), n=1)
             hint = f"did you mean {close[0]}? " if close else ""
-            raise ConfigError(f"no fabric {text!r}: {hint}there are {', '.join(fabric_names())}; or {FABRIC_FORMS}")
+            known = ", ".join(fabric_names())
+            raise ConfigError(f"no fabric {text!r}: {hint}there are {known}; or write {FABRIC_FORMS}")
         return fabric_material(text)
     values = {}
     for word in text.split(","):

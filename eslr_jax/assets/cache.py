@@ -1,0 +1,78 @@
+"""Results that take seconds to make, kept on disk by what they were made of.
+
+An entry's name is a hash of its inputs and of the code that made it, so it is never out of date. It appears
+whole or not at all, so two processes may make the same one at once; the last one stays. A cache that can't be
+written or read costs time and nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.errors import AssetError
+from eslr_jax.io.npz import read_arrays, write_arrays
+
+MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
+_CODE = ("geometry", "fit", "io/mesh.py", "io/garment.py", "types.py")  # whose changes make entries worthless
+
+
+def cache_folder() -> Path:
+    """Return the folder of the cache; it need not exist."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax" / "garments"
+
+
+@cache
+def _code_hash() -> bytes:
+    """Return a hash of the code behind the entries."""
+    package = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for name in _CODE:
+        path = package / name
+        for file in sorted(path.glob("*.py")) if path.is_dir() else [path]:
+            digest.update(file.read_bytes())
+    return digest.digest()
+
+
+def content_key(*parts: Any) -> str:
+    """Return a hash of arrays, bytes, paths' contents are the caller's, and of the representation of the rest."""
+    digest = hashlib.sha256(_code_hash())
+    for part in parts:
+        if isinstance(part, bytes):
+            digest.update(b"b" + len(part).to_bytes(8, "little") + part)
+        elif hasattr(part, "dtype"):
+            array = np.ascontiguousarray(part)
+            digest.update(f"a{array.dtype}{array.shape}".encode() + array.tobytes())
+        else:
+            digest.update(f"r{part!r}".encode())
+    return digest.hexdigest()
+
+
+def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays of an entry, made and kept if there is none."""
+    path = cache_folder() / f"{key}.npz"
+    if path.exists():
+        with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again
+            arrays = read_arrays(path, content="cache")
+            os.utime(path)
+            return arrays
+    arrays = make()
+    with contextlib.suppress(AssetError, OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_arrays(path, arrays)
+        _remove_oldest(path.parent)
+    return arrays
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Remove the entries beyond `MAX_ENTRIES` that were not used for longest."""
+    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+    for path in entries[:-MAX_ENTRIES]:
+        path.unlink(missing_ok=True)

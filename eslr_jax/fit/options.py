@@ -1,0 +1,45 @@
+"""What a user may say about a garment; importing it does no work, for the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+Unit = Literal["auto", "m", "cm", "mm", "in"]
+Axis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+
+WELD_TOLERANCE = 1e-5  # of the bounding box's diagonal: ten micrometres on a shirt, more than text rounds off
+_JOIN_GAP = 0.01  # [m] across which parts are joined: a seam allowance
+
+
+@dataclasses.dataclass(frozen=True)
+class FitOptions:
+    """What is not left to recognition.
+
+    Attributes:
+        units: Unit of the file, or metres per unit.
+        up: The file's axis that points up.
+        front: The file's axis that the wearer faces.
+        keep_place: Do not move the garment along the body; its origin is the body's.
+        arms: Recognise the pose of the arms that the garment was modelled in, or take the body's rest pose.
+        components: What becomes of separate parts: keep them, join their open edges, keep the largest, or
+            refuse them.
+        join_gap: Distance across which `join` sews parts together [m].
+        weld: Distance within which the vertices of open edges are one, relative to the garment's size.
+        edge_length: Remesh to this mean edge length [m] (extra `remesh`).
+        pin: Vertices that follow the body: vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or
+            loop:top|bottom|left|right|front|back.
+        push_out: Move vertices that lie inside the body out of it.
+    """
+
+    units: Unit | float = "auto"
+    up: Axis = "auto"
+    front: Axis = "auto"
+    keep_place: bool = False
+    arms: Literal["auto", "rest"] = "auto"
+    components: Literal["keep", "join", "largest", "refuse"] = "keep"
+    join_gap: float = _JOIN_GAP
+    weld: float = WELD_TOLERANCE
+    edge_length: float | None = None
+    pin: tuple[str, ...] = ()
+    push_out: bool = True

@@ -1,0 +1,112 @@
+"""Garments of a user through the front door: fitted once, kept by content, safe with two processes."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from garment_files import bundled, scanned_tshirt
+
+from eslr_jax.assets import load, load_garment, load_garment_file
+from eslr_jax.assets.cache import cache_folder, cached_arrays, content_key
+from eslr_jax.fit.options import FitOptions
+from eslr_jax.io.garment import write_garment_npz
+
+
+@pytest.fixture
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return cache_folder()
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory, body):
+    return scanned_tshirt(tmp_path_factory.mktemp("scan") / "shirt.obj", body)
+
+
+def test_second_load_computes_nothing(empty_cache, scan, body, monkeypatch):
+    first = load_garment(scan, body=body)
+    assert len(list(empty_cache.iterdir())) == 2
+    monkeypatch.setattr(load, "fit_garment", None)
+    monkeypatch.setattr(load, "prepare_garment", None)
+    again = load_garment(scan, body=body)
+    for name in first.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    with pytest.raises(TypeError):
+        load_garment(scan, body=body, fit=FitOptions(pin=("loop:top",)))  # other options, another entry
+    with pytest.raises(TypeError):
+        load_garment(scan, body=body.replace(rest_positions=body.rest_positions * 1.01))  # another body
+
+
+def test_changed_file_and_damaged_entry_are_made_again(empty_cache, tmp_path, body):
+    path = tmp_path / "tank.npz"
+    garment = bundled("tank_1k")
+    np.savez(path, positions=garment.rest_positions, faces=garment.faces)
+    first = load_garment_file(path, body=body)
+    (entry,) = empty_cache.iterdir()
+    entry.write_bytes(entry.read_bytes()[:1000])
+    again = load_garment_file(path, body=body)
+    np.testing.assert_allclose(first.rest_positions, again.rest_positions, atol=1e-6)
+    np.savez(path, positions=garment.rest_positions + np.array([0, 0.01, 0]), faces=garment.faces)
+    moved = load_garment_file(path, body=body)
+    np.testing.assert_allclose(moved.sewn_positions[:, 1] - again.sewn_positions[:, 1], 0.01, atol=1e-6)
+
+
+def test_unwritable_cache_costs_only_time(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cached_arrays(content_key("x"), lambda: {"a": np.ones(2)})["a"].tolist() == [1, 1]
+
+
+def test_keys_tell_contents_apart():
+    contents = [
+        (b"ab", b"c"),
+        (b"a", b"bc"),
+        (np.zeros(2),),
+        (np.zeros((1, 2)),),
+        (np.zeros(2, np.float32),),
+        ("a",),
+        (FitOptions(),),
+        (FitOptions(units="cm"),),
+    ]
+    keys = {content_key(*parts) for parts in contents}
+    assert len(keys) == 8
+    assert content_key(np.zeros(2), "a") == content_key(np.zeros(2), "a")
+
+
+def test_two_processes_may_make_the_same_entry(empty_cache):
+    code = (
+        "import numpy as np; from eslr_jax.assets.cache import cached_arrays\n"
+        "for k in range(40):\n"
+        "    a = cached_arrays(f'{k:064d}', lambda: {'a': np.full((200, 200), k, float)})['a']\n"
+        "    assert a.shape == (200, 200) and (a == k).all()"
+    )
+    workers = [subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE) for _ in range(2)]
+    for worker in workers:
+        _, errors = worker.communicate(timeout=60)
+        assert worker.returncode == 0, errors
+    assert len(list(empty_cache.iterdir())) == 40
+
+
+def test_fitted_file_is_taken_as_it_is(empty_cache, tmp_path, scan, body):
+    fitted = load_garment_file(scan, body=body)
+    write_garment_npz(tmp_path / "fitted.npz", fitted)
+    again = load_garment_file(tmp_path / "fitted.npz")
+    np.testing.assert_allclose(again.rest_positions, fitted.rest_positions, atol=1e-6)
+    assert again.metadata == fitted.metadata
+    assert not any(path.suffix == ".tmp" for path in empty_cache.iterdir())
+
+
+@pytest.mark.slow
+def test_4k_garment_is_quick(empty_cache, tmp_path, body):
+    import time
+
+    garment = bundled("tshirt_4k")
+    np.savez(tmp_path / "shirt.npz", positions=garment.rest_positions * 100, faces=garment.faces)
+    times = []
+    for _ in range(2):
+        began = time.process_time()
+        load_garment(tmp_path / "shirt.npz", body=body)
+        times.append(time.process_time() - began)
+    assert times[0] < 5.0
+    assert times[1] < 1.0

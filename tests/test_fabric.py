@@ -1,0 +1,96 @@
+"""Fabrics by name, by numbers, per part; and what they do in the energies."""
+
+import numpy as np
+import pytest
+from garment_files import bundled
+
+from eslr_jax.assets import prepare_stored
+from eslr_jax.errors import ConfigError
+from eslr_jax.fabric import garment_material, parse_fabric
+from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.materials import COTTON, FABRICS, fabric_material, fabric_names
+from eslr_jax.physics.membrane import stretch_energy
+
+
+@pytest.fixture(scope="module")
+def two_fabrics():
+    import dataclasses
+
+    stored = bundled("tshirt_1k")
+    side = (stored.rest_positions[stored.faces].mean(axis=1)[:, 0] > 0).astype(int)
+    stored = dataclasses.replace(stored, face_parts=side, part_names=("right", "left"))
+    return stored, prepare_stored(stored)
+
+
+def test_every_fabric_has_a_source_and_plausible_values():
+    assert {"cotton", "denim", "silk"} <= set(fabric_names())
+    for name in fabric_names():
+        material = fabric_material(name)
+        assert 0.02 < material.density < 0.7
+        assert 1e-6 < material.bending_stiffness < 1e-3
+        assert 0 < material.lame_mu * material.thickness < 5e3
+    assert all(fabric.source for fabric in FABRICS.values())
+
+
+@pytest.mark.parametrize("name", list(FABRICS))
+def test_uniaxial_tension_has_the_measured_stiffness(name):
+    """Plane stress: E h = 4 mu h (mu + lambda) / (2 mu + lambda)."""
+    material, fabric = fabric_material(name), FABRICS[name]
+    mu, lame = (
+        float(value) * float(material.thickness) for value in (material.lame_mu, material.lame_lambda)
+    )
+    assert 4 * mu * (mu + lame) / (2 * mu + lame) == pytest.approx(fabric.stretch_stiffness, rel=1e-5)
+
+
+def test_fabric_by_numbers():
+    material = parse_fabric("density=0.3, bending_stiffness=1e-5")
+    assert material.density == np.float32(0.3)
+    assert material.bending_stiffness == np.float32(1e-5)
+    assert material.lame_mu == COTTON.lame_mu
+
+
+def test_fabric_per_part(two_fabrics):
+    stored, garment = two_fabrics
+    material = garment_material(["silk", "left:denim"], garment, stored)
+    silk, denim = fabric_material("silk"), fabric_material("denim")
+    left = stored.face_parts == 1
+    np.testing.assert_array_equal(material.lame_mu, np.where(left, denim.lame_mu, silk.lame_mu))
+    x = np.asarray(garment.rest_positions)[:, 0]
+    assert np.all(material.density[x > 0.06] == denim.density)
+    assert np.all(material.density[x < -0.06] == silk.density)
+    both = (material.bending_stiffness > silk.bending_stiffness * 1.01) & (
+        material.bending_stiffness < denim.bending_stiffness * 0.99
+    )
+    assert 20 < both.sum() < 200  # hinges along the seam have the mean
+    areas = np.asarray(garment.rest_areas)
+    expected = areas[left].sum() * denim.density + areas[~left].sum() * silk.density
+    assert float(np.sum(vertex_masses(garment, material))) == pytest.approx(float(expected), rel=1e-5)
+    stretched = garment.rest_positions * 1.1
+    parts = [
+        float(stretch_energy(stretched, garment.replace(rest_areas=np.where(mask, areas, 0.0)), fabric))
+        for mask, fabric in ((left, denim), (~left, silk))
+    ]
+    assert float(stretch_energy(stretched, garment, material)) == pytest.approx(sum(parts), rel=1e-4)
+
+
+def test_fabric_of_the_file_is_the_default(two_fabrics):
+    import dataclasses
+
+    stored, garment = two_fabrics
+    stored = dataclasses.replace(stored, metadata={"fabrics": ["satin"]})
+    assert garment_material((), garment, stored).density == fabric_material("satin").density
+    assert garment_material(("denim",), garment, stored).density == fabric_material("denim").density
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("denin", "did you mean denim"),
+    ("weight=3", "'weight' is none of density"),
+    ("density=heavy", "is no number"),
+    ("density=-1", "must be positive"),
+    ("density=nan", "must be positive"),
+    ("collar:silk", "no part 'collar'; parts: right, left"),
+])  # fmt: skip
+def test_unknown_fabrics_are_named(two_fabrics, text, message):
+    stored, garment = two_fabrics
+    with pytest.raises(ConfigError, match=message):
+        garment_material([text], garment, stored)
