@@ -406,6 +406,7 @@ def train(
     config: Path | None = None,
     set_: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = (),
     resume: bool = False,
+    start_from: str | None = None,
     tensorboard: bool = False,
     coordinator: str | None = None,
     num_processes: int | None = None,
@@ -421,13 +422,16 @@ def train(
         config: TOML file of a training configuration; not needed with --resume.
         set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
         resume: Go on from the newest checkpoint of the folder.
+        start_from: Name of a bundled network or an exported file whose weights to start from.
         tensorboard: Write event files for TensorBoard too.
         coordinator: Address of the first process as HOST:PORT, or "auto" under Slurm.
         num_processes: Number of processes; not needed with "auto".
         process_id: Number of this process, from 0; not needed with "auto".
     """
+    from eslr_jax.assets import load_model
     from eslr_jax.config import parse_override
     from eslr_jax.errors import ConfigError
+    from eslr_jax.models.registry import check_params
     from eslr_jax.training.checkpoint import read_run_config
     from eslr_jax.training.loop import train as run
     from eslr_jax.training.plot import plot_curves
@@ -440,10 +444,14 @@ def train(
     else:
         chosen = load_recipe(config, dict(parse_override(text) for text in set_))
     _use_compile_cache()
+    initial = None
+    if start_from is not None and not resume:
+        initial, _ = load_model(start_from)
+        check_params(chosen.model, initial)
     if coordinator is not None:
         _join_processes(coordinator, num_processes, process_id)
     with _training_progress(chosen.iterations, out if tensorboard else None) as show:
-        state = run(chosen, out, resume=resume, on_progress=show)
+        state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
     if _is_other_process():
         return
     plot_curves(out)

@@ -154,7 +154,17 @@ def _excesses(params: Any, scene, config: SimConfig, every: int) -> tuple[Excess
     for weights, simulator in ((None, truth), (params, config)):
         trajectory = simulate_scene(weights, scene, parameters, simulator)
         measured.append(
-            jax.device_get(measure_excess(params, trajectory, scene, parameters, config, every=every))
+            jax.device_get(
+                measure_excess(
+                    params,
+                    trajectory,
+                    scene,
+                    parameters,
+                    config,
+                    every=every,
+                    corrector_steps=(config.corrector_steps,),
+                )
+            )
         )
     return measured[0], measured[1]
 
@@ -178,7 +188,7 @@ def _summarize(measured: list[Excess]) -> dict[str, Any]:
         }
 
     lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}
-    return {"frames": len(optimum), **medians(join(lambda entry: entry.model)), "lbfgs": lbfgs}
+    return {"frames": len(optimum), **medians(join(lambda entry: next(iter(entry.corrected.values())))), "lbfgs": lbfgs}
 
 
 def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:

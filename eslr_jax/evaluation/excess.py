@@ -27,8 +27,8 @@ class Excess(NamedTuple):
 
     start: Float[Array, " frames"]  # at the pushed-out inertial guess
     optimum: Float[Array, " frames"]
-    model: Float[Array, " frames"] | None
-    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations
+    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from that start
+    corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
 
 
 def trajectory_states(
@@ -51,7 +51,7 @@ def trajectory_states(
     return states, inputs
 
 
-@partial(jax.jit, static_argnames=("config", "every", "iterations"))
+@partial(jax.jit, static_argnames=("config", "every", "iterations", "corrector_steps"))
 def measure_excess(
     params: Any,
     trajectory: Trajectory,
@@ -61,6 +61,7 @@ def measure_excess(
     *,
     every: int = 1,
     iterations: tuple[int, ...] = ITERATIONS,
+    corrector_steps: tuple[int, ...] = (0,),
 ) -> Excess:
     """Compare a model, the solver after few iterations, and the optimum, from the states of a trajectory.
 
@@ -71,9 +72,10 @@ def measure_excess(
         trajectory: Supplies the states.
         scene: The same scene.
         parameters: Physical constants.
-        config: With the model's architecture, and its corrector; static.
+        config: With the model's architecture; static.
         every: Take every so many frames, from the second on; static.
         iterations: L-BFGS iterations to compare with; static.
+        corrector_steps: L-BFGS iterations behind the model; static.
     """
     states, inputs = trajectory_states(trajectory, scene, parameters)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
@@ -87,16 +89,16 @@ def measure_excess(
         problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
         start = start_guess(problem, garment)
         run = partial(solve, problem, garment, material, memory=_MEMORY, tolerance=0.0)
-        model = None
+        corrected = {}
         if params is not None:
             assert config.model is not None
             answer, _ = network_step(params, garment, material, problem, state, config.model)
-            model = run(answer, iterations=config.corrector_steps).value
+            corrected = {count: run(answer, iterations=count).value for count in corrector_steps}
         solver = {count: run(start, iterations=count).value for count in iterations}
         optimum = run(start, iterations=_OPTIMUM_ITERATIONS).value
-        if model is not None:
+        if corrected:
             # The network may start in the basin of a deeper minimum than the solver finds.
             optimum = jnp.minimum(optimum, run(answer, iterations=_OPTIMUM_ITERATIONS).value)
-        return Excess(energy(start, problem), optimum, model, solver)
+        return Excess(energy(start, problem), optimum, solver, corrected)
 
     return jax.lax.map(measure, taken)

@@ -53,7 +53,8 @@ def train(
     state = init_train_state(config, datasets)
     datasets, state = replicate(datasets, mesh), replicate(state, mesh)
     if initial_params is not None:
-        state = state.replace(params=replicate(jax.tree.map(jax.numpy.array, initial_params), mesh))
+        given = replicate(jax.tree.map(jax.numpy.array, initial_params), mesh)
+        state = state.replace(params={**state.params, **given})
     if resume:
         state = checkpoints.restore(state)
         _forget_after(out / "metrics.jsonl", int(state.iteration))

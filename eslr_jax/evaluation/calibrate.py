@@ -1,0 +1,288 @@
+"""What a device can do in how much time: the choice of a simulator for a budget or for a tolerance (host)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+from eslr_jax.assets.catalog import data_folder
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax.evaluation.excess import measure_excess
+from eslr_jax.evaluation.report import environment
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.scene import prepare_scene
+from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.types import Scene
+
+FORMAT = 1
+ITERATIONS = (0, 1, 2, 5, 10, 20, 40, 80, 160)
+SOLVER = "solver"
+_CLIP = "cmu_016_22"  # of the training split, so that the choice has not seen the test clips
+_GARMENTS = ("tshirt", "dress")
+_FRAMES = 60
+_EVERY = 3  # frames between those whose excess is measured
+_TIMED_FRAMES = 20
+_TIMED_ITERATIONS = (10, 60)
+_TURNS = 5  # timings of each, in turns; the fastest counts
+_MARGIN = 2  # iterations allowed for a tolerance, as a multiple of what 99 % of the frames need
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """Cost and error of one way to step a frame, at one size of garment."""
+
+    name: str  # SOLVER, or the name of a bundled network
+    vertices: int
+    fixed_ms: float  # per frame: contacts, and the network's passes
+    iteration_ms: float  # per L-BFGS iteration
+    median: dict[str, float]  # excess relative to the frame's drop after so many iterations
+    p99: dict[str, float]  # the same, not exceeded by 99 % of the frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Measurements of one device."""
+
+    device: str
+    methods: tuple[Method, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What was chosen, and why."""
+
+    method: str
+    iterations: int
+    tolerance: float  # for SimConfig; zero where a budget was given
+    expected_ms: float
+    expected_excess: float  # median, relative to the frame's drop
+    reason: str
+
+
+def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) -> Calibration:
+    """Measure the solver, and the solver behind each network, on this device.
+
+    Args:
+        models: Names of bundled networks.
+        sizes: Resolutions of the garments.
+    """
+    methods = []
+    for size in sizes:
+        scenes = [_scene(name, size) for name in _GARMENTS]
+        truths = [
+            simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics")) for scene in scenes
+        ]
+        for model in (None, *models):
+            methods.append(_measure(model, scenes, truths))
+    return Calibration(device_name(), tuple(methods))
+
+
+def _scene(garment: str, size: str) -> Scene:
+    body = load_body()
+    poses = pose_body(body, load_motion(_CLIP), num_frames=_FRAMES)
+    return prepare_scene(load_garment(garment, vertices=size), poses)  # type: ignore[arg-type]
+
+
+def _measure(model: str | None, scenes: list[Scene], truths: list[Any]) -> Method:
+    """Measure one method's error on all scenes and its cost on the first."""
+    parameters = PhysicsParameters()
+    params, config = None, SimConfig(simulator="physics")
+    if model is not None:
+        params, architecture = load_model(model)
+        config = SimConfig(model=architecture)
+    counts = ITERATIONS[1:] if model is None else ITERATIONS
+    relative: dict[int, list[np.ndarray]] = {count: [] for count in counts}
+    for scene, truth in zip(scenes, truths, strict=True):
+        excess = jax.device_get(
+            measure_excess(
+                params,
+                truth,
+                scene,
+                parameters,
+                config,
+                every=_EVERY,
+                iterations=counts if model is None else (),
+                corrector_steps=counts,
+            )
+        )
+        drop = np.maximum(excess.start - excess.optimum, 1e-9)
+        for count, energy in (excess.solver if model is None else excess.corrected).items():
+            relative[count].append(np.maximum(energy - excess.optimum, 0.0) / drop)
+    joined = {count: np.concatenate(parts) for count, parts in relative.items()}
+    times = _times(params, scenes[0], config)
+    low, high = _TIMED_ITERATIONS
+    iteration_ms = (times[high] - times[low]) / (high - low)
+    return Method(
+        name=SOLVER if model is None else model,
+        vertices=int(np.sum(scenes[0].garment.vertex_mask)),
+        fixed_ms=max(times[low] - low * iteration_ms, 0.0),
+        iteration_ms=iteration_ms,
+        median={str(count): float(np.median(values)) for count, values in joined.items()},
+        p99={str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
+    )
+
+
+def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
+    """Return milliseconds per frame with few and with many iterations, measured in turns."""
+    short = scene.replace(
+        body_positions=None if scene.body_positions is None else scene.body_positions[:_TIMED_FRAMES],
+        pin_targets=None if scene.pin_targets is None else scene.pin_targets[:_TIMED_FRAMES],
+        num_frames=_TIMED_FRAMES,
+    )
+    runs = {count: with_iterations(config, count) for count in _TIMED_ITERATIONS}
+    best = dict.fromkeys(runs, np.inf)
+    for turn in range(_TURNS + 1):
+        for count, chosen in runs.items():
+            began = time.perf_counter()
+            jax.block_until_ready(simulate_scene(params, short, PhysicsParameters(), chosen))
+            if turn:  # the first compiles
+                best[count] = min(best[count], time.perf_counter() - began)
+    return {count: seconds * 1e3 / (_TIMED_FRAMES - 1) for count, seconds in best.items()}
+
+
+def with_iterations(config: SimConfig, iterations: int, tolerance: float = 0.0) -> SimConfig:
+    """Return a configuration with so many solver iterations per frame, behind the network if it has one."""
+    name = "solver_iterations" if config.simulator == "physics" else "corrector_steps"
+    return dataclasses.replace(config, **{name: iterations, "tolerance": tolerance})
+
+
+def choose(
+    calibration: Calibration,
+    num_vertices: int,
+    *,
+    budget_ms: float | None = None,
+    tolerance: float | None = None,
+) -> Choice:
+    """Choose a simulator for a time per frame, or for an excess relative to the frame's drop.
+
+    Costs are scaled in proportion to the number of vertices from the size that was measured nearest by.
+
+    Args:
+        calibration: Of this device.
+        num_vertices: Of the garment.
+        budget_ms: Milliseconds per frame to stay within.
+        tolerance: Relative excess to stay below on 99 % of the frames.
+
+    Raises:
+        ConfigError: Neither or both are given, the budget is too small, or the tolerance out of reach.
+    """
+    if (budget_ms is None) == (tolerance is None):
+        raise ConfigError("give either a budget or a tolerance")
+    nearest = min({m.vertices for m in calibration.methods}, key=lambda v: abs(np.log(v / num_vertices)))
+    methods = [
+        dataclasses.replace(
+            method,
+            fixed_ms=method.fixed_ms * num_vertices / nearest,
+            iteration_ms=method.iteration_ms * num_vertices / nearest,
+        )
+        for method in calibration.methods
+        if method.vertices == nearest
+    ]
+    if budget_ms is not None:
+        return _within_budget(methods, budget_ms)
+    assert tolerance is not None
+    return _within_tolerance(methods, tolerance)
+
+
+def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
+    options = []
+    for method in methods:
+        count = int((budget_ms - method.fixed_ms) / method.iteration_ms)
+        count = min(count, ITERATIONS[-1])
+        if count >= min(int(key) for key in method.median):
+            options.append((_interpolate(method.median, count), method, count))
+    if not options:
+        least = min(method.fixed_ms + method.iteration_ms for method in methods)
+        raise ConfigError(f"--budget {budget_ms:g}ms: the fastest frame here takes {least:.1f} ms")
+    options.sort(key=lambda option: option[0])
+    excess, method, count = options[0]
+    others = ", ".join(f"{other.name} {value:.2%}" for value, other, _ in options[1:])
+    return Choice(
+        method=method.name,
+        iterations=count,
+        tolerance=0.0,
+        expected_ms=method.fixed_ms + count * method.iteration_ms,
+        expected_excess=excess,
+        reason=f"least excess within {budget_ms:g} ms" + (f" (others: {others})" if others else ""),
+    )
+
+
+def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
+    options = []
+    for method in methods:
+        counts = range(min(int(key) for key in method.p99), ITERATIONS[-1] + 1)
+        count = next((count for count in counts if _interpolate(method.p99, count) <= tolerance), None)
+        if count is not None:
+            options.append((method.fixed_ms + count * method.iteration_ms, method, count))
+    if not options:
+        best = min(min(method.p99.values()) for method in methods)
+        raise ConfigError(f"--tolerance {tolerance:.3%}: the best that was measured here is {best:.3%}")
+    options.sort(key=lambda option: option[0])
+    cost, method, count = options[0]
+    others = ", ".join(f"{other.name} {value:.1f} ms" for value, other, _ in options[1:])
+    return Choice(
+        method=method.name,
+        iterations=max(_MARGIN * count, 1),
+        tolerance=tolerance,
+        expected_ms=cost,
+        expected_excess=_interpolate(method.median, count),
+        reason=f"fastest below {tolerance:.2%} on 99 % of frames" + (f" (others: {others})" if others else ""),
+    )
+
+
+def _interpolate(curve: dict[str, float], count: int) -> float:
+    """Return the excess after `count` iterations: between measurements its logarithm is linear."""
+    counts = sorted(int(key) for key in curve)
+    values = [np.log(max(curve[str(key)], 1e-7)) for key in counts]
+    return float(np.exp(np.interp(count, counts, values)))
+
+
+def device_name() -> str:
+    """Return what calibrations are kept under: kind of device and number of cores."""
+    device = jax.devices()[0]
+    cores = f", {os.cpu_count()} cores" if device.platform == "cpu" else ""
+    return f"{device.device_kind}{cores}"
+
+
+def cache_path() -> Path:
+    """Return the file in which this device's own calibration is kept."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax"
+    name = "".join(letter if letter.isalnum() else "-" for letter in device_name().lower())
+    return cache / f"calibration-{name}.json"
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration as JSON."""
+    record = {"format": FORMAT, **dataclasses.asdict(calibration), "environment": environment()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def read_calibration(path: Path | None = None) -> Calibration:
+    """Read this device's calibration, or the shipped one of two CPU cores where there is none.
+
+    Raises:
+        AssetError: The file is damaged.
+    """
+    if path is None:
+        path = cache_path() if cache_path().exists() else data_folder() / "models" / "calibration.json"
+    try:
+        record = json.loads(path.read_text())
+        if record["format"] != FORMAT:
+            raise ValueError(f"format {record['format']}")
+        methods = tuple(Method(**method) for method in record["methods"])
+        return Calibration(record["device"], methods)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AssetError(f"{path} is no calibration ({error}); make one by eslr calibrate") from error
