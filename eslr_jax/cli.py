@@ -7,6 +7,7 @@ something that the user can put right.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import sys
@@ -66,6 +67,8 @@ def simulate(
     frames: int | None = None,
     iterations: int = 100,
     corrector_steps: int = 0,
+    budget: str | None = None,
+    tolerance: str | None = None,
     out: Path = Path("out"),
     pictures: bool = True,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -85,6 +88,9 @@ def simulate(
         frames: Simulate this many frames, the start included; all if not given.
         iterations: Solver iterations per frame of the physics simulator.
         corrector_steps: Solver iterations behind the network.
+        budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it.
+        tolerance: Excess over the optimum relative to what a frame gains, such as 1%: choose the fastest
+            simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.
         out: Folder to write to.
         pictures: Render the contact sheet.
         json_: Print the report as JSON.
@@ -102,6 +108,7 @@ def simulate(
     from eslr_jax.assets.load import default_model
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig
+    from eslr_jax.evaluation.calibrate import SOLVER, choose, read_calibration
     from eslr_jax.evaluation.report import environment, trajectory_report
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.report import describe_fit
@@ -109,9 +116,19 @@ def simulate(
     from eslr_jax.rollout import raise_for_status, rollout_in_chunks
     from eslr_jax.scene import prepare_scene
 
+    budget_ms, share = _parse_budget(budget), _parse_share(tolerance)
     with _stderr.status("loading garment, body and motion"):
         rig = load_body(body)
         clip = load_motion(motion)
+        stored = load_garment_file(garment, vertices=vertices, body=rig)
+        choice = None
+        if budget_ms is not None or share is not None:
+            choice = choose(
+                read_calibration(), len(stored.rest_positions), budget_ms=budget_ms, tolerance=share
+            )
+            simulator = "physics" if choice.method == SOLVER else "network"
+            model = None if choice.method == SOLVER else choice.method
+            iterations = corrector_steps = choice.iterations
         params, architecture = None, None
         options: dict[str, Any] = {}
         if simulator == "network":
@@ -121,7 +138,6 @@ def simulate(
                 "embedding_size": architecture.embedding_size,
                 "embedding_mode": architecture.embedding_mode,
             }
-        stored = load_garment_file(garment, vertices=vertices, body=rig)
         cloth = prepare_stored(stored, name=Path(garment).name, **options)
         material = garment_material(fabric, cloth, stored)
         poses = pose_body(rig, clip, num_frames=frames)
@@ -133,6 +149,7 @@ def simulate(
         model=architecture,
         solver_iterations=iterations,
         corrector_steps=corrector_steps,
+        tolerance=0.0 if choice is None else choice.tolerance,
     )
     with _progress("simulating", scene.num_frames - 1) as advance:
         trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
@@ -145,6 +162,7 @@ def simulate(
             "simulator": simulator,
             "model": model,
             **trajectory_report(trajectory, scene),
+            "choice": None if choice is None else dataclasses.asdict(choice),
             "frame_ms": timing.frame_ms,
             "compile_s": timing.compile_s,
             **environment(),
@@ -161,6 +179,78 @@ def simulate(
         print(json.dumps(report, indent=2))
     else:
         _print_report(report, out)
+
+
+def _parse_budget(text: str | None) -> float | None:
+    """Return a time in milliseconds.
+
+    Raises:
+        ConfigError: It is not a positive time.
+    """
+    from eslr_jax.errors import ConfigError
+
+    if text is None:
+        return None
+    units = {"ms": 1.0, "s": 1e3}
+    unit = "ms" if text.endswith("ms") else "s"
+    try:
+        value = float(text.removesuffix(unit)) * units[unit] if text.endswith(unit) else 0.0
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise ConfigError(f"--budget {text}: write a time per frame, such as 20ms or 0.1s")
+    return value
+
+
+def _parse_share(text: str | None) -> float | None:
+    """Return a share, written as 1% or 0.01.
+
+    Raises:
+        ConfigError: It is not between 0 and 1.
+    """
+    from eslr_jax.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1:
+        raise ConfigError(f"--tolerance {text}: write a share of what a frame gains, such as 1% or 0.01")
+    return value
+
+
+@app.command
+def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
+    """Measure what this device can do in how much time, for `eslr simulate --budget` and `--tolerance`.
+
+    Takes a few minutes on an otherwise idle machine. The result is kept with the compiled programs.
+
+    Args:
+        models: Bundled networks to measure beside the solver; the default network if not given.
+        out: File to write to, instead of the one that `eslr simulate` reads.
+    """
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.evaluation.calibrate import cache_path, write_calibration
+    from eslr_jax.evaluation.calibrate import calibrate as run
+
+    _use_compile_cache()
+    with _stderr.status("measuring"):
+        measured = run(models or (default_model(),))
+    path = out or cache_path()
+    write_calibration(measured, path)
+    table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "excess after 20", box=None)
+    for method in measured.methods:
+        table.add_row(
+            method.name,
+            str(method.vertices),
+            f"{method.fixed_ms:.1f}",
+            f"{method.iteration_ms:.2f}",
+            f"{method.median['20']:.2%}",
+        )
+    Console().print(table, markup=False)
+    print(path)
 
 
 def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: dict[str, Any]) -> None:
@@ -261,8 +351,6 @@ def fit(
         picture: Render the picture (extra `render`).
         json_: Print the report as JSON.
     """
-    import dataclasses
-
     from eslr_jax.assets import load_body, load_garment_file, prepare_stored
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.report import describe_fit
@@ -322,8 +410,6 @@ def assets(
         verify: Compare every file with its checksum.
         json_: Print as JSON.
     """
-    import dataclasses
-
     from eslr_jax.assets.catalog import is_intact, list_assets
 
     if kind == "fabric":
@@ -345,8 +431,6 @@ def assets(
 
 def _list_fabrics(as_json: bool) -> None:
     """Print the table of fabrics."""
-    import dataclasses
-
     from eslr_jax.physics.materials import FABRICS, fabric_names
 
     if as_json:

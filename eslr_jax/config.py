@@ -85,7 +85,9 @@ class SimConfig:
     solver_iterations: int = 100  # L-BFGS iterations of the physics simulator
     solver_memory: int = 8  # pairs kept by L-BFGS
     corrector_steps: int = 0  # L-BFGS iterations behind the network
-    tolerance: float = 0.0  # stop a frame's iterations at this force norm over weight
+    # Stop a frame's iterations where what is left to gain is estimated to be below this share of what the
+    # frame gains from its pushed-out inertial guess; 0.01 is kept on 99 % of frames.
+    tolerance: float = 0.0
     self_contact: bool = False
 
 

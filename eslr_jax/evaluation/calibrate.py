@@ -81,7 +81,8 @@ def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) ->
     for size in sizes:
         scenes = [_scene(name, size) for name in _GARMENTS]
         truths = [
-            simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics")) for scene in scenes
+            simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
+            for scene in scenes
         ]
         for model in (None, *models):
             methods.append(_measure(model, scenes, truths))
@@ -237,7 +238,8 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
         tolerance=tolerance,
         expected_ms=cost,
         expected_excess=_interpolate(method.median, count),
-        reason=f"fastest below {tolerance:.2%} on 99 % of frames" + (f" (others: {others})" if others else ""),
+        reason=f"fastest below {tolerance:.2%} on 99 % of frames"
+        + (f" (others: {others})" if others else ""),
     )
 
 

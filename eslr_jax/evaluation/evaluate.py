@@ -188,7 +188,11 @@ def _summarize(measured: list[Excess]) -> dict[str, Any]:
         }
 
     lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}
-    return {"frames": len(optimum), **medians(join(lambda entry: next(iter(entry.corrected.values())))), "lbfgs": lbfgs}
+    return {
+        "frames": len(optimum),
+        **medians(join(lambda entry: next(iter(entry.corrected.values())))),
+        "lbfgs": lbfgs,
+    }
 
 
 def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.lbfgs import Minimum, minimize
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.preconditioner import stiffness
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, start_guess
 from eslr_jax.physics.start import solver_start
 from eslr_jax.simulate.network import network_step
 from eslr_jax.types import BodySurface, ClothState, Garment, Material
@@ -73,15 +73,20 @@ def solve(
     memory: int,
     tolerance: float,
 ) -> Minimum:
-    """Minimise the frame's potential from `start` by L-BFGS; stop at `tolerance` of the weight's norm."""
-    weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
+    """Minimise the frame's potential from `start` by L-BFGS; see `SimConfig.tolerance`."""
+
+    def energy(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
+        return potential(position, problem, garment, material)
+
     return minimize(
-        lambda position: potential(position, problem, garment, material),
+        energy,
         start,
         stiffness(problem, garment, material, start),
         iterations=iterations,
         memory=memory,
-        residual_tolerance=tolerance * weight,
+        excess_tolerance=tolerance,
+        # Whatever it starts from, a frame's gain counts from the best guess that costs nothing.
+        reference_value=energy(start_guess(problem, garment)) if tolerance else None,
     )
 
 
