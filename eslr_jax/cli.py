@@ -455,14 +455,27 @@ def _list_fabrics(as_json: bool) -> None:
 @app.command
 def info(
     model: str = "eslr-15",
+    scene: str | None = None,
+    motion: str = "cmu_016_32",
+    vertices: Literal["1k", "4k", "10k"] = "1k",
+    simulator: Literal["network", "physics"] = "physics",
+    self_contact: bool = False,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Show an architecture and its number of parameters.
+    """Show an architecture and its number of parameters; or with --scene, what a scene models at what cost.
 
     Args:
         model: Name of an architecture, or of a bundled network, or an exported file.
+        scene: A garment, by name or file, on the bundled body.
+        motion: Motion of the scene.
+        vertices: Resolution of a bundled garment.
+        simulator: Simulator of the scene; the network is the default one.
+        self_contact: Keep layers of cloth apart.
         json_: Print as JSON.
     """
+    if scene is not None:
+        _show_scene(scene, motion, vertices, simulator, self_contact, json_)
+        return
     from eslr_jax.assets import asset_names, load_model
     from eslr_jax.config import to_dict
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
@@ -482,6 +495,43 @@ def info(
     print(f"{model}: {values['parameters']:,} parameters")
     for name, value in values["config"].items():
         print(f"  {name} = {value}")
+
+
+def _show_scene(
+    garment: str,
+    motion: str,
+    vertices: Literal["1k", "4k", "10k"],
+    simulator: Literal["network", "physics"],
+    self_contact: bool,
+    as_json: bool,
+) -> None:
+    """Print what a scene models, what it leaves out, and what its parts cost."""
+    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.config import SimConfig
+    from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
+    from eslr_jax.scene import prepare_scene
+
+    _use_compile_cache()
+    params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
+    config = SimConfig(simulator=simulator, model=architecture, self_contact=self_contact)
+    with _stderr.status("measuring"):
+        rig = load_body()
+        poses = pose_body(rig, load_motion(motion))
+        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses)
+        parts = describe_scene(scene, poses, config)
+        costs = time_parts(params, scene, config)
+    if as_json:
+        print(json.dumps({**dataclasses.asdict(parts), "cost_ms": costs}, indent=2))
+        return
+    for title, entries in (("modelled", parts.modelled), ("left out", parts.left_out)):
+        print(title)
+        for name, size in entries.items():
+            print(f"  {name}: {size}")
+    print("cost on this device")
+    for name, cost in costs.items():
+        print(f"  {name}: {cost:.2f} ms")
 
 
 @app.command

@@ -1,0 +1,141 @@
+"""What a scene's compiled step holds, what was left out, and what each part costs (host)."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import find_both_sides
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
+from eslr_jax.physics.problem import PhysicsParameters, start_guess
+from eslr_jax.simulate.network import network_step
+from eslr_jax.simulate.scan import frame_inputs
+from eslr_jax.simulate.step import frame_problem, solve, step
+from eslr_jax.types import BodyMotion, Scene
+
+_TURNS = 15  # timings of every part, in turns; medians count
+_ITERATIONS = 20  # of the solver's part
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneParts:
+    """Parts of a scene by name, each with a word on its size."""
+
+    modelled: dict[str, str]
+    left_out: dict[str, str]
+
+
+def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneParts:
+    """Return what a scene models.
+
+    Args:
+        scene: Of `prepare_scene`.
+        poses: The motion it was made from.
+        config: Decides about self-contact and the network.
+    """
+    vertices = int(np.sum(scene.garment.vertex_mask))
+    modelled = {
+        "stretch": f"{int(np.sum(np.asarray(scene.garment.rest_areas) > 0))} faces",
+        "bending": f"{int(np.sum(np.asarray(scene.garment.hinge_rest_areas) > 0))} hinges",
+        "inertia and gravity": f"{vertices} vertices",
+    }
+    left_out: dict[str, str] = {}
+
+    def sort(name: str, is_modelled: bool, size: str, why: str) -> None:
+        (modelled if is_modelled else left_out)[name] = size if is_modelled else why
+
+    surface, total = scene.surface, int(np.asarray(poses.faces).shape[0])
+    faces = 0 if surface is None else surface.faces.shape[0]
+    sort("collision and friction", surface is not None, f"{faces} of {total} body faces", "no body in reach")
+    if 0 < faces < total:
+        left_out["other body faces"] = f"{total - faces} that the garment does not reach"
+    pinned = int(np.sum(scene.garment.is_pinned))
+    sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
+    sort("self-contact", config.self_contact, "layers of cloth keep apart", "not asked for")
+    varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
+    sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
+    sort("network", config.simulator == "network", "passes before the solver", "solver alone")
+    return SceneParts(modelled, left_out)
+
+
+def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]:
+    """Return milliseconds of each part of one frame, on this device, measured in turns.
+
+    Args:
+        params: Weights of the network; None for the physics simulator.
+        scene: Of `prepare_scene`.
+        config: Which simulator.
+    """
+    garment, material, parameters = scene.garment, scene.material, PhysicsParameters()
+    state = scene.start
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+
+    def problem_of(state):
+        return frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
+
+    problem = jax.jit(problem_of)(state)
+    start = jax.jit(start_guess)(problem, garment)
+    gradient = jax.grad(potential)
+    parts: dict[str, tuple[Callable, tuple]] = {
+        "gradient of the potential": (lambda x: gradient(x, problem, garment, material), (start,)),
+        "preconditioner": (
+            lambda x: solve_stiffness(stiffness(problem, garment, material, x), x),
+            (start,),
+        ),
+        f"solver, {_ITERATIONS} iterations": (
+            lambda x: (
+                solve(
+                    problem,
+                    garment,
+                    material,
+                    x,
+                    iterations=_ITERATIONS,
+                    memory=config.solver_memory,
+                    tolerance=0.0,
+                ).position
+            ),
+            (start,),
+        ),
+        "whole frame": (
+            lambda state: step(params, garment, material, problem_of(state), state, config)[0],
+            (state,),
+        ),
+    }
+    if scene.surface is not None:
+        parts["contact search"] = (
+            lambda x: find_both_sides(x, inputs.body, inputs.next_body, scene.surface),
+            (state.position,),
+        )
+    if config.simulator == "network":
+        assert config.model is not None
+        model = config.model
+        parts["network"] = (
+            lambda state: network_step(params, garment, material, problem, state, model)[0],
+            (state,),
+        )
+    return take_turns(parts)
+
+
+def take_turns(parts: dict[str, tuple[Callable, tuple]], turns: int = _TURNS) -> dict[str, float]:
+    """Return the median milliseconds of jitted functions that are called in turns.
+
+    Args:
+        parts: Functions with their arguments.
+        turns: Calls of each.
+    """
+    compiled = {name: jax.jit(function) for name, (function, _) in parts.items()}
+    times: dict[str, list[float]] = {name: [] for name in parts}
+    for turn in range(turns + 1):
+        for name, (_, arguments) in parts.items():
+            began = time.perf_counter()
+            jax.block_until_ready(compiled[name](*arguments))
+            if turn:  # the first compiles
+                times[name].append((time.perf_counter() - began) * 1e3)
+    return {name: float(np.median(values)) for name, values in times.items()}
