@@ -81,7 +81,6 @@ class SimConfig:
 
     simulator: Literal["network", "physics"] = "network"
     model: ModelConfig | None = None  # required by the network
-    energy_set: Literal["consistent", "hood"] = "consistent"
     solver_iterations: int = 100  # L-BFGS iterations of the physics simulator
     solver_memory: int = 8  # pairs kept by L-BFGS
     corrector_steps: int = 0  # L-BFGS iterations behind the network
@@ -100,6 +99,8 @@ class TrainConfig:
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed iteration by iteration
     split: str = "train"  # clips of this split
     iterations: int = 20_000  # optimiser steps
+    energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
+    schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine
     warmup: int = 100  # iterations of linear warm-up
@@ -112,7 +113,7 @@ class TrainConfig:
     reset_stretch: float = 2.5  # a trajectory that stretches further starts anew
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
-    collision_stiffness: float = 3.5e7  # [J/m^5]
+    collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
     pass_weights: Literal["equal", "last"] = "equal"  # energies of which passes count
     max_skipped: int = 100  # non-finite updates skipped before training stops
     log_every: int = 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,9 @@ from eslr_jax.simulate.network import correction_passes, graph_inputs, predict_a
 from eslr_jax.types import ClothState, Garment, Material
 
 _FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by this
+
+
+EnergyTerms = Callable[[Array, FrameProblem, Garment, Material], PotentialTerms]
 
 
 class LossReport(NamedTuple):
@@ -33,6 +37,7 @@ def physics_loss(
     problem: FrameProblem,
     state: ClothState,
     config: TrainConfig,
+    terms_of: EnergyTerms = potential_terms,
 ) -> tuple[Float[Array, ""], LossReport]:
     """Return the loss, without unit, and its report.
 
@@ -43,6 +48,7 @@ def physics_loss(
         problem: The frame's problem.
         state: Cloth at t.
         config: Architecture and which passes count; static.
+        terms_of: The set of energies, as a function of positions, problem, garment and fabric.
     """
     model = config.model
     inputs = graph_inputs(problem, garment, material, state)
@@ -51,10 +57,10 @@ def physics_loss(
         answers = answer[None]
     else:
         answers, _ = correction_passes(params, garment, material, problem, inputs, model, detach=True)
-    terms = jax.vmap(potential_terms, in_axes=(0, None, None, None))(answers, problem, garment, material)
+    terms = jax.vmap(terms_of, in_axes=(0, None, None, None))(answers, problem, garment, material)
     energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
     energy = energies[-1] if config.pass_weights == "last" else jnp.mean(energies)
     scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
-    start = sum(potential_terms(start_guess(problem, garment), problem, garment, material))
+    start = sum(terms_of(start_guess(problem, garment), problem, garment, material))
     last = PotentialTerms(*(jnp.broadcast_to(term, answers.shape[:1])[-1] for term in terms))
     return energy / scale, LossReport(answers[-1], last, start)  # type: ignore[arg-type]

@@ -19,16 +19,19 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import Normalizer
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
+from eslr_jax.physics.hood import BodyFrames, HoodParameters, collision_weight, hood_terms
 from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.physics.potential import potential_terms
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.simulate.network import graph_inputs
 from eslr_jax.simulate.step import FrameInput, frame_problem, next_state
 from eslr_jax.training.data import TrainingData
-from eslr_jax.training.loss import LossReport, physics_loss
+from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, skin, start_trajectory
 from eslr_jax.types import Garment
 
 _TIMESTEP = 1 / 30  # [s]
+_HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
 
 
@@ -45,7 +48,9 @@ class TrainState:
 
 
 def make_schedule(config: TrainConfig) -> optax.Schedule:
-    """Return linear warm-up, then a cosine to the final rate."""
+    """Return linear warm-up, then a cosine to the final rate; or HOOD's steps, halved every 50,000."""
+    if config.schedule == "hood":
+        return lambda count: config.learning_rate * (0.5 ** (count // _HOOD_HALVING) + _HOOD_LEAST)
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=config.learning_rate,
@@ -197,10 +202,13 @@ def _sample_gradient(
     garment = data.garment(index % data.num_garments)
     slot = jax.lax.cond(slot.is_done, lambda: start_trajectory(key, data, garment, config), lambda: slot)
     problem = _problem(slot, data, garment, config)
+    terms_of = potential_terms
+    if config.energy_set == "hood":
+        terms_of = _hood_terms(slot, data, iteration // config.horizon)
 
     def loss_of(trained):
         weights = {**params, "params": trained}
-        return physics_loss(weights, garment, slot.material, problem, slot.state, config)
+        return physics_loss(weights, garment, slot.material, problem, slot.state, config, terms_of)
 
     (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(params["params"])
     statistics = {}
@@ -220,6 +228,34 @@ def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConf
     parameters = PhysicsParameters(collision_stiffness=config.collision_stiffness)
     problem = frame_problem(garment, slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters)
     return jax.lax.stop_gradient(problem)
+
+
+def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> EnergyTerms:
+    """Return HOOD's losses around this frame, with the collision weight of its ramp."""
+    # Within a clip `frames_left` falls by one a frame; a clip's first frame has no frame before it.
+    last = jnp.maximum(slot.frame - 1, 0)
+    before = jnp.where(data.frames_left[last] > data.frames_left[slot.frame], last, slot.frame)
+    frames = (before, slot.frame, slot.frame + 1)
+    bodies = BodyFrames(*(data.body(data.transforms(frame, slot.yaw)) for frame in frames))
+    parameters = HoodParameters(collision_weight=collision_weight(num_samples))
+    state = slot.state
+
+    def terms_of(position, problem, garment, material):
+        previous = state.position - problem.timestep * state.velocity
+        faces = data.surface.faces
+        return hood_terms(
+            position,
+            state.position,
+            previous,
+            bodies,
+            faces,
+            garment,
+            material,
+            problem.timestep,
+            parameters,
+        )
+
+    return terms_of
 
 
 def _advance(

@@ -121,3 +121,33 @@ def test_unknown_split_lists_what_exists():
 
     with pytest.raises(ConfigError, match="validation"):
         split_clips("holdout")
+
+
+@pytest.mark.slow
+def test_hoods_recipe_takes_finite_steps(tmp_path):
+    from eslr_jax.training.recipe import load_recipe
+
+    overrides = {
+        "garments": ["tshirt"],
+        "vertices": ["1k"],
+        "iterations": 3,
+        "log_every": 1,
+        "model": "mgn-15",
+        "model.message_passing_steps": 2,
+        "model.latent_size": 16,
+    }
+    config = load_recipe("experiments/configs/hood.toml", overrides)
+    assert config.energy_set == "hood"
+    state = train(config, tmp_path)
+    assert int(state.skipped) == 0
+    counts = [entry.count for entry in state.params["statistics"].values()]
+    assert all(count > 0 for count in counts)
+
+
+def test_overrides_may_name_another_model(tmp_path):
+    from eslr_jax.training.recipe import load_recipe
+
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text('model = "eslr-small"')
+    config = load_recipe(recipe, {"model": "mgn-small", "model.passes": 4})
+    assert config.model == dataclasses.replace(MODELS["mgn-small"], passes=4)
