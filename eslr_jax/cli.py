@@ -398,6 +398,105 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
 
 
 @app.command
+def view(
+    runs: tyro.conf.Positional[tuple[Path, ...]],
+    port: int = 8080,
+    host: str = "127.0.0.1",
+) -> None:
+    """Show runs side by side in the browser: timeline, colours, wireframe, export of a picture; Ctrl-C ends it.
+
+    Args:
+        runs: Folders that `eslr simulate` wrote.
+        port: Port of the page, or the next free one.
+        host: Address to listen on; 0.0.0.0 shows it to the whole network.
+    """
+    from eslr_jax.io.run import read_run
+    from eslr_jax.viewer import open_view, play
+
+    page = open_view([read_run(run) for run in runs], host=host, port=port)
+    print(page.url, flush=True)
+    play(page)
+
+
+@app.command
+def render(
+    run: tyro.conf.Positional[Path],
+    out: Path,
+    color: Literal[
+        "fabric",
+        "stretch",
+        "stretch-energy",
+        "bending-energy",
+        "inertia-energy",
+        "gravity-energy",
+        "distance",
+    ] = "fabric",
+    camera: str = "front",
+    width: int | None = None,
+    frames: int | None = None,
+    samples: int = 16,
+) -> None:
+    """Render a run without a display: a film (mp4) or a contact sheet (png).
+
+    Args:
+        run: Folder that `eslr simulate` wrote.
+        out: File to write; .mp4 (extra `video`) or .png.
+        color: Colour the garment by this: dark blue is little, yellow much.
+        camera: front, side, back, or degrees from the front towards the side.
+        width: Width of one picture [pixels]; three quarters of its height.
+        frames: Only the first so many frames of a film, or so many pictures of a sheet.
+        samples: Camera rays per pixel.
+    """
+    from eslr_jax.evaluation.fields import run_field
+    from eslr_jax.io.run import read_run
+    from eslr_jax.render import color_scale, contact_sheet, render_frames, write_png, write_video
+
+    if out.suffix.lower() not in (".mp4", ".png"):
+        raise AssetError(f"--out {out}: give a film, .mp4, or a picture, .png")
+    content = read_run(run)
+    trajectory = content.trajectory
+    colors = None
+    if color != "fabric":
+        field = run_field(content, color)
+        colors = color_scale(field.values, field.low, field.high)
+        _stderr.print(
+            f"{color}: dark {field.low:.3g} to yellow {field.high:.3g} {field.unit}", highlight=False
+        )
+    angle: str | float = float(camera) if camera.lstrip("-").replace(".", "", 1).isdigit() else camera
+    meshes = trajectory.body_positions, trajectory.body_faces, trajectory.positions, trajectory.faces
+    if out.suffix.lower() == ".png":
+        size = (width or 280, round((width or 280) * 10 / 7))
+        count = frames or 8
+        with _progress("rendering", count) as advance:
+            sheet = contact_sheet(
+                *meshes, num_frames=count, camera=angle, size=size, vertex_colors=colors, samples=samples,
+                on_picture=advance,
+            )  # fmt: skip
+        write_png(out, sheet)
+    else:
+        size = (width or 480, round((width or 480) * 4 / 3))
+        count = min(frames or trajectory.num_frames, trajectory.num_frames)
+        pictures = render_frames(
+            *meshes,
+            frame_indices=range(count),
+            camera=angle,
+            size=size,
+            vertex_colors=colors,
+            samples=samples,
+        )
+        with _progress("rendering", count) as advance:
+            write_video(out, _counted(pictures, count, advance), 1.0 / trajectory.timestep)
+    print(out)
+
+
+def _counted(items, total: int, advance) -> Iterator[Any]:
+    """Yield items and show how many there were."""
+    for done, item in enumerate(items, 1):
+        yield item
+        advance(done, total)
+
+
+@app.command
 def assets(
     kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
     verify: bool = False,

@@ -26,5 +26,5 @@ def require(module: str, *, extra: str = "render") -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         raise MissingExtraError(
-            f'pictures need {package}, which is not installed: pip install "eslr-jax[{extra}]"'
+            f'this needs {package}, which is not installed: pip install "eslr-jax[{extra}]"'
         ) from error

@@ -1,0 +1,172 @@
+"""Runs in the browser, side by side, with a timeline (extra `view`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.errors import AssetError
+from eslr_jax.evaluation.fields import FIELDS, Field, run_field
+from eslr_jax.io.run import Run
+from eslr_jax.render.colors import color_scale
+from eslr_jax.render.extras import require
+from eslr_jax.render.pictures import BODY_COLOR, GARMENT_COLOR
+
+PLAIN = "fabric"  # colour by nothing
+_SPACING = 1.3  # [m] between runs: arms held out pass each other
+_PICTURE_SIZE = (1280, 960)  # width, height [pixels]
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A page that shows runs; its controls are the state."""
+
+    server: Any  # viser.ViserServer
+    runs: tuple[Run, ...]
+    fields: dict[tuple[int, str], Field]  # filled as they are asked for
+    controls: dict[str, Any]
+    lock: threading.Lock
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://localhost:{self.server.get_port()}"
+
+
+def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080) -> View:
+    """Serve a page with runs side by side: body, garment, timeline, colours, wireframe, export of a picture.
+
+    Args:
+        runs: Of `read_run`, shown from left to right.
+        host: Address to listen on; only this machine by default.
+        port: Port, or the next free one.
+
+    Returns:
+        The view; `play` keeps its timeline going.
+
+    Raises:
+        AssetError: There is no run.
+        MissingExtraError: The extra `view` is not installed.
+    """
+    if not runs:
+        raise AssetError("nothing to view; give one run or more")
+    viser = require("viser", extra="view")
+    server = viser.ViserServer(host=host, port=port, verbose=False)
+    last = max(run.trajectory.num_frames for run in runs) - 1
+    gui = server.gui
+    controls = {
+        "frame": gui.add_slider("frame", 0, max(last, 1), 1, 0),
+        "playing": gui.add_checkbox("play", False),
+        "speed": gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0),
+        "color": gui.add_dropdown("colour by", (PLAIN, *FIELDS), initial_value=PLAIN),
+        "legend": gui.add_markdown(""),
+        "wireframe": gui.add_checkbox("wireframe", False),
+        "body": gui.add_checkbox("body", True),
+        "save": gui.add_button("save picture"),
+    }
+    view = View(server, tuple(runs), {}, controls, threading.Lock())
+    _place_scene(view)
+    for name in ("frame", "color", "wireframe", "body"):
+        controls[name].on_update(lambda _: show(view))
+    controls["save"].on_click(lambda event: _save_picture(event.client))
+    show(view)
+    return view
+
+
+def show(view: View) -> None:
+    """Bring the scene in line with the controls."""
+    color = view.controls["color"].value
+    with view.lock, view.server.atomic():
+        fields = [_field(view, k, color) for k in range(len(view.runs))] if color != PLAIN else []
+        low = min((field.low for field in fields), default=0.0)
+        high = max((field.high for field in fields), default=1.0)
+        for k, run in enumerate(view.runs):
+            frame = min(int(view.controls["frame"].value), run.trajectory.num_frames - 1)
+            colors = None
+            if fields:
+                colors = color_scale(fields[k].values[frame], low, high)
+            _show_run(view, k, run, frame, colors)
+        legend = f"dark {low:.3g} to yellow {high:.3g} {fields[0].unit}" if fields else ""
+        view.controls["legend"].content = legend
+
+
+def play(view: View, *, until: threading.Event | None = None) -> None:
+    """Advance the timeline at the runs' own rate while "play" is ticked; returns when `until` is set."""
+    until = until or threading.Event()
+    slider = view.controls["frame"]
+    while not until.is_set():
+        began = time.perf_counter()
+        if view.controls["playing"].value:
+            slider.value = (int(slider.value) + 1) % (int(slider.max) + 1)  # shows the frame by its callback
+        pause = view.runs[0].trajectory.timestep / float(view.controls["speed"].value)
+        until.wait(max(pause - (time.perf_counter() - began), 0.005))
+
+
+def _place_scene(view: View) -> None:
+    """Set up axis, camera, floor and names."""
+    scene, count = view.server.scene, len(view.runs)
+    scene.set_up_direction("+y")
+    middle = 0.5 * _SPACING * (count - 1)
+    view.server.initial_camera.position = (middle, 1.2, 2.6 + 0.8 * count)
+    view.server.initial_camera.look_at = (middle, 0.9, 0.0)
+    view.server.initial_camera.up = (0.0, 1.0, 0.0)
+    scene.add_grid("/floor", width=4.0 + _SPACING * count, height=4.0, plane="xz", cell_size=0.25)
+    for k, run in enumerate(view.runs):
+        scene.add_label(f"/runs/{k}/name", run.name, position=(_SPACING * k, 2.05, 0.0))
+
+
+def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | None) -> None:
+    """Show one frame of one run."""
+    scene, trajectory = view.server.scene, run.trajectory
+    wireframe = bool(view.controls["wireframe"].value)
+    # Where the subject walks, the runs walk beside each other.
+    offset = np.array([_SPACING * k, 0.0, 0.0])
+    points = (trajectory.positions[frame] + offset).astype(np.float32)
+    name = f"/runs/{k}/garment"
+    if colors is None or wireframe:
+        scene.add_mesh_simple(
+            name, points, trajectory.faces, color=_bytes(GARMENT_COLOR), wireframe=wireframe, side="double"
+        )
+    else:
+        mesh = require("trimesh", extra="view").Trimesh(
+            points, trajectory.faces, vertex_colors=np.round(255 * colors).astype(np.uint8), process=False
+        )
+        scene.add_mesh_trimesh(name, mesh)
+    if trajectory.body_positions is not None:
+        scene.add_mesh_simple(
+            f"/runs/{k}/body",
+            (trajectory.body_positions[frame] + offset).astype(np.float32),
+            trajectory.body_faces,
+            color=_bytes(BODY_COLOR),
+            visible=bool(view.controls["body"].value),
+        )
+
+
+def _field(view: View, k: int, name: str) -> Field:
+    """Return a run's field, computed once."""
+    if (k, name) not in view.fields:
+        view.fields[k, name] = run_field(view.runs[k], name)
+    return view.fields[k, name]
+
+
+def _save_picture(client: Any) -> None:
+    """Render what a client sees and hand it over as a download."""
+    if client is None:
+        return
+    width, height = _PICTURE_SIZE
+    picture = client.get_render(height=height, width=width, transport_format="png")
+    stream = io.BytesIO()
+    require("PIL.Image", extra="view").fromarray(picture).save(stream, format="PNG")
+    client.send_file_download("garment.png", stream.getvalue())
+
+
+def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:
+    """Return sRGB in [0, 1] as bytes."""
+    red, green, blue = (round(255 * value) for value in color)
+    return red, green, blue
