@@ -185,18 +185,18 @@ def test_page_in_headless_chromium(view, tmp_path):
             "--enable-unsafe-swiftshader",
         ]
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        page = browser.new_page(viewport={"width": 900, "height": 700})
+        page = browser.new_page(viewport={"width": 640, "height": 480})
         page.goto(view.url)
         picture = tmp_path / "page.png"
 
         def blue_pixels():
-            page.screenshot(path=picture)
+            page.screenshot(path=picture, timeout=180_000)  # WebGL in software, on a busy machine
             pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
             return int(((pixels[..., 2] > pixels[..., 0] + 40) & (pixels[..., 2] > 90)).sum())
 
-        deadline = time.monotonic() + 90
-        while blue_pixels() < 3000 and time.monotonic() < deadline:
+        deadline = time.monotonic() + 240
+        while blue_pixels() < 1500 and time.monotonic() < deadline:
             time.sleep(1.0)
-        assert blue_pixels() > 3000  # two blue garments
+        assert blue_pixels() > 1500  # two blue garments
         assert page.get_by_text("colour by").count() > 0
         browser.close()
