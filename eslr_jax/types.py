@@ -64,6 +64,8 @@ class Body:
     is_obstacle: Bool[Array, " body_faces"]  # faces that cloth may touch
     parents: tuple[int, ...] = struct.field(pytree_node=False)  # -1 is the root
     joint_names: tuple[str, ...] = struct.field(pytree_node=False)
+    # [m] per entry of R - I of every joint but the root; None: the model has no pose blend shapes
+    pose_directions: Float[Array, "body_vertices 3 entries"] | None = None
 
 
 @struct.dataclass

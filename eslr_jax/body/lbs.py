@@ -4,7 +4,7 @@ Rotations are local axis-angle vectors in world-aligned rest axes: with all of t
 rest pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some
 GPUs keeps ten bits, which moves a hand by millimetres.
 
-Source: Loper et al. 2015 (doi:10.1145/2816795.2818013), section 3, without pose blend shapes.
+Source: Loper et al. 2015 (doi:10.1145/2816795.2818013), section 3.
 """
 
 from __future__ import annotations
@@ -105,6 +105,21 @@ def skin(
     )  # a product beats gathers, on every device
     blended = _product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
+
+
+def bend(
+    directions: Float[Array, "vertices 3 entries"], turned: Float[Array, "joints 3 3"]
+) -> Float[Array, "vertices 3"]:
+    """Return the displacement of rest points by pose blend shapes [m].
+
+    Args:
+        directions: Displacement per entry of R - I [m], shape [vertices, 3, 9 joints].
+        turned: R - I of every joint but the root, local, shape [joints, 3, 3].
+
+    Source: Loper et al. 2015, equation 9.
+    """
+    flat = directions.reshape((-1, directions.shape[2]))
+    return _product(flat, turned.reshape((-1, 1))).reshape((-1, 3))
 
 
 def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -10,9 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.body import lbs
+from eslr_jax.body.joints import find_parts, torso_axes
 from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, leg_length, resample
 from eslr_jax.errors import MotionError
+from eslr_jax.io.skeleton import Skeleton
 from eslr_jax.types import Body, BodyMotion
+
+_ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is taken to face it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,17 +108,17 @@ def pose_body(
             )
         rotations, translations = rotations[:num_frames], translations[:num_frames]
     if arm_abduction:
-        rotations = abduct_arms(rotations, body.joint_names, arm_abduction)
+        rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
     rest, joints = shape_body(body, shape)
     if shape is not None:
         # Longer legs take longer steps and carry the root higher, so that the soles stay on the floor.
         before, after = (
-            leg_length(body.joint_names, np.asarray(j)) for j in (body.joint_rest_positions, joints)
+            leg_length(body.joint_names, np.asarray(j)) or 1.0 for j in (body.joint_rest_positions, joints)
         )
         translations = translations * (after / before)
     transforms = joint_transforms(rotations, translations, joints, body.parents)
     return BodyMotion(
-        positions=_skin_frames(rest, body.skin_weights, body.skin_indices, transforms),
+        positions=_skin_body(body, rest, rotations, transforms),
         joint_transforms=transforms,
         faces=body.faces,
         is_obstacle=body.is_obstacle,
@@ -159,6 +163,37 @@ def joint_transforms(
     return _joint_transforms(
         jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, parents
     )
+
+
+def _front(body: Body) -> np.ndarray:
+    """Where the resting chest faces; +Z if the rig doesn't tell."""
+    skeleton = Skeleton(body.joint_names, body.parents, np.asarray(body.joint_rest_positions, np.float64))
+    axes = torso_axes(skeleton, find_parts(skeleton))
+    if axes is None or axes[2, 2] > np.cos(_ORDINARY_YAW):
+        return np.array([0.0, 0.0, 1.0])
+    return axes[:, 2]
+
+
+def _skin_body(body: Body, rest: jax.Array, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
+    """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
+    if body.pose_directions is None:
+        return _skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
+    bends = jnp.asarray(rotations[:, 1:], jnp.float32)
+    return _skin_bent(rest, body.pose_directions, body.skin_weights, body.skin_indices, bends, transforms)
+
+
+@jax.jit
+def _skin_bent(rest, directions, weights, indices, rotations, transforms):
+    """Skin frame by frame what the joints' rotations have bent first.
+
+    Source: Loper et al. 2015, equations 8 and 9.
+    """
+
+    def pose(frame):
+        turned = jax.vmap(lbs.rotation_matrix)(frame[0]) - jnp.eye(3)
+        return lbs.skin(rest + lbs.bend(directions, turned), weights, indices, frame[1])
+
+    return jax.lax.map(pose, (rotations, transforms))
 
 
 @jax.jit

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from eslr_jax.body.joints import find_named_parts
 from eslr_jax.errors import MotionError
 
 ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bundled walks clear of the torso
@@ -116,14 +117,33 @@ def global_rotations(rotations: NDArray, parents: Sequence[int]) -> NDArray:
     return matrices
 
 
-def leg_length(joint_names: Sequence[str], joint_rest_positions: NDArray) -> float:
-    """Length of the left thigh and shank [m]: the ratio of two skeletons' legs scales a motion's steps."""
-    names = list(joint_names)
-    hip, knee, ankle = (joint_rest_positions[names.index("Left" + part)] for part in ("UpLeg", "Leg", "Foot"))
-    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+def leg_length(joint_names: Sequence[str], joint_rest_positions: NDArray) -> float | None:
+    """Length of a thigh and shank: the ratio of two skeletons' legs scales a motion's steps.
+
+    Args:
+        joint_names: Joints of a rig, by any names that `find_named_parts` knows.
+        joint_rest_positions: Their rest positions, shape [joints, 3].
+
+    Returns:
+        The length in the unit of the positions, or None if the rig has no such leg.
+    """
+    parts = find_named_parts(joint_names)
+    for side in ("left", "right"):
+        chain = [parts.get((side, name), [None])[0] for name in ("upper_leg", "lower_leg", "foot")]
+        if None not in chain:
+            bones = np.diff(np.asarray(joint_rest_positions, np.float64)[chain], axis=0)
+            length = float(np.linalg.norm(bones, axis=1).sum())
+            return length if length > 0 else None
+    return None
 
 
-def abduct_arms(rotations: NDArray, joint_names: Sequence[str], degrees: float = ARM_ABDUCTION) -> NDArray:
+def abduct_arms(
+    rotations: NDArray,
+    joint_names: Sequence[str],
+    degrees: float = ARM_ABDUCTION,
+    *,
+    front: Sequence[float] | NDArray = (0.0, 0.0, 1.0),
+) -> NDArray:
     """Return the motion with both arms lifted sideways about the chest's front axis.
 
     Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
@@ -131,8 +151,9 @@ def abduct_arms(rotations: NDArray, joint_names: Sequence[str], degrees: float =
 
     Args:
         rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        joint_names: Joints of the rig; `LeftArm` and `RightArm` must be among them.
+        joint_names: Joints of the rig; both upper arms must be among them.
         degrees: Abduction added to each arm [degrees]; zero returns the motion as it is.
+        front: Where the resting chest faces, shape [3].
 
     Returns:
         Rotations [rad], shape [frames, joints, 3].
@@ -140,13 +161,15 @@ def abduct_arms(rotations: NDArray, joint_names: Sequence[str], degrees: float =
     Raises:
         MotionError: If the rig has no such arms.
     """
-    names = list(joint_names)
+    parts = find_named_parts(joint_names)
     result = np.array(rotations, dtype=np.float64)
-    for name, sign in (("LeftArm", 1.0), ("RightArm", -1.0)):
-        if name not in names:
-            raise MotionError(f"the rig has no joint {name}; set the arm abduction to 0")
-        arm = names.index(name)
-        lift = Rotation.from_euler("z", sign * degrees, degrees=True)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        if (side, "upper_arm") not in parts:
+            raise MotionError(
+                f"the rig has no {side} upper arm ({side.capitalize()}Arm); set the arm abduction to 0"
+            )
+        arm = parts[side, "upper_arm"][0]
+        lift = Rotation.from_rotvec(sign * np.deg2rad(degrees) * np.asarray(front, np.float64))
         result[:, arm] = (lift * Rotation.from_rotvec(result[:, arm])).as_rotvec()
     return result
 

@@ -1,0 +1,244 @@
+"""Which joint is which: names of common rigs to parts of a body, and joint maps between two rigs.
+
+A part is a side and a chain, such as left `upper_leg`; spine, neck and fingers are chains of several joints.
+Recognised: CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, and the
+LeftCollar/LeftShoulder/LeftElbow family.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.parsing import parsing
+from eslr_jax.io.skeleton import Skeleton
+
+Part = tuple[str, str]  # side ("left", "right", "") and chain
+
+_SIDES = {"left": "left", "l": "left", "lft": "left", "right": "right", "r": "right", "rgt": "right"}
+_PREFIXES = re.compile(
+    r"^(mixamorig\d*|bip\d*|bip01|cc_base|def|org|character\d*|rig|j_bip(_c)?|j|valvebiped)[\s_.:-]+",
+    re.IGNORECASE,
+)
+_IGNORED = {"twist", "roll", "end", "nub", "ik", "pole", "ctrl", "helper", "site", "share", "metacarpal"}
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+_WORDS = {  # with a side or without one
+    "hips": "hips", "pelvis": "hips", "root": "root",
+    "spine": "spine", "lowerback": "spine", "upperback": "spine", "thorax": "spine", "chest": "spine",
+    "upperchest": "spine", "torso": "spine", "abdomen": "spine", "abdomenlower": "spine",
+    "abdomenupper": "spine", "chestlower": "spine", "chestupper": "spine", "waist": "spine",
+    "neck": "neck", "lowerneck": "neck", "upperneck": "neck", "necklower": "neck", "neckupper": "neck",
+    "head": "head", "skull": "head",
+}  # fmt: skip
+_SIDED_WORDS = {
+    "hipjoint": "hip_joint",
+    "upleg": "upper_leg", "upperleg": "upper_leg", "thigh": "upper_leg", "femur": "upper_leg",
+    "hip": "upper_leg", "thighbend": "upper_leg",
+    "loleg": "lower_leg", "lowerleg": "lower_leg", "lowleg": "lower_leg", "calf": "lower_leg",
+    "shin": "lower_leg", "tibia": "lower_leg", "knee": "lower_leg", "leg": "lower_leg",
+    "foot": "foot", "ankle": "foot",
+    "toe": "toe", "toes": "toe", "toebase": "toe", "ball": "toe",
+    "clavicle": "clavicle", "collar": "clavicle", "shoulder": "shoulder",
+    "uparm": "upper_arm", "upperarm": "upper_arm", "humerus": "upper_arm", "arm": "upper_arm",
+    "shldr": "upper_arm", "shldrbend": "upper_arm",
+    "loarm": "forearm", "lowerarm": "forearm", "lowarm": "forearm", "forearm": "forearm",
+    "radius": "forearm", "elbow": "forearm", "forearmbend": "forearm",
+    "hand": "hand", "wrist": "wrist",
+    "fingers": "fingers", "fingerbase": "fingers", "handfinger": "fingers",
+}  # fmt: skip
+for _finger in _FINGERS:
+    for _word in (_finger, f"hand{_finger}", f"f{_finger}"):
+        _SIDED_WORDS[_word] = _finger
+_SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
+_FALLBACKS = {"fingers": ("middle", "index"), "hip_joint": (), "toe": ()} | {
+    finger: ("fingers",) for finger in _FINGERS[1:]
+}
+
+
+def name_part(name: str) -> Part | None:
+    """Return the part that a joint's name stands for, by itself; None if it is unknown."""
+    name = re.split(r"[:|]", name)[-1]
+    if name.startswith("__"):  # a helper of MakeHuman, in the place of the joint that follows
+        return None
+    name = _PREFIXES.sub("", name)
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", name)]
+    if not words or _IGNORED & set(words):
+        return None
+    side = ""
+    for position in (0, -1, *range(1, len(words) - 1)):
+        if words[position] in _SIDES and len(words) > 1:
+            side = _SIDES[words.pop(position)]
+            break
+    digits = [word for word in words if word.isdigit()]
+    base = "".join(word for word in words if not word.isdigit())
+    if not side and base not in _WORDS and base[:1] in ("l", "r") and base[1:] in _SIDED_WORDS:
+        side, base = _SIDES[base[0]], base[1:]  # lfemur, rThigh
+    if not side and base.startswith(("left", "right")):
+        side = "left" if base.startswith("left") else "right"
+        base = base.removeprefix(side)
+    if side and base == "finger" and digits and int(digits[0][0]) < len(_FINGERS):
+        return side, _FINGERS[int(digits[0][0])]  # Biped: Finger0 is the thumb, Finger01 its second joint
+    if side and base in _SIDED_WORDS:
+        return side, _SIDED_WORDS[base]
+    if not side and base in (*_WORDS, "hip"):
+        return "", _WORDS.get(base, "hips")
+    return None
+
+
+def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
+    """Return the joints of every part that names tell, in the order of the names.
+
+    Words that mean different joints in different families (shoulder, foot, hand) are told apart by what else
+    the rig has.
+    """
+    found: dict[Part, list[int]] = {}
+    for joint, name in enumerate(joint_names):
+        part = name_part(name)
+        if part is not None:
+            found.setdefault(part, []).append(joint)
+    for side in ("left", "right"):
+        if (side, "shoulder") in found:
+            is_clavicle = (side, "clavicle") not in found and (side, "upper_arm") in found
+            found[side, "clavicle" if is_clavicle else "upper_arm"] = found.pop((side, "shoulder"))
+        if (side, "wrist") in found:
+            joints = found.pop((side, "wrist"))
+            if (side, "hand") in found:
+                found[side, "fingers"] = found.pop((side, "hand")) + found.get((side, "fingers"), [])
+            found[side, "hand"] = joints
+        feet = found.get((side, "foot"), [])
+        ankles = [joint for joint in feet if "ankle" in joint_names[joint].lower()]
+        if ankles and len(ankles) < len(feet):
+            beyond = [joint for joint in feet if joint not in ankles]
+            found[side, "foot"] = ankles
+            found[side, "toe"] = beyond + found.get((side, "toe"), [])
+    return found
+
+
+def find_parts(skeleton: Skeleton) -> dict[Part, list[int]]:
+    """Return the joints of every part of a rig, from the body outwards; the hips are always found."""
+    found = find_named_parts(skeleton.joint_names)
+    hips = _find_hips(skeleton, found)
+    found.pop(("", "root"), None)
+    found = {part: kept for part, joints in found.items() if (kept := [j for j in joints if j != hips])}
+    found["", "hips"] = [hips]
+    return found
+
+
+def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
+    """Return the joint above legs and spine: what a character hangs on."""
+    below = [
+        parts[part][0]
+        for part in (("left", "upper_leg"), ("right", "upper_leg"), ("", "spine"), ("", "neck"), ("", "head"))
+        if part in parts
+    ]
+    has_legs = ("left", "upper_leg") in parts and ("right", "upper_leg") in parts
+    if not has_legs or len(below) < 3:
+        return parts.get(("", "hips"), parts.get(("", "root"), [0]))[0]
+    chains = [_ancestors(skeleton, joint) for joint in below]
+    return max(set.intersection(*map(set, chains)), default=0)
+
+
+def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
+    """Return a joint and what it hangs on, up to the root."""
+    chain = [joint]
+    while skeleton.parents[chain[-1]] >= 0:
+        chain.append(skeleton.parents[chain[-1]])
+    return chain
+
+
+def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarray | None:
+    """Return left, up and front of the resting torso as columns, or None if the rig does not tell them."""
+    rest = skeleton.rest_positions
+    for chain in ("upper_leg", "upper_arm", "clavicle"):
+        if ("left", chain) in parts and ("right", chain) in parts:
+            left = rest[parts["left", chain][0]] - rest[parts["right", chain][0]]
+            break
+    else:
+        return None
+    top = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
+    if top is None:
+        return None
+    up = rest[top] - rest[parts["", "hips"][0]]
+    if np.linalg.norm(np.cross(left, up)) < 1e-6 * np.linalg.norm(left) * np.linalg.norm(up) or not up.any():
+        return None
+    left = left / np.linalg.norm(left)
+    up = up - (up @ left) * left
+    up /= np.linalg.norm(up)
+    return np.stack([left, up, np.cross(left, up)], axis=1)
+
+
+def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
+    """Return for each joint of a rig the source's joint whose turning it follows.
+
+    A name that both have maps to itself if both read it alike; else parts meet parts, and chains of different
+    length share evenly. Joints without a counterpart are left out: they keep still on their parent.
+    """
+    if target.joint_names == source.joint_names:
+        return {name: name for name in target.joint_names}
+    ours, theirs = find_parts(target), find_parts(source)
+    result: dict[str, str] = {}
+    for (side, chain), joints in ours.items():
+        others = theirs.get((side, chain), [])
+        for other in _FALLBACKS.get(chain, ()):
+            others = others or theirs.get((side, other), [])
+        for position, joint in enumerate(joints if others else ()):
+            share = -(-(position + 1) * len(others) // len(joints)) - 1
+            result[target.joint_names[joint]] = source.joint_names[others[share]]
+    named = {joint for joints in ours.values() for joint in joints}
+    known = set(source.joint_names)
+    for joint, name in enumerate(target.joint_names):
+        if joint not in named and name in known:
+            result[name] = name
+    return {name: result[name] for name in target.joint_names if name in result}
+
+
+def read_joint_map(path: str | Path) -> dict[str, str]:
+    """Read a joint map: a JSON object of the body's joints to the motion's; "" keeps a joint still.
+
+    Raises:
+        AssetError: The file is missing or holds something else.
+    """
+    with parsing(path, "joint map", max_bytes=1 << 22) as file:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
+        raise AssetError(
+            f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
+        )
+    return values
+
+
+def complete_map(
+    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return the joint map between two rigs, with a user's changes.
+
+    Raises:
+        MotionError: A changed joint is not there, or nothing maps.
+    """
+    result = map_joints(target, source)
+    for ours, theirs in (changes or {}).items():
+        _check_name(ours, target.joint_names, "the body")
+        if theirs:
+            _check_name(theirs, source.joint_names, "the motion")
+        result[ours] = theirs
+    result = {name: result[name] for name in target.joint_names if result.get(name)}
+    if not result:
+        raise MotionError(
+            f"no joint of the motion ({', '.join(source.joint_names[:4])}, ...) is known to this body "
+            f"({', '.join(target.joint_names[:4])}, ...); give a joint map"
+        )
+    return result
+
+
+def _check_name(name: str, known: Sequence[str], owner: str) -> None:
+    """Raise unless a name of a joint map exists."""
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(known[:6])}, ..."
+        raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")

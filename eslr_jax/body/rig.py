@@ -1,0 +1,334 @@
+"""From what a file holds to what is simulated: a rigged mesh to a body, a moving skeleton to its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body.joints import Part, complete_map, find_parts, torso_axes
+from eslr_jax.body.motion import Motion
+from eslr_jax.body.retarget import leg_length, local_rotations, minimal_rotation
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
+from eslr_jax.types import Body
+
+HEIGHT_RANGE = (0.3, 3.0)  # [m] of a body; outside, the unit of its file is not the metre
+UNITS = {0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
+SAME_REST = 1e-3  # [m] by which the rest joints of one rig differ from file to file
+ORDINARY_TILT = np.deg2rad(35.0)  # rest poses that lean less than this are taken to stand alike
+MAX_LEG_TURN = np.deg2rad(75.0)  # between the legs of two rest poses that both stand
+GROUND_QUANTILE = 0.05  # of the lowest sole of each frame: robust to a toe that dips for a moment
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from Z up
+_LIMBS = {"upper_leg": "lower_leg", "lower_leg": "foot", "upper_arm": "forearm", "forearm": "hand"}
+_HAND = ("hand", "fingers", "thumb", "index", "middle", "ring", "pinky")  # continue the forearm's bone
+
+
+def body_skeleton(body: Body) -> Skeleton:
+    """Return a body's joints at rest."""
+    rest = np.asarray(body.joint_rest_positions, np.float64)
+    return Skeleton(body.joint_names, body.parents, rest)
+
+
+# ---------------------------------------------------------------- bodies
+
+
+def make_body(mesh: RiggedMesh) -> Body:
+    """Make a rigged mesh a body: one vertex a place, the hips first, hands no obstacle.
+
+    Args:
+        mesh: A body as its file has it.
+
+    Raises:
+        AssetError: The mesh is empty, not finite, not in metres, or its weights and faces don't fit.
+    """
+    _check_mesh(mesh)
+    vertices, places = _shared_vertices(mesh.positions)
+    faces = places[mesh.faces]
+    corners = np.sort(faces, axis=1)
+    faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
+    skeleton, order = hips_first(mesh.skeleton)
+    joint_place = np.argsort(order)
+    indices = joint_place[mesh.skin_indices[vertices]]
+    weights = mesh.skin_weights[vertices]
+
+    def floats(values: NDArray):
+        return jnp.asarray(values, jnp.float32)
+
+    shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
+    has_shapes = shapes is not None and joint_shapes is not None
+    return Body(
+        rest_positions=floats(mesh.positions[vertices]),
+        shape_directions=floats(shapes[vertices] if has_shapes else np.zeros((len(vertices), 3, 0))),
+        joint_rest_positions=floats(skeleton.rest_positions),
+        joint_shape_directions=floats(joint_shapes[order] if has_shapes else np.zeros((len(order), 3, 0))),
+        skin_weights=floats(weights / weights.sum(1, keepdims=True)),
+        skin_indices=jnp.asarray(indices, jnp.int32),
+        faces=jnp.asarray(faces, jnp.int32),
+        is_obstacle=jnp.asarray(_is_obstacle(faces, weights, indices, skeleton)),
+        parents=skeleton.parents,
+        joint_names=skeleton.joint_names,
+        pose_directions=None if mesh.pose_directions is None else floats(mesh.pose_directions[vertices]),
+    )
+
+
+def _check_mesh(mesh: RiggedMesh) -> None:
+    """Raise unless a rigged mesh can be a body."""
+    count, joints = len(mesh.positions), len(mesh.skeleton)
+    if count == 0 or len(mesh.faces) == 0:
+        raise AssetError(f"body {mesh.name} has {count} vertices and {len(mesh.faces)} faces; give a mesh")
+    if (
+        mesh.positions.shape != (count, 3)
+        or mesh.faces.shape[1:] != (3,)
+        or mesh.skeleton.rest_positions.shape != (joints, 3)
+    ):
+        raise AssetError(f"body {mesh.name} is no triangle mesh with joints; export it again")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= count:
+        raise AssetError(
+            f"body {mesh.name} has a face that names vertex {mesh.faces.max()} of {count}; export it again"
+        )
+    if mesh.skin_weights.shape != mesh.skin_indices.shape or len(mesh.skin_weights) != count:
+        raise AssetError(
+            f"body {mesh.name} has skin weights for {len(mesh.skin_weights)} of {count} vertices; export it again"
+        )
+    if mesh.skin_indices.min() < 0 or mesh.skin_indices.max() >= joints:
+        raise AssetError(
+            f"body {mesh.name} has a skin weight for joint {mesh.skin_indices.max()} of {joints}; export it again"
+        )
+    values = (mesh.positions, mesh.skin_weights, mesh.skeleton.rest_positions)
+    if not all(np.isfinite(array).all() for array in values):
+        raise AssetError(f"body {mesh.name} has NaN or infinite vertices, weights or joints; repair it")
+    is_bad = (mesh.skin_weights < 0).any(1) | (mesh.skin_weights.sum(1) < 1e-3)
+    if is_bad.any():
+        raise AssetError(
+            f"body {mesh.name}: vertex {np.argmax(is_bad)} has no or negative skin weights; bind it to a joint"
+        )
+    height = float(np.ptp(mesh.positions, axis=0).max())
+    if not HEIGHT_RANGE[0] <= height <= HEIGHT_RANGE[1]:
+        fits = [
+            name for factor, name in UNITS.items() if HEIGHT_RANGE[0] <= height * factor <= HEIGHT_RANGE[1]
+        ]
+        hint = f"it looks like {fits[0]}: " if fits else ""
+        raise AssetError(f"body {mesh.name} is {height:.4g} m large; {hint}scale it to metres")
+
+
+def _shared_vertices(positions: NDArray) -> tuple[NDArray, NDArray]:
+    """Join vertices at bit-identical positions, which exporters split where texture coordinates differ.
+
+    Returns:
+        The vertices kept, in their order, and the place of every vertex among them.
+    """
+    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return np.sort(first), rank[inverse.ravel()]
+
+
+def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: Skeleton) -> NDArray:
+    """Tell the faces that cloth may touch: all but those that follow the hands, which cut themselves."""
+    is_hand = np.zeros(len(skeleton), bool)
+    for (_, chain), joints in find_parts(skeleton).items():
+        is_hand[joints] |= chain in _HAND
+    for joint, parent in enumerate(skeleton.parents):
+        is_hand[joint] |= parent >= 0 and is_hand[parent]
+    leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
+    return ~is_hand[leading][faces].all(axis=1)
+
+
+def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
+    """Hang a skeleton on its hips, since a motion's translation is that of joint 0.
+
+    Returns:
+        The skeleton with the hips as joint 0, and the old index of each of its joints.
+    """
+    hips = find_parts(skeleton)["", "hips"][0]
+    neighbors: dict[int, list[int]] = {}
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            neighbors.setdefault(parent, []).append(joint)
+            neighbors.setdefault(joint, []).append(parent)
+    order, parents = [hips], [-1]
+    seen = {hips}
+    for place, joint in enumerate(order):
+        for other in neighbors.get(joint, []):
+            if other not in seen:
+                seen.add(other)
+                order.append(other)
+                parents.append(place)
+    if hips == 0:  # as the file has it
+        return skeleton, np.arange(len(skeleton))
+    names = tuple(skeleton.joint_names[joint] for joint in order)
+    return Skeleton(names, tuple(parents), skeleton.rest_positions[order]), np.array(order)
+
+
+# ---------------------------------------------------------------- motions
+
+
+def make_motion(
+    source: SkeletonMotion, body: Body, *, joint_map: Mapping[str, str] | None = None, up: str = "y"
+) -> Motion:
+    """Carry a moving skeleton over to a body.
+
+    On its own rig a motion is taken as it is. On another one, limbs point where the source's point, the rest
+    of the body turns as the source's has turned since its rest pose; steps are scaled by the length of the
+    legs, the floor is put at y = 0 and the start above the origin.
+
+    Args:
+        source: The motion of a file.
+        body: The body to move.
+        joint_map: Changes to the map of joints, the body's to the source's; "" keeps a joint still.
+        up: Axis that points up in the source: "y", "z", or "auto" to see it from how the source stands.
+
+    Raises:
+        MotionError: No joint is known to both, or the source does not stand at rest.
+    """
+    if up == "z" or (up == "auto" and _stands_along_z(source)):
+        source = turn_motion(source, _Y_UP)
+    target = body_skeleton(body)
+    mapping = complete_map(target, source.skeleton, joint_map)
+    place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
+    followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
+    is_own = _is_same_rig(target, source, followed)
+    alignments = np.tile(np.eye(3), (len(target), 1, 1))
+    if not is_own:
+        alignments = _align_rests(target, source)
+    turned = np.empty((len(source.rotations), len(target), 3, 3))
+    for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
+        if other >= 0:
+            turned[:, joint] = source.rotations[:, other] @ alignments[joint]
+        else:
+            turned[:, joint] = turned[:, parent] if parent >= 0 else np.eye(3)
+    hips = followed[0] if followed[0] >= 0 else find_parts(source.skeleton)["", "hips"][0]
+    translations = source.positions[:, hips]
+    if not is_own:
+        translations = _scale_of(target, source.skeleton) * translations
+        translations = _put_on_floor(turned, translations, target, body)
+    elif source.root_axes is not None:
+        translations = translations + source.root_axes @ target.rest_positions[0]
+    return Motion(
+        source.name, local_rotations(turned, target.parents), translations, source.fps, target.joint_names
+    )
+
+
+def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:
+    """Return a motion in other axes: every vector v becomes `axes` v."""
+    skeleton = motion.skeleton
+    return SkeletonMotion(
+        motion.name,
+        Skeleton(skeleton.joint_names, skeleton.parents, skeleton.rest_positions @ axes.T),
+        axes @ motion.rotations @ axes.T,
+        motion.positions @ axes.T,
+        motion.fps,
+        motion.root_axes,
+    )
+
+
+def _stands_along_z(motion: SkeletonMotion) -> bool:
+    """Tell whether the head is mostly above the feet along z rather than y."""
+    parts = find_parts(motion.skeleton)
+    upper = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
+    lower = [
+        parts[side, chain][0]
+        for side in ("left", "right")
+        for chain in ("foot", "lower_leg", "upper_leg")
+        if (side, chain) in parts
+    ]
+    if upper is None or not lower:
+        return False
+    rise = (motion.positions[:, upper] - motion.positions[:, lower].mean(axis=1)).mean(axis=0)
+    return bool(rise[2] > abs(rise[1]))
+
+
+def _is_same_rig(target: Skeleton, source: SkeletonMotion, followed: list[int]) -> bool:
+    """Tell whether a motion was made for this very rig."""
+    names = source.skeleton.joint_names
+    if source.root_axes is not None:
+        # Parameters of a body model: its joints are told by name, those without a value rest.
+        known = [name for name, other in zip(target.joint_names, followed, strict=True) if other >= 0]
+        return (
+            target.joint_names[0] == names[0]
+            and len(known) > 0.8 * min(len(target), 22)
+            and set(known) <= set(names)
+        )
+    if any(
+        other < 0 or names[other] != name for name, other in zip(target.joint_names, followed, strict=True)
+    ):
+        return False
+    theirs = source.skeleton.rest_positions[followed]
+    difference = (theirs - theirs[0]) - (target.rest_positions - target.rest_positions[0])
+    return bool(np.abs(difference).max() < SAME_REST)
+
+
+def _align_rests(target: Skeleton, source: SkeletonMotion) -> NDArray:
+    """Return for each joint the rotation from the body's rest pose to the source's, [joints, 3, 3]."""
+    ours, theirs = find_parts(target), find_parts(source.skeleton)
+    upright = _torso_turn(target, ours, source.skeleton, theirs)
+    result = np.tile(upright, (len(target), 1, 1))
+    for side in ("left", "right"):
+        for chain, beyond in _LIMBS.items():
+            parts = (side, chain), (side, beyond)
+            if not all(part in ours and part in theirs for part in parts):
+                continue
+            bone = _bone(target, ours, *parts)
+            other = _bone(source.skeleton, theirs, *parts)
+            if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
+                continue
+            turn = minimal_rotation(upright @ bone, other)
+            if beyond in ("lower_leg", "foot") and np.arccos((np.trace(turn) - 1) / 2) > MAX_LEG_TURN:
+                raise MotionError(
+                    f"motion {source.name}: its rest pose does not stand ({side} {chain} points elsewhere); "
+                    "export it with a T-pose at rest"
+                )
+            chains = (chain, *_HAND) if chain == "forearm" else (chain,)
+            for name in chains:
+                result[ours.get((side, name), [])] = turn @ upright
+    return result
+
+
+def _bone(skeleton: Skeleton, parts: Mapping[Part, list[int]], start: Part, end: Part) -> NDArray:
+    """Return the vector from one part's first joint to another's, at rest."""
+    return skeleton.rest_positions[parts[end][0]] - skeleton.rest_positions[parts[start][0]]
+
+
+def _torso_turn(
+    target: Skeleton, ours: Mapping[Part, list[int]], source: Skeleton, theirs: Mapping[Part, list[int]]
+) -> NDArray:
+    """Return the rotation from the body's rest torso to the source's: quarter turns only, if those do.
+
+    Two rest poses that stand alike still lean by some degrees; that is anatomy, and no turn.
+    """
+    one, other = torso_axes(target, ours), torso_axes(source, theirs)
+    if one is None or other is None:
+        return np.eye(3)
+    turn = other @ one.T
+    quarters = Rotation.create_group("O").as_matrix()
+    angles = np.arccos(np.clip((np.einsum("nab,ab->n", quarters, turn) - 1) / 2, -1, 1))
+    is_near = angles.min() < ORDINARY_TILT
+    return np.round(quarters[angles.argmin()]) if is_near else turn
+
+
+def _scale_of(target: Skeleton, source: Skeleton) -> float:
+    """Return metres of the body's steps per unit of the source's."""
+    ours, theirs = (leg_length(rig.joint_names, rig.rest_positions) for rig in (target, source))
+    return ours / theirs if ours and theirs else 1.0
+
+
+def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:
+    """Return the translations with the start above the origin and the soles on the floor."""
+    translations = translations - translations[0] * [1.0, 0.0, 1.0]
+    parts = find_parts(target)
+    feet = [
+        joint
+        for side in ("left", "right")
+        for chain in ("foot", "toe")
+        for joint in parts.get((side, chain), [])
+    ]
+    if not feet:
+        return translations
+    soles = float(np.asarray(body.rest_positions)[:, 1].min())
+    heights = target.rest_positions[feet, 1] - soles
+    lowest = (chain_positions(turned, translations, target)[:, feet, 1] - heights).min(axis=1)
+    return translations - [0.0, np.quantile(lowest, GROUND_QUANTILE), 0.0]

@@ -1,0 +1,203 @@
+"""Biovision BVH motions: a hierarchy of offsets and Euler channels, then one line of numbers a frame.
+
+The rest pose is the one with all rotations zero: each joint at the sum of the offsets above it. Units and the
+up axis are the file's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.parsing import parsing
+from eslr_jax.io.skeleton import (
+    MAX_FRAMES,
+    MAX_JOINTS,
+    Skeleton,
+    SkeletonMotion,
+    chain_rotations,
+    order_joints,
+    unique_names,
+)
+
+_CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
+
+
+@dataclasses.dataclass
+class _Joint:
+    """One joint of the hierarchy while it is read."""
+
+    name: str
+    parent: int
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    channels: tuple[str, ...] = ()
+
+
+def read_bvh(path: str | Path) -> SkeletonMotion:
+    """Read a BVH file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The motion at its own frame rate, in its own unit and axes.
+
+    Raises:
+        AssetError: The file is missing, or is not BVH; the message names the line.
+        MotionError: It has no usable frames.
+    """
+    with parsing(path, "motion") as file:
+        words = _Words(file)
+        joints = _read_hierarchy(words)
+        values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
+    if not 1e-3 <= frame_time <= 1.0:
+        raise MotionError(f"{file}: a frame time of {frame_time:g} s; expected 0.001 to 1")
+    return _pose(file.stem, joints, values, 1.0 / frame_time)
+
+
+class _Words:
+    """The words of a file, one by one, with the number of their line."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        self.number = 0  # of the lines consumed
+        self.rest: list[str] = []
+
+    def fail(self, cause: str) -> AssetError:
+        """Return the error that names this line."""
+        return AssetError(f"motion file {self.path}, line {self.number}: {cause}; export it again")
+
+    def next(self) -> str:
+        """Return the next word."""
+        while not self.rest:
+            if self.number == len(self.lines):
+                raise self.fail("the file ends here, in the middle")
+            self.rest = self.lines[self.number].split()[::-1]
+            self.number += 1
+        return self.rest.pop()
+
+    def expect(self, *accepted: str) -> str:
+        """Return the next word, which must be one of these."""
+        word = self.next()
+        if word.upper() not in {option.upper() for option in accepted}:
+            raise self.fail(f"{word[:40]!r} where {' or '.join(accepted)} belongs")
+        return word
+
+    def number_of(self, kind: type) -> float:
+        """Return the next word as a number."""
+        word = self.next()
+        try:
+            value = kind(word)
+        except ValueError:
+            raise self.fail(f"{word[:40]!r} is no number") from None
+        if not np.isfinite(value):
+            raise self.fail(f"{word[:40]!r} is not finite")
+        return value
+
+
+def _read_hierarchy(words: _Words) -> list[_Joint]:
+    """Read everything before MOTION; end sites are left out."""
+    words.expect("HIERARCHY")
+    joints: list[_Joint] = []
+    opened: list[int] = []  # joints whose brace is open; -1 is an end site
+    while True:
+        word = words.next().upper()
+        if word in ("ROOT", "JOINT"):
+            if (word == "ROOT") == bool(opened):
+                raise words.fail(f"{word} in the wrong place")
+            if len(joints) == MAX_JOINTS:
+                raise words.fail(f"more than {MAX_JOINTS} joints")
+            name = " ".join(words.rest[::-1]) or words.next()
+            words.rest = []
+            joints.append(_Joint(name.rstrip("{ "), opened[-1] if opened else -1))
+            if not name.endswith("{"):
+                words.expect("{")
+            opened.append(len(joints) - 1)
+        elif word == "END":
+            words.rest = []  # "Site"
+            words.expect("{")
+            opened.append(-1)
+        elif word == "OFFSET":
+            offset = tuple(words.number_of(float) for _ in range(3))
+            if opened and opened[-1] >= 0:
+                joints[opened[-1]].offset = offset
+        elif word == "CHANNELS":
+            count = int(words.number_of(int))
+            if not 0 <= count <= 6 or not opened or opened[-1] < 0:
+                raise words.fail(f"{count} channels")
+            names = tuple(words.expect(*_CHANNELS).capitalize() for _ in range(count))
+            if len(set(names)) != count:
+                raise words.fail("a channel twice")
+            joints[opened[-1]].channels = names
+        elif word == "}":
+            if not opened:
+                raise words.fail("a brace that closes nothing")
+            opened.pop()
+        elif word == "MOTION":
+            if opened or not joints:
+                raise words.fail("MOTION inside the hierarchy")
+            return joints
+        else:
+            raise words.fail(f"{word[:40]!r} is unknown")
+
+
+def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
+    """Read the frame count, the frame time and the table of values."""
+    words.expect("Frames:")
+    num_frames = int(words.number_of(int))
+    words.expect("Frame")
+    words.expect("Time:")
+    frame_time = words.number_of(float)
+    if not 0 < num_frames <= MAX_FRAMES:
+        raise words.fail(f"{num_frames} frames")
+    if num_channels == 0:
+        raise words.fail("no channels to animate")
+    text = " ".join(words.lines[words.number :]).split()
+    if len(text) != num_frames * num_channels:
+        raise words.fail(
+            f"{len(text)} numbers follow; {num_frames} frames of {num_channels} channels need "
+            f"{num_frames * num_channels}"
+        )
+    values = np.array(text, np.float64).reshape(num_frames, num_channels)
+    return values, frame_time
+
+
+def _pose(name: str, joints: list[_Joint], values: np.ndarray, fps: float) -> SkeletonMotion:
+    """Evaluate the channels."""
+    num_frames, num_joints = len(values), len(joints)
+    local = np.tile(np.eye(3), (num_frames, num_joints, 1, 1))
+    offsets = np.tile(np.array([joint.offset for joint in joints]), (num_frames, 1, 1))
+    column = 0
+    for index, joint in enumerate(joints):
+        angles, axes = [], ""
+        for channel in joint.channels:
+            axis = "XYZ".index(channel[0])
+            if channel.endswith("position"):
+                # A position replaces the offset: that is what exporters write and importers expect.
+                offsets[:, index, axis] = values[:, column]
+            else:
+                angles.append(np.remainder(values[:, column] + 180.0, 360.0) - 180.0)
+                axes += channel[0]
+            column += 1
+        if axes:
+            local[:, index] = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix()
+    parents = tuple(joint.parent for joint in joints)
+    rotations = chain_rotations(local, parents)
+    positions = np.empty((num_frames, num_joints, 3))
+    rest = np.zeros((num_joints, 3))
+    for index, (joint, parent) in enumerate(zip(joints, parents, strict=True)):
+        if parent < 0:
+            positions[:, index], rest[index] = offsets[:, index], joint.offset
+        else:
+            moved = np.einsum("tab,tb->ta", rotations[:, parent], offsets[:, index])
+            positions[:, index] = positions[:, parent] + moved
+            rest[index] = rest[parent] + joint.offset
+    names = unique_names([joint.name for joint in joints])
+    order, new_parents = order_joints(names, list(parents), what=f"motion {name}")
+    skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest[order])
+    return SkeletonMotion(name, skeleton, rotations[:, order], positions[:, order], fps)

@@ -1,0 +1,51 @@
+"""One named error for every way in which a file can be broken."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from eslr_jax.errors import AssetError, EslrError
+
+MAX_FILE_BYTES = 2 << 30  # larger files are refused before they are read
+
+
+@contextlib.contextmanager
+def parsing(path: str | Path, content: str, *, max_bytes: int = MAX_FILE_BYTES) -> Iterator[Path]:
+    """Check that a file is there, and turn whatever its parser raises into one named error.
+
+    Args:
+        path: The file.
+        content: What the file should be, for messages, e.g. "motion".
+        max_bytes: Largest file accepted [bytes].
+
+    Yields:
+        The path.
+
+    Raises:
+        AssetError: The file is missing, too large, or its parser failed.
+    """
+    file = Path(path)
+    if not file.is_file():
+        cause = "is a folder" if file.is_dir() else "doesn't exist"
+        raise AssetError(f"{content} file {file} {cause}; check the path")
+    if file.stat().st_size > max_bytes:
+        raise AssetError(f"{content} file {file} is larger than {max_bytes} bytes; cut or reduce it")
+    try:
+        yield file
+    except EslrError:
+        raise
+    except OSError as error:
+        reason = (error.strerror or one_line(error)).lower()
+        raise AssetError(f"{content} file {file} can't be read: {reason}; check the path") from error
+    except Exception as error:  # a parser may raise anything on a damaged file
+        raise AssetError(
+            f"{content} file {file} can't be read ({one_line(error)}); export it again"
+        ) from error
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error's text, cut short, or its type when it has none."""
+    lines = str(error).splitlines()
+    return lines[0][:200] if lines and lines[0].strip() else type(error).__name__

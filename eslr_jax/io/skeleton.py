@@ -1,0 +1,167 @@
+"""What the readers of bodies and motions hand on: a rigged mesh, and a skeleton that moves.
+
+Axes are right-handed, Y up, metres where the format has a unit. The rest pose of a file is its bind pose.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.errors import AssetError, MotionError
+
+MAX_JOINTS = 4096  # more than any character has; a damaged file may claim more
+MAX_FRAMES = 1 << 20  # nine hours at 30 frames per second
+
+
+@dataclasses.dataclass(frozen=True)
+class Skeleton:
+    """Named joints at rest."""
+
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]  # -1 is the root, joint 0; a parent comes before its children
+    rest_positions: np.ndarray  # [joints, 3]
+
+    def __len__(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+
+@dataclasses.dataclass(frozen=True)
+class SkeletonMotion:
+    """A skeleton that moves, joint by joint in world space."""
+
+    name: str
+    skeleton: Skeleton
+    rotations: (
+        np.ndarray
+    )  # how each joint has turned since the rest pose, in world axes [frames, joints, 3, 3]
+    positions: np.ndarray  # [frames, joints, 3]
+    fps: float
+    # None where the format holds a skeleton. Otherwise the skeleton only stands for the body's own, whose root at
+    # rest, turned by this matrix from the file's axes to ours, is to be added to the positions.
+    root_axes: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Check the arrays.
+
+        Raises:
+            MotionError: No frames, too many of them, or values that are not finite.
+        """
+        frames, joints = len(self.rotations), len(self.skeleton)
+        if self.rotations.shape != (frames, joints, 3, 3) or self.positions.shape != (frames, joints, 3):
+            raise MotionError(
+                f"motion {self.name}: rotations {self.rotations.shape} and positions {self.positions.shape} "
+                f"do not fit {joints} joints; export it again"
+            )
+        if not 0 < frames <= MAX_FRAMES:
+            raise MotionError(f"motion {self.name} has {frames} frames; give 1 to {MAX_FRAMES}")
+        for label, values in (("rotations", self.rotations), ("positions", self.positions)):
+            is_bad = ~np.isfinite(values.reshape(frames, -1)).all(axis=1)
+            if is_bad.any():
+                raise MotionError(
+                    f"motion {self.name}: {label} of frame {np.argmax(is_bad)} are not finite; cut or repair it"
+                )
+        if not (np.isfinite(self.fps) and 1.0 <= self.fps <= 1000.0):
+            raise MotionError(f"motion {self.name}: {self.fps} frames per second; expected 1 to 1000")
+
+
+@dataclasses.dataclass(frozen=True)
+class RiggedMesh:
+    """A body as its file has it, in the rest pose."""
+
+    name: str
+    positions: np.ndarray  # [vertices, 3] [m]
+    faces: np.ndarray  # [faces, 3]
+    skin_weights: np.ndarray  # [vertices, influences], rows sum to one
+    skin_indices: np.ndarray  # [vertices, influences]
+    skeleton: Skeleton
+    shape_directions: np.ndarray | None = None  # [vertices, 3, shapes] [m] per standard deviation
+    joint_shape_directions: np.ndarray | None = None  # [joints, 3, shapes]
+    pose_directions: np.ndarray | None = None  # [vertices, 3, 9 (joints - 1)], of the entries of R - I
+
+
+def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[list[int], list[int]]:
+    """Put parents before children, and every joint under one root.
+
+    Args:
+        names: Joints, for messages.
+        parents: Parent of each; -1 is a root. Roots beyond the first become its children.
+        what: What messages call the file.
+
+    Returns:
+        The joints in their new order, and the parent of each in that order.
+
+    Raises:
+        AssetError: There are no joints, too many, or a cycle.
+    """
+    if not 0 < len(names) <= MAX_JOINTS:
+        raise AssetError(f"{what} has {len(names)} joints; expected 1 to {MAX_JOINTS}")
+    if any(not -1 <= parent < len(names) for parent in parents) or -1 not in parents:
+        raise AssetError(f"{what} has joints without a root; export the skeleton again")
+    root = parents.index(-1)
+    children: dict[int, list[int]] = {}
+    for joint, parent in enumerate(parents):
+        if joint != root:
+            children.setdefault(root if parent < 0 else parent, []).append(joint)
+    order, new_parents = [root], [-1]
+    for position, joint in enumerate(order):
+        order += children.get(joint, [])
+        new_parents += [position] * len(children.get(joint, []))
+    if len(order) != len(names):
+        lost = next(joint for joint in range(len(names)) if joint not in order)
+        raise AssetError(f"{what} has joint {names[lost]!r} in a cycle of parents; export the skeleton again")
+    return order, new_parents
+
+
+def unique_names(names: list[str]) -> list[str]:
+    """Number repeated names: hand, hand.2, ..."""
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        result.append(name if seen[name] == 1 else f"{name}.{seen[name]}")
+    return result
+
+
+def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
+    """Return the rotation nearest to each matrix, [..., 3, 3]: scale and shear are dropped."""
+    left, _, right = np.linalg.svd(matrices)
+    sign = np.sign(np.linalg.det(left @ right))
+    left[..., :, 2] *= np.where(sign == 0, 1.0, sign)[..., None]
+    return left @ right
+
+
+def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
+    """Multiply local rotation matrices [frames, joints, 3, 3] down the chain."""
+    result = np.array(local, np.float64)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            result[:, joint] = result[:, parent] @ result[:, joint]
+    return result
+
+
+def chain_positions(rotations: np.ndarray, root: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Return posed joints [frames, joints, 3] of rigid bones.
+
+    Args:
+        rotations: Global rotations since the rest pose, shape [frames, joints, 3, 3].
+        root: Position of joint 0, shape [frames, 3].
+        skeleton: Joints at rest.
+    """
+    result = np.empty(rotations.shape[:3])
+    for joint, parent in enumerate(skeleton.parents):
+        if parent < 0:
+            result[:, joint] = root
+        else:
+            bone = skeleton.rest_positions[joint] - skeleton.rest_positions[parent]
+            result[:, joint] = result[:, parent] + rotations[:, parent] @ bone
+    return result
+
+
+def rotation_matrices(vectors: np.ndarray) -> np.ndarray:
+    """Axis-angle vectors [..., 3] [rad] to matrices [..., 3, 3]."""
+    vectors = np.asarray(vectors, np.float64)
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
