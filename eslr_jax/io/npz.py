@@ -9,7 +9,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -49,12 +49,15 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compr
         save(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
 
 
-def read_arrays(path: str | Path, *, content: str, max_bytes: int = 16 << 30) -> dict[str, np.ndarray]:
-    """Read every array of an npz archive, without unpickling and without trusting its headers.
+def read_arrays(
+    path: str | Path, *, content: str, names: Collection[str] | None = None, max_bytes: int = 16 << 30
+) -> dict[str, np.ndarray]:
+    """Read arrays of an npz archive, without unpickling and without trusting its headers.
 
     Args:
         path: The file to read.
         content: What the file should be, for messages, e.g. "trajectory".
+        names: Read only these, where they are there; None reads all.
         max_bytes: Largest unpacked size accepted [bytes].
 
     Returns:
@@ -64,12 +67,15 @@ def read_arrays(path: str | Path, *, content: str, max_bytes: int = 16 << 30) ->
         AssetError: If the file is missing, truncated, damaged, larger than `max_bytes`, or no npz archive.
     """
     with _readable(path, content), zipfile.ZipFile(path) as archive:
-        total = sum(member.file_size for member in archive.infolist())
+        members = {member.removesuffix(".npy"): member for member in archive.namelist()}
+        if names is not None:
+            members = {name: member for name, member in members.items() if name in names}
+        total = sum(archive.getinfo(member).file_size for member in members.values())
         if total > max_bytes:
             raise AssetError(
                 f"{content} file {path} unpacks to {total} bytes, more than {max_bytes}; check the file"
             )
-        return {name.removesuffix(".npy"): _read_member(archive, name) for name in archive.namelist()}
+        return {name: _read_member(archive, member) for name, member in members.items()}
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from eslr_jax.errors import AssetError, MotionError
 
 MAX_JOINTS = 4096  # more than any character has; a damaged file may claim more
 MAX_FRAMES = 1 << 20  # nine hours at 30 frames per second
+MAX_POSES = 1 << 23  # frames times joints: half a gigabyte of matrices
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,315 @@
+"""A glTF 2.0 file as read: its JSON tables, arrays behind accessors, nodes in world space, key frames.
+
+The tables stay plain dicts: a damaged file must fail with a named error, so each value is checked where it is
+used. Source: Khronos, glTF 2.0 specification.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import urllib.parse
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from eslr_jax.errors import AssetError
+
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_MAX_BLANK = 1 << 22  # elements of an accessor that has no data behind it
+_READ_EXTENSIONS = {  # that change nothing here, or are read
+    "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform", "KHR_materials_specular",
+    "KHR_materials_emissive_strength", "KHR_materials_ior", "KHR_lights_punctual", "KHR_texture_basisu",
+    "EXT_texture_webp", "VRM", "VRMC_vrm", "KHR_materials_pbrSpecularGlossiness",
+}  # fmt: skip
+
+
+class GltfDocument:
+    """The tables of a .gltf or .glb file."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the tables; buffers are read when they are needed."""
+        self.path = path
+        data = path.read_bytes()
+        self._blob: bytes | None = None
+        if data[:4] == struct.pack("<I", _MAGIC):
+            data = self._split(data)
+        self.tables: dict[str, Any] = json.loads(data.decode("utf-8-sig"))
+        if not isinstance(self.tables, dict) or not str(
+            _table(self.tables.get("asset")).get("version")
+        ).startswith("2"):
+            raise self.fail("is no glTF 2.0")
+        needed = set(map(str, self.tables.get("extensionsRequired", []))) - _READ_EXTENSIONS
+        if needed:
+            raise AssetError(
+                f"{path} needs {', '.join(sorted(needed))}, which is not read; export it without compression"
+            )
+
+    def _split(self, data: bytes) -> bytes:
+        """Return the JSON chunk of a GLB and keep the binary one."""
+        version, _ = struct.unpack_from("<II", data, 4)
+        if version != 2:
+            raise self.fail(f"is glTF {version}, not 2")
+        offset, text = 12, b""
+        while offset + 8 <= len(data):
+            length, kind = struct.unpack_from("<II", data, offset)
+            chunk = data[offset + 8 : offset + 8 + length]
+            if len(chunk) < length:
+                raise self.fail("is truncated")
+            if kind == _JSON and not text:
+                text = chunk
+            elif kind == _BIN and self._blob is None:
+                self._blob = chunk
+            offset += 8 + length
+        return text
+
+    def fail(self, cause: str) -> AssetError:
+        """Return an error about this file."""
+        return AssetError(f"{self.path} {cause}; export it again")
+
+    def item(self, table: str, index: Any) -> dict[str, Any]:
+        """Return an entry of a table.
+
+        Raises:
+            AssetError: There is none of this index.
+        """
+        entries = self.tables.get(table, [])
+        if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
+            raise self.fail(f"names {table} {str(index)[:20]}, which it doesn't have")
+        return _table(entries[index])
+
+    def items(self, table: str) -> list[dict[str, Any]]:
+        """Return all entries of a table."""
+        entries = self.tables.get(table, [])
+        return [_table(entry) for entry in entries] if isinstance(entries, list) else []
+
+    def _buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer: the GLB's own, a data URI, or a file beside this one."""
+        uri = self.item("buffers", index).get("uri")
+        if uri is None:
+            if self._blob is None:
+                raise self.fail(f"has no data for buffer {index}")
+            return self._blob
+        if str(uri).startswith("data:"):
+            return base64.b64decode(str(uri).partition(",")[2], validate=True)
+        name = urllib.parse.unquote(str(uri))
+        folder = self.path.parent.resolve()
+        file = (folder / name).resolve()
+        if "://" in name or not file.is_relative_to(folder):
+            raise self.fail(f"refers to {name[:80]!r}, which is not beside it")
+        if not file.is_file():
+            raise AssetError(
+                f"{self.path} refers to {name[:80]!r}, which is not there; keep the files together"
+            )
+        return file.read_bytes()
+
+    @cached_property
+    def _buffers(self) -> list[bytes]:
+        return [self._buffer(index) for index in range(len(self.items("buffers")))]
+
+    def array(self, index: Any) -> np.ndarray:
+        """Return an accessor's values, [count, components] float64, or [count] for scalars.
+
+        Integers of a normalised accessor are divided by their largest value, others are whole floats.
+        """
+        accessor = self.item("accessors", index)
+        dtype, width = _TYPES.get(accessor.get("componentType", 0)), _WIDTHS.get(accessor.get("type", ""))
+        count = accessor.get("count")
+        if dtype is None or width is None or type(count) is not int or count < 1:
+            raise self.fail(f"has an impossible accessor {index}")
+        values = self._values(accessor, np.dtype(dtype), width, count)
+        if "sparse" in accessor:
+            values = self._overwrite(values, _table(accessor["sparse"]), np.dtype(dtype), width)
+        result = values.astype(np.float64)
+        if accessor.get("normalized") and values.dtype.kind in "iu":
+            result = np.maximum(result / np.iinfo(values.dtype).max, -1.0)
+        return result[:, 0] if width == 1 else result
+
+    def _values(self, view_of: dict[str, Any], dtype: np.dtype, width: int, count: int) -> np.ndarray:
+        """Return the raw values that an accessor or a sparse part points to, [count, width]."""
+        if "bufferView" not in view_of:
+            if count > _MAX_BLANK:
+                raise self.fail(f"has {count} values without data")
+            return np.zeros((count, width), dtype)
+        view = self.item("bufferViews", view_of["bufferView"])
+        index = view.get("buffer")
+        if type(index) is not int or not 0 <= index < len(self._buffers):
+            raise self.fail("has a view of no buffer")
+        numbers = [
+            view.get("byteOffset", 0),
+            view_of.get("byteOffset", 0),
+            view.get("byteStride", 0),
+            view.get("byteLength"),
+        ]
+        if not all(type(number) is int and number >= 0 for number in numbers):
+            raise self.fail("has a view with impossible numbers")
+        start, inner, stride, length = numbers
+        size = width * dtype.itemsize
+        stride = stride or size
+        data = self._buffers[index][start : start + length]
+        if stride < size or inner + stride * (count - 1) + size > len(data):
+            raise self.fail(f"has {count} values in a view of {len(data)} bytes")
+        strides = (stride, dtype.itemsize)
+        return np.array(np.ndarray((count, width), dtype, data, inner, strides))
+
+    def _overwrite(
+        self, values: np.ndarray, sparse: dict[str, Any], dtype: np.dtype, width: int
+    ) -> np.ndarray:
+        """Return values with those of a sparse accessor put in."""
+        count = sparse.get("count")
+        if type(count) is not int or not 0 < count <= len(values):
+            raise self.fail("has an impossible sparse accessor")
+        places, entries = _table(sparse.get("indices")), _table(sparse.get("values"))
+        kind = _TYPES.get(places.get("componentType", 0), "<f4")
+        rows = self._values(places, np.dtype(kind), 1, count)[:, 0]
+        if rows.dtype.kind != "u" or rows.max() >= len(values):
+            raise self.fail("has an impossible sparse accessor")
+        values[rows] = self._values(entries, dtype, width, count)
+        return values
+
+    @cached_property
+    def parents(self) -> list[int]:
+        """Parent of every node, -1 for those of the scene."""
+        nodes = self.items("nodes")
+        parents = [-1] * len(nodes)
+        for parent, node in enumerate(nodes):
+            for child in node.get("children", []):
+                if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
+                    raise self.fail(f"has a node with two parents or none ({str(child)[:20]})")
+                parents[child] = parent
+        return parents
+
+    @cached_property
+    def order(self) -> list[int]:
+        """All nodes, parents before children."""
+        children: dict[int, list[int]] = {}
+        for node, parent in enumerate(self.parents):
+            children.setdefault(parent, []).append(node)
+        order = list(children.get(-1, []))
+        for node in order:
+            order += children.get(node, [])
+        if len(order) != len(self.parents):
+            raise self.fail("has nodes in a cycle")
+        return order
+
+    def local_transform(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return a node's translation [3], rotation (x, y, z, w) [4] and scale [3]; a matrix is taken apart."""
+        node = self.item("nodes", index)
+        if "matrix" in node:
+            matrix = _numbers(self, node["matrix"], 16).reshape(4, 4).T
+            scale = np.linalg.norm(matrix[:3, :3], axis=0)
+            if not (scale > 0).all():
+                raise self.fail(f"has node {index} without size")
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                scale[0] = -scale[0]
+            return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3] / scale).as_quat(), scale
+        rotation = _numbers(self, node.get("rotation", [0, 0, 0, 1]), 4)
+        if not np.linalg.norm(rotation) > 0:
+            raise self.fail(f"has node {index} with the rotation zero")
+        return (
+            _numbers(self, node.get("translation", [0, 0, 0]), 3),
+            rotation,
+            _numbers(self, node.get("scale", [1, 1, 1]), 3),
+        )
+
+    def world_matrices(self, animated: dict[tuple[int, str], np.ndarray], num_frames: int) -> np.ndarray:
+        """Return every node's matrix, [frames, nodes, 4, 4].
+
+        Args:
+            animated: Values of (node, path), shape [frames, 3 or 4]; other nodes keep their own.
+            num_frames: Number of frames.
+        """
+        result = np.tile(np.eye(4), (num_frames, len(self.parents), 1, 1))
+        for node in self.order:
+            rest = dict(zip(("translation", "rotation", "scale"), self.local_transform(node), strict=True))
+            moved = {path: animated.get((node, path), value[None]) for path, value in rest.items()}
+            turned = Rotation.from_quat(moved["rotation"]).as_matrix()
+            result[:, node, :3, :3] = turned * moved["scale"][:, None, :]
+            result[:, node, :3, 3] = moved["translation"]
+            if self.parents[node] >= 0:
+                result[:, node] = result[:, self.parents[node]] @ result[:, node]
+        return result
+
+    def key_frames(self, animation: dict[str, Any]) -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
+        """Return (node, path, interpolation, times [s], values) of an animation's channels that move nodes."""
+        samplers = animation.get("samplers", [])
+        result = []
+        for entry in animation.get("channels", []):
+            channel = _table(entry)
+            target, index = _table(channel.get("target")), channel.get("sampler")
+            node, path = target.get("node"), target.get("path")
+            if path not in ("translation", "rotation", "scale") or node is None:
+                continue
+            if type(index) is not int or not 0 <= index < len(samplers):
+                raise self.fail("has an animation channel without a sampler")
+            self.item("nodes", node)
+            sampler = _table(samplers[index])
+            kind = sampler.get("interpolation", "LINEAR")
+            times, values = self.array(sampler.get("input")), self.array(sampler.get("output"))
+            width, each = (4 if path == "rotation" else 3), (3 if kind == "CUBICSPLINE" else 1)
+            if (
+                kind not in ("LINEAR", "STEP", "CUBICSPLINE")
+                or times.ndim != 1
+                or values.shape != (each * len(times), width)
+                or not np.isfinite(times).all()
+                or not np.isfinite(values).all()
+                or (np.diff(times) <= 0).any()
+            ):
+                raise self.fail(f"has an impossible animation of node {node}'s {path}")
+            result.append((node, path, kind, times, values))
+        return result
+
+
+def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return key frames sampled at other times, held before the first and after the last.
+
+    Args:
+        path: "rotation" (quaternions x, y, z, w), "translation" or "scale".
+        kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
+        times: Times of the keys [s], ascending, shape [keys].
+        values: Shape [keys, components], or [3 keys, components] for cubic splines.
+        at: Times wanted [s], shape [samples].
+
+    Source: glTF 2.0, appendix C.
+    """
+    at = np.clip(at, times[0], times[-1])
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, max(len(times) - 2, 0))
+    if kind == "STEP":
+        return values[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)]
+    if kind == "CUBICSPLINE":
+        knots = values.reshape(len(times), 3, -1)
+        if len(times) == 1:
+            return np.repeat(knots[:, 1], len(at), axis=0)
+        span = (times[before + 1] - times[before])[:, None]
+        t = (at - times[before])[:, None] / span
+        return (
+            (2 * t**3 - 3 * t**2 + 1) * knots[before, 1]
+            + span * (t**3 - 2 * t**2 + t) * knots[before, 2]
+            + (3 * t**2 - 2 * t**3) * knots[before + 1, 1]
+            + span * (t**3 - t**2) * knots[before + 1, 0]
+        )
+    if len(times) == 1:
+        return np.repeat(values, len(at), axis=0)
+    if path == "rotation":
+        return Slerp(times, Rotation.from_quat(values))(at).as_quat()
+    t = ((at - times[before]) / (times[before + 1] - times[before]))[:, None]
+    return (1 - t) * values[before] + t * values[before + 1]
+
+
+def _table(value: Any) -> dict[str, Any]:
+    """Return a JSON object, empty for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
+def _numbers(document: GltfDocument, value: Any, count: int) -> np.ndarray:
+    """Return a list of finite numbers of this length."""
+    array = np.array(value, np.float64)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise document.fail("has a node that is moved by no numbers")
+    return array

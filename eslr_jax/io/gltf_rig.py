@@ -1,0 +1,300 @@
+"""Skinned characters and skeleton animations of glTF 2.0 files (.gltf, .glb, .vrm).
+
+The rest pose is the bind pose. A skin's inverse bind matrices give it in a space of the mesh's own; which
+matrix takes that space to the world is told by the nodes, and exporters disagree on which: see `_bind_space`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.gltf_document import GltfDocument, sample_keys
+from eslr_jax.io.parsing import parsing
+from eslr_jax.io.skeleton import (
+    MAX_FRAMES,
+    MAX_POSES,
+    RiggedMesh,
+    Skeleton,
+    SkeletonMotion,
+    nearest_rotations,
+    order_joints,
+    unique_names,
+)
+
+_TRIANGLES = 4  # primitive mode
+_SCALE_TOLERANCE = 0.01  # by which a bind space may differ in size from the posed skin
+
+
+@dataclasses.dataclass
+class _Joints:
+    """The joints of all skins of a file, in world space at rest."""
+
+    nodes: list[int]
+    rest_frames: np.ndarray  # [joints, 4, 4]
+    skeleton: Skeleton
+    spaces: dict[int, np.ndarray]  # skin -> matrix from its mesh space to the world
+
+
+def has_gltf_skin(path: str | Path) -> bool:
+    """Tell whether a glTF file holds a skinned character."""
+    with parsing(path, "body") as file:
+        return bool(GltfDocument(file).items("skins"))
+
+
+def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
+    """Return the names of a file's animations."""
+    with parsing(path, "motion") as file:
+        return _clip_names(GltfDocument(file))
+
+
+def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
+    """Read a skinned character.
+
+    Args:
+        path: .gltf, .glb or .vrm file.
+        meshes: Names of the meshes, or of their nodes, that make up the body; all skinned ones if empty.
+
+    Returns:
+        The character in its bind pose, in world axes; its vertices as the file has them.
+
+    Raises:
+        AssetError: The file is missing, damaged, has no skinned mesh, or not the meshes that are named.
+    """
+    with parsing(path, "body") as file:
+        document = GltfDocument(file)
+        joints = _read_joints(document)
+        found = _skinned_nodes(document)
+        if meshes:
+            unknown = [name for name in meshes if not any(name in names for _, names in found)]
+            if unknown:
+                known = ", ".join(names[0] for _, names in found)
+                raise AssetError(f"{path} has no skinned mesh {unknown[0]!r}; it has {known}")
+            found = [(node, names) for node, names in found if set(names) & set(meshes)]
+        parts = [part for node, _ in found for part in _read_node(document, joints, node)]
+    if not parts:
+        raise AssetError(f"{path} has a skin, but no triangles bound to it; export the mesh with its skin")
+    offsets = np.cumsum([0, *(len(part[0]) for part in parts)])
+    influences = max(part[2].shape[1] for part in parts)
+    positions, faces, weights, indices = zip(*parts, strict=True)
+
+    def widen(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, ((0, 0), (0, influences - array.shape[1])))
+
+    return RiggedMesh(
+        name=file.name,
+        positions=np.concatenate(positions),
+        faces=np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=False)]),
+        skin_weights=np.concatenate([widen(part) for part in weights]),
+        skin_indices=np.concatenate([widen(part) for part in indices]),
+        skeleton=joints.skeleton,
+    )
+
+
+def read_gltf_motion(path: str | Path, clip: str = "") -> SkeletonMotion:
+    """Read an animation of a skinned character's joints.
+
+    Args:
+        path: .gltf, .glb or .vrm file.
+        clip: Name of the animation; not needed where there is one.
+
+    Returns:
+        The motion, sampled at the rate of its densest keys.
+
+    Raises:
+        AssetError: The file is missing, damaged, or has no skin.
+        MotionError: It has no such animation, or the animation moves no joint.
+    """
+    with parsing(path, "motion") as file:
+        document = GltfDocument(file)
+        names = _clip_names(document)
+        if not names:
+            raise MotionError(f"{path} has no animation; export the character with one")
+        if not clip and len(names) > 1:
+            raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
+        if clip and clip not in names:
+            raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+        joints = _read_joints(document)
+        index = names.index(clip) if clip else 0
+        keys = document.key_frames(document.items("animations")[index])
+        if not keys:
+            raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")
+        times, fps = _sample_times(document, [key[3] for key in keys])
+        if len(times) * len(document.parents) > MAX_POSES:
+            raise MotionError(f"{path}: {len(times)} frames of {len(document.parents)} nodes; cut the clip")
+        animated = {
+            (node, what): sample_keys(what, kind, at, values, times) for node, what, kind, at, values in keys
+        }
+        world = document.world_matrices(animated, len(times))[:, joints.nodes]
+        since_rest = world @ np.linalg.inv(joints.rest_frames)
+        return SkeletonMotion(
+            names[index], joints.skeleton, nearest_rotations(since_rest[..., :3, :3]), world[..., :3, 3], fps
+        )
+
+
+def _clip_names(document: GltfDocument) -> tuple[str, ...]:
+    """Names of the animations; those without one are numbered."""
+    entries = document.items("animations")
+    return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
+
+
+def _sample_times(document: GltfDocument, inputs: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Return evenly spaced times over all keys [s], and their rate."""
+    start, end = min(times[0] for times in inputs), max(times[-1] for times in inputs)
+    steps = [float(np.median(np.diff(times))) for times in inputs if len(times) > 1]
+    fps = float(np.clip(1.0 / min(steps), 1.0, 1000.0)) if steps else 30.0
+    count = np.floor((end - start) * fps + 1e-3) + 1
+    if not count <= MAX_FRAMES:
+        raise document.fail(f"has an animation of {end - start:.3g} s")
+    return start + np.arange(int(count)) / fps, fps
+
+
+def _skinned_nodes(document: GltfDocument) -> list[tuple[int, list[str]]]:
+    """Return the nodes that carry a skinned mesh, with the names they go by."""
+    found = []
+    for index, node in enumerate(document.items("nodes")):
+        if "mesh" in node and "skin" in node:
+            mesh = document.item("meshes", node["mesh"])
+            names = [str(entry["name"]) for entry in (node, mesh) if entry.get("name")]
+            found.append((index, names or [f"mesh{index}"]))
+    return found
+
+
+def _read_joints(document: GltfDocument) -> _Joints:
+    """Collect the joints of all skins at rest."""
+    skins = document.items("skins")
+    if not skins:
+        raise AssetError(f"{document.path} has no skin; give a character that is bound to a skeleton")
+    world = document.world_matrices({}, 1)[0]
+    users = {
+        node.get("skin"): index
+        for index, node in reversed(list(enumerate(document.items("nodes"))))
+        if "skin" in node
+    }
+    frames: dict[int, np.ndarray] = {}
+    spaces: dict[int, np.ndarray] = {}
+    for number, skin in enumerate(skins):
+        nodes, bind = _read_skin(document, skin, number)
+        user = users.get(number)
+        spaces[number] = _bind_space(document, world, nodes, bind, user)
+        rest = spaces[number] @ np.linalg.inv(bind)
+        for node, frame in zip(nodes, rest, strict=True):
+            frames.setdefault(node, frame)
+    nodes = [node for node in document.order if node in frames]
+    place = {node: joint for joint, node in enumerate(nodes)}
+    parents = []
+    for node in nodes:
+        above = document.parents[node]
+        while above >= 0 and above not in place:
+            above = document.parents[above]
+        parents.append(place.get(above, -1))
+    names = unique_names([str(document.item("nodes", node).get("name") or f"joint{node}") for node in nodes])
+    order, new_parents = order_joints(names, parents, what=str(document.path))
+    nodes = [nodes[joint] for joint in order]
+    rest_frames = np.stack([frames[node] for node in nodes])
+    skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest_frames[:, :3, 3])
+    return _Joints(nodes, rest_frames, skeleton, spaces)
+
+
+def _read_skin(document: GltfDocument, skin: dict[str, Any], number: int) -> tuple[list[int], np.ndarray]:
+    """Return a skin's joint nodes and its inverse bind matrices [joints, 4, 4]."""
+    nodes = skin.get("joints", [])
+    if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
+        raise document.fail(f"has skin {number} without joints, or with one twice")
+    for node in nodes:
+        document.item("nodes", node)
+    bind = np.tile(np.eye(4), (len(nodes), 1, 1))
+    if "inverseBindMatrices" in skin:
+        values = document.array(skin["inverseBindMatrices"])
+        if values.shape[1:] != (16,) or len(values) < len(nodes):
+            raise document.fail(f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints")
+        bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
+    if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
+        raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
+    return nodes, bind
+
+
+def _bind_space(
+    document: GltfDocument, world: np.ndarray, nodes: list[int], bind: np.ndarray, user: int | None
+) -> np.ndarray:
+    """Return the matrix that takes a skin's mesh space to the world in the bind pose.
+
+    In the pose that the nodes show, joint j takes the mesh space to the world by G_j B_j. Where they show the
+    bind pose these agree, and are the answer. Else it is the node of the mesh, the parent of the skeleton, or
+    the skeleton's first joint, whichever has the right size and is nearest to all joints.
+    """
+    posed = world[nodes] @ bind
+    candidates = [posed[0]]
+    top = min(nodes, key=document.order.index)
+    candidates.append(world[document.parents[top]] if document.parents[top] >= 0 else np.eye(4))
+    if user is not None:
+        candidates.append(world[user])
+    size = np.cbrt(np.abs(np.linalg.det(posed[:, :3, :3])).clip(1e-12))
+    best, least = posed[0], np.inf
+    for candidate in candidates:
+        own = np.cbrt(abs(np.linalg.det(candidate[:3, :3])))
+        if own < 1e-9 or abs(own / size[0] - 1) > _SCALE_TOLERANCE:
+            continue
+        away = np.abs((posed - candidate)[:, :3, :3]).mean() / own
+        # The first joint's own turn is the last resort, unless all others agree with it.
+        away += 0.0 if candidate is not posed[0] else 1e-6
+        if away < least:
+            best, least = candidate, away
+    return best
+
+
+def _read_node(
+    document: GltfDocument, joints: _Joints, index: int
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Return positions [m], faces, weights and joints of each primitive of a skinned node."""
+    node = document.item("nodes", index)
+    skin = document.item("skins", node["skin"])
+    space = joints.spaces[node["skin"]]
+    place = {joint: number for number, joint in enumerate(joints.nodes)}
+    order = np.array([place[joint] for joint in skin["joints"]])
+    result = []
+    for primitive in document.item("meshes", node["mesh"]).get("primitives", []):
+        attributes = primitive.get("attributes", {})
+        if "JOINTS_0" not in attributes:
+            continue
+        if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
+            raise document.fail("has a body of strips or lines, not triangles")
+        points = document.array(attributes.get("POSITION"))
+        if points.shape[1:] != (3,):
+            raise document.fail("has positions that are no points")
+        faces = document.array(primitive["indices"]) if "indices" in primitive else np.arange(len(points))
+        if faces.ndim != 1 or len(faces) % 3 or faces.max() >= len(points):
+            raise document.fail("has faces that are no triangles of its vertices")
+        faces = faces.reshape(-1, 3).astype(np.int64)
+        if np.linalg.det(space[:3, :3]) < 0:
+            faces = faces[:, ::-1]
+        weights, local = _read_weights(document, attributes, len(points))
+        if local.max() >= len(order):
+            raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
+        world = points @ space[:3, :3].T + space[:3, 3]
+        result.append((world, faces, weights, order[local.astype(np.int64)]))
+    return result
+
+
+def _read_weights(
+    document: GltfDocument, attributes: dict[str, Any], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return all skin weights of a primitive, rows summing to one, and their joints, [vertices, influences]."""
+    weights, joints = [], []
+    number = 0
+    while f"JOINTS_{number}" in attributes:
+        weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
+        joints.append(document.array(attributes[f"JOINTS_{number}"]))
+        if weights[-1].shape != (count, 4) or joints[-1].shape != (count, 4):
+            raise document.fail("has skin weights that don't fit its vertices")
+        number += 1
+    weight, joint = np.concatenate(weights, axis=1), np.concatenate(joints, axis=1)
+    total = weight.sum(axis=1, keepdims=True)
+    if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
+        raise document.fail("has a vertex without skin weights")
+    return weight / total, np.where(weight > 0, joint, 0.0)

@@ -1,0 +1,298 @@
+"""SMPL, SMPL-H and SMPL-X: body models from the user's own .npz or .pkl, and motions given as their parameters.
+
+Nothing of these models ships here; their licence asks every user to fetch them. Motions: AMASS .npz (Z up), and
+the pickles of HOOD and of the VTO dataset (Y up). They hold rotations of joints that are told by number, and no
+skeleton.
+
+Source: Loper et al. 2015 (doi:10.1145/2816795.2818013); Pavlakos et al. 2019 (arXiv:1904.05866); AMASS,
+Mahmood et al. 2019 (arXiv:1904.03278).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.parsing import parsing
+from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.skeleton import (
+    RiggedMesh,
+    Skeleton,
+    SkeletonMotion,
+    chain_positions,
+    chain_rotations,
+    order_joints,
+    rotation_matrices,
+)
+
+NUM_SHAPES = 10  # leading shape directions kept; later files hold up to 400
+MAX_VERTICES = 1 << 20
+HOOD_FPS = 30.0  # HOOD and the VTO dataset store no frame rate; theirs is this
+
+_BODY = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
+    "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+_BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+_HANDS = tuple(
+    f"{side}_{finger}{number}"
+    for side in ("left", "right")
+    for finger in ("index", "middle", "pinky", "ring", "thumb")
+    for number in (1, 2, 3)
+)
+_FACE = ("jaw", "left_eye", "right_eye")
+JOINT_NAMES = {  # by number of joints
+    22: _BODY,
+    24: (*_BODY, "left_hand", "right_hand"),  # SMPL
+    52: (*_BODY, *_HANDS),  # SMPL-H
+    55: (*_BODY, *_FACE, *_HANDS),  # SMPL-X
+}
+_MODEL_KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table")
+_OPTIONAL_KEYS = ("shapedirs", "posedirs", "joint_names")
+_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # to Y up
+
+# A person who stands in a T-pose, for motions whose own body is not at hand [m]: straight limbs, with segments of
+# Drillis and Contini (1966) for a height of 1.7 m. Only directions and the length of the legs are used.
+_T_POSE = {
+    "pelvis": (0, 0, 0), "hip": (0.09, -0.08, 0), "knee": (0.09, -0.495, 0), "ankle": (0.09, -0.915, 0),
+    "foot": (0.09, -0.96, 0.13), "spine1": (0, 0.11, 0), "spine2": (0, 0.24, 0), "spine3": (0, 0.3, 0),
+    "neck": (0, 0.51, 0), "head": (0, 0.6, 0), "collar": (0.08, 0.42, 0), "shoulder": (0.18, 0.44, 0),
+    "elbow": (0.49, 0.44, 0), "wrist": (0.74, 0.44, 0), "hand": (0.82, 0.44, 0),
+}  # fmt: skip
+
+
+# ---------------------------------------------------------------- bodies
+
+
+def is_smpl_model(path: str | Path) -> bool:
+    """Tell an .npz of a SMPL model from other archives by its keys."""
+    return {"v_template", "kintree_table"} <= set(read_arrays(path, content="body", names=_MODEL_KEYS))
+
+
+def read_smpl_body(path: str | Path) -> RiggedMesh:
+    """Read a body model in the layout of SMPL.
+
+    Args:
+        path: .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and if present shapedirs,
+            posedirs and joint_names; 24, 52 or 55 joints are SMPL's, SMPL-H's and SMPL-X's, other numbers
+            need joint_names.
+
+    Returns:
+        The mean body at rest, with its shape and pose blend shapes.
+
+    Raises:
+        AssetError: The file is missing, damaged, or lacks a part of a body model.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".pkl":
+        values = read_pickle(path, content="body")
+    else:
+        values = read_arrays(path, content="body", names=(*_MODEL_KEYS, *_OPTIONAL_KEYS))
+    if not isinstance(values, dict):
+        raise AssetError(f"body file {path} holds no table; give a SMPL model")
+    missing = [key for key in _MODEL_KEYS if key not in values]
+    if missing:
+        raise AssetError(f"body file {path} lacks {', '.join(missing)}; give a SMPL model")
+    with parsing(path, "body"):
+        return _smpl_body(path, values)
+
+
+def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
+    """Build the body of a model's arrays."""
+    positions = _numbers(path, values, "v_template", (None, 3))
+    count = len(positions)
+    if not 0 < count <= MAX_VERTICES:
+        raise AssetError(f"body file {path} has {count} vertices; expected 1 to {MAX_VERTICES}")
+    weights = _numbers(path, values, "weights", (count, None))
+    joints = weights.shape[1]
+    names = _joint_names(path, values, joints)
+    tree = _numbers(path, values, "kintree_table", (2, joints)).astype(np.int64)
+    numbers = {int(number): place for place, number in enumerate(tree[1])}
+    parents = [-1, *(numbers.get(int(parent), -2) for parent in tree[0, 1:])]
+    order, new_parents = order_joints(names, parents, what=f"body file {path}")
+    if order != list(range(joints)):
+        raise AssetError(f"body file {path} has joints before their parents; give a SMPL model")
+    regressor = _regressor(path, values["J_regressor"], joints, count)
+    shapes = joint_shapes = pose = None
+    if "shapedirs" in values:
+        shapes = _numbers(path, values, "shapedirs", (count, 3, None))[:, :, :NUM_SHAPES]
+        joint_shapes = (regressor @ shapes.reshape(count, -1)).reshape(joints, 3, -1)
+    if "posedirs" in values:
+        pose = _numbers(path, values, "posedirs", (count, 3, 9 * (joints - 1)))
+        _check_finite(path, "posedirs", pose)
+    used = max(1, int((weights > 0).sum(1).max()))
+    indices = np.argsort(-weights, axis=1, kind="stable")[:, :used]
+    return RiggedMesh(
+        name=path.name,
+        positions=positions,
+        faces=_numbers(path, values, "f", (None, 3)).astype(np.int64),
+        skin_weights=np.take_along_axis(weights, indices, axis=1),
+        skin_indices=indices,
+        skeleton=Skeleton(tuple(names), tuple(new_parents), regressor @ positions),
+        shape_directions=shapes,
+        joint_shape_directions=joint_shapes,
+        pose_directions=pose,
+    )
+
+
+def _numbers(path: Path, values: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return an array of numbers of this shape, None standing for any length."""
+    array = np.asarray(values[key])
+    fits = array.ndim == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind not in "fiu" or not fits:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise AssetError(
+            f"{path}: {key} has shape {array.shape} and type {array.dtype}, not numbers of shape [{wanted}]; "
+            "fetch the file again"
+        )
+    return array if array.dtype.kind in "iu" else array.astype(np.float64)
+
+
+def _check_finite(path: Path, key: str, array: np.ndarray) -> None:
+    """Raise on NaN and infinity."""
+    if not np.isfinite(array).all():
+        raise AssetError(f"{path}: {key} is not finite; fetch the file again")
+
+
+def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str]:
+    """Return the names of a model's joints."""
+    if "joint_names" in values:
+        names = [str(name) for name in np.ravel(np.asarray(values["joint_names"]))]
+        if len(names) == joints and len(set(names)) == joints:
+            return names
+        raise AssetError(f"{path}: joint_names does not name {joints} joints; correct it")
+    if joints not in JOINT_NAMES:
+        raise AssetError(
+            f"{path} has {joints} joints; SMPL has 24, SMPL-H 52, SMPL-X 55: add joint_names for another model"
+        )
+    return list(JOINT_NAMES[joints])
+
+
+def _regressor(path: Path, value: Any, joints: int, count: int) -> Any:
+    """Return the matrix from vertices to joints, dense or sparse as the file has it."""
+    matrix = value if scipy.sparse.issparse(value) else np.asarray(value)
+    if matrix.shape != (joints, count) or matrix.dtype.kind not in "fiu":
+        raise AssetError(
+            f"{path}: J_regressor has shape {matrix.shape}, not [{joints}, {count}]; fetch the file again"
+        )
+    return matrix.astype(np.float64)
+
+
+# ---------------------------------------------------------------- motions
+
+
+def read_amass(path: str | Path) -> SkeletonMotion:
+    """Read an AMASS .npz: `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`), Z up.
+
+    Raises:
+        AssetError: The file is missing or damaged.
+        MotionError: It lacks a part, or is no motion of 22, 24, 52 or 55 joints.
+    """
+    keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
+    values = read_arrays(path, content="motion", names=keys)
+    rates = [values[key] for key in keys[2:] if key in values]
+    missing = [key for key in keys[:2] if key not in values] + ([] if rates else [keys[2]])
+    if missing:
+        raise MotionError(
+            f"motion file {path} lacks {', '.join(missing)}; give a motion of AMASS, not its shape"
+        )
+    if rates[0].size != 1 or rates[0].dtype.kind not in "fiu":
+        raise MotionError(f"motion file {path}: {rates[0].dtype} as the frame rate; expected a number")
+    return _parameters(Path(path), values["poses"], values["trans"], float(rates[0].ravel()[0]), _Z_UP)
+
+
+def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
+    """Read a motion of HOOD or of the VTO dataset, Y up, 30 frames per second.
+
+    Args:
+        path: .pkl with `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
+
+    Raises:
+        AssetError: The file is missing, damaged, or holds anything but plain data.
+        MotionError: It lacks a part, or is no motion of 22, 24, 52 or 55 joints.
+    """
+    values = read_pickle(path, content="motion")
+    values = values if isinstance(values, dict) else {}
+    names = {
+        "pose": next((key for key in ("pose", "poses") if key in values), None),
+        "move": next((key for key in ("transl", "translation", "trans") if key in values), None),
+    }
+    if {"global_orient", "body_pose"} <= values.keys():
+        with parsing(path, "motion"):
+            parts = (np.atleast_2d(np.asarray(values[key])) for key in ("global_orient", "body_pose"))
+            poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    elif names["pose"] is not None:
+        poses = values[names["pose"]]
+    else:
+        found = ", ".join(str(key)[:30] for key in list(values)[:6]) or "no table"
+        raise MotionError(f"motion file {path} has {found}; it needs body_pose and global_orient, or pose")
+    if names["move"] is None:
+        raise MotionError(f"motion file {path} has no transl or translation; give a motion of HOOD or VTO")
+    return _parameters(Path(path), poses, values[names["move"]], HOOD_FPS, np.eye(3))
+
+
+def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray) -> SkeletonMotion:
+    """Return the motion of a table of axis-angle rotations [rad] and translations [m].
+
+    Args:
+        path: The file, for messages.
+        poses: Shape [frames, 3 joints].
+        moves: Shape [frames, 3].
+        fps: Frames per second.
+        axes: From the file's axes to ours.
+    """
+    poses, moves = np.asarray(poses), np.asarray(moves)
+    is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
+    if (
+        not is_table
+        or moves.shape != (len(poses), 3)
+        or poses.shape[1] // 3 not in JOINT_NAMES
+        or poses.shape[1] % 3
+    ):
+        raise MotionError(
+            f"motion file {path}: rotations {poses.shape} and translations {moves.shape}; expected [frames, 3 "
+            f"times {', '.join(map(str, JOINT_NAMES))} joints] and [frames, 3]"
+        )
+    for label, table in (("rotations", poses), ("translations", moves)):
+        if not np.isfinite(table).all():
+            frame = int(np.argmin(np.isfinite(table).all(axis=1)))
+            raise MotionError(
+                f"motion file {path}: {label} of frame {frame} are not finite; cut or repair it"
+            )
+    skeleton = _standing_skeleton(poses.shape[1] // 3)
+    local = rotation_matrices(poses.reshape(len(poses), -1, 3))
+    local[:, 0] = axes @ local[:, 0]
+    rotations = chain_rotations(local, skeleton.parents)
+    positions = chain_positions(rotations, moves.astype(np.float64) @ axes.T, skeleton)
+    return SkeletonMotion(path.stem, skeleton, rotations, positions, fps, root_axes=axes)
+
+
+def _standing_skeleton(joints: int) -> Skeleton:
+    """Return SMPL's joints on a person who stands in a T-pose."""
+    names = JOINT_NAMES[joints]
+    parents = list(_BODY_PARENTS)
+    for place in range(len(_BODY), joints):
+        name = names[place]
+        side = name.split("_")[0]
+        if name.endswith(("2", "3")):
+            parents.append(place - 1)
+        else:
+            parents.append(_BODY.index("head" if name in _FACE else f"{side}_wrist"))
+    rest = []
+    for name, parent in zip(names, parents, strict=True):
+        side, _, word = name.rpartition("_")
+        if word in _T_POSE:
+            x, y, z = _T_POSE[word]
+            rest.append((-x if side == "right" else x, y, z))
+        else:
+            rest.append(rest[parent])
+    return Skeleton(names, tuple(parents), np.array(rest, np.float64))
