@@ -1,0 +1,133 @@
+"""A body without a rig: a mesh sequence, on which patches of its surface stand for joints (host)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.geometry.skinning import smooth
+from eslr_jax.geometry.topology import unique_edges
+from eslr_jax.io.mesh_sequence import MeshSequence
+from eslr_jax.io.skeleton import nearest_rotations
+from eslr_jax.types import Body, BodyMotion
+
+NUM_PATCHES = 48  # pieces that move almost rigidly; about two a limb segment
+_BLEND_STEPS = 12  # Laplacian smoothings of the patches' weights
+_INFLUENCES = 4
+_SIZES = (0.3, 3.0)  # [m] largest extent of a body; outside, the unit is not the metre
+
+
+def pose_sequence(
+    sequence: MeshSequence, *, fps: float = 30.0, num_frames: int | None = None
+) -> tuple[Body, BodyMotion]:
+    """Make a moving mesh a body in motion.
+
+    The vertices move exactly as in the sequence, resampled in time by straight lines. Patches of the surface
+    follow the best rigid motion of their vertices; a garment that fits the first frame is carried along by
+    them to its pins and its start.
+
+    Args:
+        sequence: The mesh in motion; its first frame is the rest pose.
+        fps: Frame rate of the simulation.
+        num_frames: Keep this many frames; None keeps all.
+
+    Raises:
+        AssetError: The mesh is not of a body's size in metres.
+        MotionError: There are fewer frames than asked for.
+    """
+    rest, faces = sequence.positions[0], np.asarray(sequence.faces, np.int64)
+    extent = float(np.ptp(rest, axis=0).max())
+    if not _SIZES[0] <= extent <= _SIZES[1]:
+        raise AssetError(f"{sequence.name} is {extent:.4g} m large in its first frame; scale it to metres")
+    positions = _resample(sequence.positions, sequence.fps, fps)
+    if num_frames is not None:
+        if num_frames > len(positions):
+            raise MotionError(
+                f"{sequence.name} has {len(positions)} frames at {fps:g} fps, fewer than the {num_frames} "
+                "asked for; ask for fewer"
+            )
+        positions = positions[:num_frames]
+    weights, indices, dense = _patch_weights(rest, faces)
+    transforms, centers = _fit_patches(positions, rest, dense)
+    patches = dense.shape[1]
+    body = Body(
+        rest_positions=jnp.asarray(rest, jnp.float32),
+        shape_directions=jnp.zeros((len(rest), 3, 0), jnp.float32),
+        joint_rest_positions=jnp.asarray(centers, jnp.float32),
+        joint_shape_directions=jnp.zeros((patches, 3, 0), jnp.float32),
+        skin_weights=jnp.asarray(weights, jnp.float32),
+        skin_indices=jnp.asarray(indices, jnp.int32),
+        faces=jnp.asarray(faces, jnp.int32),
+        is_obstacle=jnp.ones(len(faces), bool),
+        parents=(-1,) * patches,
+        joint_names=tuple(f"patch{patch}" for patch in range(patches)),
+    )
+    motion = BodyMotion(
+        positions=jnp.asarray(positions, jnp.float32),
+        joint_transforms=jnp.asarray(transforms, jnp.float32),
+        faces=body.faces,
+        is_obstacle=body.is_obstacle,
+        timestep=jnp.float32(1.0 / fps),
+        rest_positions=body.rest_positions,
+    )
+    return body, motion
+
+
+def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
+    """Return positions at another frame rate, by straight lines between frames."""
+    count = int(np.floor((len(positions) - 1) / fps_in * fps_out + 1e-6)) + 1
+    at = np.arange(count) * (fps_in / fps_out)
+    before = np.clip(at.astype(int), 0, max(len(positions) - 2, 0))
+    share = np.clip(at - before, 0.0, 1.0)[:, None, None]
+    after = np.minimum(before + 1, len(positions) - 1)
+    return (1 - share) * positions[before] + share * positions[after]
+
+
+def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Divide a surface into patches with soft borders.
+
+    Returns:
+        The largest weights of every vertex, which sum to one, and their patches, [vertices, influences]; and
+        all weights, [vertices, patches].
+    """
+    edges = unique_edges(faces)
+    lengths = np.maximum(np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1), 1e-9)
+    graph = scipy.sparse.csr_array((lengths, (edges[:, 0], edges[:, 1])), (len(rest), len(rest)))
+    # Along the surface, so that a hanging arm and the hip beside it stay apart; farthest points first.
+    nearest, owner = np.full(len(rest), np.inf), np.zeros(len(rest), np.int64)
+    seed = int(rest[:, 1].argmax())
+    for patch in range(min(NUM_PATCHES, len(rest))):
+        distance = dijkstra(graph, directed=False, indices=seed, limit=float(nearest.max()))
+        is_nearer = distance < nearest
+        nearest[is_nearer], owner[is_nearer] = distance[is_nearer], patch
+        seed = int(nearest.argmax())
+        if nearest[seed] == 0:
+            break
+    patches = int(owner.max()) + 1
+    dense = smooth(np.eye(patches)[owner], faces, _BLEND_STEPS)
+    used = min(_INFLUENCES, patches)
+    indices = np.argsort(-dense, axis=1, kind="stable")[:, :used]
+    weights = np.take_along_axis(dense, indices, axis=1)
+    return weights / weights.sum(1, keepdims=True), indices, dense
+
+
+def _fit_patches(positions: NDArray, rest: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
+    """Return each patch's best rigid motion, [frames, patches, 3, 4], and its rest centre, [patches, 3].
+
+    Source: Kabsch 1976 (doi:10.1107/S0567739476001873).
+    """
+    share = weights / np.maximum(weights.sum(axis=0), 1e-12)
+    centers = share.T @ rest
+    transforms = np.empty((len(positions), weights.shape[1], 3, 4))
+    moments = np.einsum("vp,va->vpa", share, rest) - share[:, :, None] * centers
+    for frame, points in enumerate(positions):
+        middle = share.T @ points
+        covariance = np.einsum("va,vpb->pab", points, moments)
+        turned = nearest_rotations(covariance)
+        transforms[frame, :, :, :3] = turned
+        transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
+    return transforms, centers
