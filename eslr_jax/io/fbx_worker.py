@@ -120,8 +120,7 @@ def _animation(
     _KEPT.append(anim)
     for index, node in enumerate(nodes):  # ufbx lists parents before children
         values = [
-            ufbx.evaluate_transform(anim, node, stack.time_begin + frame / fps)
-            for frame in range(frames)
+            ufbx.evaluate_transform(anim, node, stack.time_begin + frame / fps) for frame in range(frames)
         ]
         turned = Rotation.from_quat(
             [(v.rotation.x, v.rotation.y, v.rotation.z, v.rotation.w) for v in values]

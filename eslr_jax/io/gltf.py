@@ -20,7 +20,7 @@ import pygltflib as gltf
 
 from eslr_jax.errors import MeshError, MotionError
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.gltf_builder import GlbBuilder, append, check_mesh, vertex_normals
+from eslr_jax.io.gltf_builder import GlbBuilder, append, check_mesh, split_seams, vertex_normals
 from eslr_jax.io.gltf_skin import SkinnedMesh, add_skinned_mesh
 
 DEFAULT_CLOTH_COLOR = (0.20, 0.42, 0.62, 1.0)  # sRGB
@@ -34,6 +34,7 @@ class AnimatedMesh:
     positions: np.ndarray  # [frames, vertices, 3], [m]
     faces: np.ndarray  # [faces, 3]
     color: tuple[float, float, float, float] = DEFAULT_CLOTH_COLOR  # sRGB and opacity
+    corner_uvs: np.ndarray | None = None  # texture coordinates of every face's corners, v up [faces, 3, 2]
 
 
 def write_animated_glb(
@@ -91,10 +92,19 @@ def _add_morphing_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float,
             f"mesh {mesh.name} has positions of shape {positions.shape}; it needs [frames, vertices, 3]"
         )
     check_mesh(mesh.name, positions, faces)
-    base, targets = _frame_attributes(builder, positions, faces, has_normals)
+    if mesh.corner_uvs is not None and np.shape(mesh.corner_uvs) != (len(faces), 3, 2):
+        raise MeshError(
+            f"mesh {mesh.name} has texture coordinates {np.shape(mesh.corner_uvs)} for {len(faces)} faces; "
+            "they must be [faces, 3, 2]"
+        )
+    split, vertices, uvs = split_seams(faces, positions.shape[1], mesh.corner_uvs)
+    base, targets = _frame_attributes(builder, positions, faces, vertices, has_normals)
+    if uvs is not None:
+        flipped = np.ascontiguousarray(uvs * [1, -1] + [0, 1], np.float32)  # glTF counts v from the top
+        base.TEXCOORD_0 = builder.add_accessor(flipped, gltf.VEC2, target=gltf.ARRAY_BUFFER)
     primitive = gltf.Primitive(
         attributes=base,
-        indices=builder.add_indices(faces, positions.shape[1]),
+        indices=builder.add_indices(split, len(vertices)),
         material=builder.add_material(mesh.name, mesh.color),
         targets=targets,
     )
@@ -117,10 +127,11 @@ def _add_morphing_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float,
 
 
 def _frame_attributes(
-    builder: GlbBuilder, positions: np.ndarray, faces: np.ndarray, has_normals: bool
+    builder: GlbBuilder, positions: np.ndarray, faces: np.ndarray, vertices: np.ndarray, has_normals: bool
 ) -> tuple[gltf.Attributes, list[gltf.Attributes]]:
     """Add the vertex data of every frame: the base attributes, then differences from them."""
-    normals = [vertex_normals(frame, faces) for frame in positions] if has_normals else []
+    normals = [vertex_normals(frame, faces)[vertices] for frame in positions] if has_normals else []
+    positions = positions[:, vertices]
     base = gltf.Attributes(POSITION=builder.add_points(positions[0]))
     if has_normals:
         base.NORMAL = builder.add_accessor(normals[0], gltf.VEC3, target=gltf.ARRAY_BUFFER)

@@ -135,6 +135,40 @@ def check_mesh(name: str, positions: np.ndarray, faces: np.ndarray) -> None:
         raise MeshError(f"mesh {name} has a face that names vertex {faces.max()} of {positions.shape[-2]}")
 
 
+def split_seams(
+    faces: np.ndarray, num_vertices: int, corner_uvs: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Give each vertex one texture coordinate, by splitting those on seams.
+
+    Args:
+        faces: Triangles, shape [faces, 3].
+        num_vertices: Number of vertices.
+        corner_uvs: Texture coordinate of every corner, shape [faces, 3, 2]; None leaves the mesh as it is.
+
+    Returns:
+        Faces; the old vertex of every vertex, the old ones first and in their order; and texture coordinates
+        [vertices, 2], zero for vertices without a face.
+    """
+    if corner_uvs is None:
+        return faces, np.arange(num_vertices), None
+    corners = faces.reshape(-1)
+    values = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
+    keys = np.concatenate([corners[:, None].astype(np.float64), values.astype(np.float64)], axis=1)
+    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    owner = unique[:, 0].astype(np.int64)
+    order = np.lexsort([first, owner])  # of each vertex the coordinate that comes first in the file
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = owner[order][1:] != owner[order][:-1]
+    place = np.empty(len(order), np.int64)
+    place[order[is_first]] = owner[order[is_first]]
+    extra = order[~is_first]
+    extra = extra[np.argsort(first[extra], kind="stable")]
+    place[extra] = num_vertices + np.arange(len(extra))
+    uvs = np.zeros((num_vertices + len(extra), 2), np.float32)
+    uvs[place] = unique[:, 1:]
+    return place[inverse.ravel()].reshape(-1, 3), np.concatenate([np.arange(num_vertices), owner[extra]]), uvs
+
+
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Average the area-weighted face normals around each vertex.
 

@@ -1,0 +1,183 @@
+"""A simulated run in the formats of other programs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from eslr_jax.errors import AssetError, EslrError
+from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
+from eslr_jax.io.gltf_builder import check_mesh, split_seams
+from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR
+from eslr_jax.io.mesh_sequence import frame_name, obj_text
+from eslr_jax.io.npz import write_arrays
+from eslr_jax.io.point_cache import write_mdd, write_pc2
+from eslr_jax.io.trajectory import TrajectoryFile
+from eslr_jax.io.usd import write_usd
+
+Format = Literal["glb", "usd", "usda", "usdc", "obj", "ply", "pc2", "mdd", "npz"]
+Content = Literal["garment", "body", "both"]
+_SCENES = ("glb", "usd", "usda", "usdc")  # formats that hold several meshes
+
+
+def export_trajectory(
+    run: TrajectoryFile, path: str | Path, *, format: Format | None = None, content: Content | None = None
+) -> Path:
+    """Write a run in another program's format.
+
+    Where the garment came from a file, its vertices have that file's order again: a point cache lies on it.
+
+    Args:
+        run: Of `read_trajectory`.
+        path: The file to write; a folder for `obj` and `ply`, which are one file a frame.
+        format: By default what the suffix of `path` says.
+        content: What to write; by default both meshes to glb and usd, and the garment to all others.
+
+    Returns:
+        The path written.
+
+    Raises:
+        AssetError: The format is unknown, the run has no body, or the file can't be written.
+        MissingExtraError: USD is not installed.
+    """
+    path = Path(path)
+    chosen = format or _format_of(path)
+    content = content or ("both" if chosen in _SCENES and run.body_positions is not None else "garment")
+    if content == "both" and chosen not in _SCENES:
+        raise AssetError(f"{chosen} holds one mesh; export garment and body to a file each")
+    meshes = [mesh for kind, mesh in _meshes(run).items() if content in (kind, "both")]
+    if not meshes:
+        raise AssetError("this run has no body; export the garment")
+    for mesh in meshes:
+        check_mesh(mesh.name, np.asarray(mesh.positions), np.asarray(mesh.faces))
+    if chosen in ("usd", "usda", "usdc"):
+        write_usd(path, meshes, run.timestep)
+    elif chosen == "glb":
+        write_animated_glb(path, meshes, run.timestep)
+    elif chosen == "pc2":
+        write_pc2(path, meshes[0].positions)
+    elif chosen == "mdd":
+        write_mdd(path, meshes[0].positions, run.timestep)
+    elif chosen == "npz":
+        _write_npz(path, meshes[0], run.timestep)
+    else:
+        write_sequence(path, meshes[0], chosen)
+    return path
+
+
+def _format_of(path: Path) -> Format:
+    """Return the format that a file's suffix names."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix in get_args(Format) and suffix not in ("obj", "ply"):
+        return suffix  # pyright: ignore[reportReturnType]
+    known = ", ".join(get_args(Format))
+    raise AssetError(f"can't tell the format of {path}; name one with --format: {known}")
+
+
+def _meshes(run: TrajectoryFile) -> dict[str, AnimatedMesh]:
+    """Return the garment, in its source's order, and the body if there is one."""
+    positions, faces = run.positions, run.faces
+    if run.vertex_map is not None and (run.vertex_map >= 0).all():
+        first = np.full(positions.shape[1], -1, np.int64)
+        first[run.vertex_map[::-1]] = np.arange(len(run.vertex_map))[::-1]
+        if (first[faces] >= 0).all():
+            positions, faces = positions[:, run.vertex_map], first[faces]
+    name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"
+    meshes = {"garment": AnimatedMesh(name, positions, faces, corner_uvs=run.corner_uvs)}
+    if run.body_positions is not None and run.body_faces is not None:
+        meshes["body"] = AnimatedMesh("body", run.body_positions, run.body_faces, DEFAULT_BODY_COLOR)
+    return meshes
+
+
+def _write_npz(path: Path, mesh: AnimatedMesh, timestep: float) -> None:
+    """Write a mesh sequence as an archive that `read_mesh_sequence` reads."""
+    arrays = {
+        "positions": np.asarray(mesh.positions, np.float32),
+        "faces": np.asarray(mesh.faces, np.int32),
+        "timestep": np.array(timestep, np.float64),
+        "name": np.array(mesh.name),
+    }
+    if mesh.corner_uvs is not None:
+        arrays["corner_uvs"] = np.asarray(mesh.corner_uvs, np.float32)
+    write_arrays(path, arrays)
+
+
+def write_sequence(folder: str | Path, mesh: AnimatedMesh, kind: Literal["obj", "ply"]) -> None:
+    """Write one mesh file a frame into a new folder, which appears when it is complete.
+
+    Args:
+        folder: The folder; it must not exist, or be empty.
+        mesh: The mesh in motion.
+        kind: File format.
+
+    Raises:
+        AssetError: The folder holds files already, or can't be written.
+    """
+    target = Path(folder)
+    if target.is_file() or (target.is_dir() and any(target.iterdir())):
+        raise AssetError(f"{target} exists already; name a new folder for the sequence")
+    ensure_output_dir(target.parent)
+    parts = target.with_name(f".{target.name}.part")
+    make: Callable[[np.ndarray], bytes] = _obj_writer(mesh) if kind == "obj" else _ply_writer(mesh)
+    try:
+        ensure_output_dir(parts)
+        for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
+            name = frame_name(mesh.name, frame, len(mesh.positions), f".{kind}")
+            with atomic_write(parts / name) as temporary:
+                temporary.write_bytes(make(positions))
+        if target.is_dir():
+            target.rmdir()
+        os.replace(parts, target)
+    except OSError as error:
+        raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
+    except EslrError:
+        raise
+    finally:
+        shutil.rmtree(parts, ignore_errors=True)
+
+
+def _obj_writer(mesh: AnimatedMesh) -> Callable[[np.ndarray], bytes]:
+    """Return the function from a frame's positions to an OBJ file."""
+    uvs = uv_faces = None
+    if mesh.corner_uvs is not None:
+        corners = np.asarray(mesh.corner_uvs, np.float64).reshape(-1, 2)
+        uvs, inverse = np.unique(corners, axis=0, return_inverse=True)
+        uv_faces = inverse.reshape(-1, 3)
+    return lambda positions: obj_text(mesh.name, positions, mesh.faces, uvs=uvs, uv_faces=uv_faces).encode()
+
+
+def _ply_writer(mesh: AnimatedMesh) -> Callable[[np.ndarray], bytes]:
+    """Return the function from a frame's positions to a binary PLY file; seams are split, at the end."""
+    faces, vertices, uvs = split_seams(
+        np.asarray(mesh.faces), np.asarray(mesh.positions).shape[1], mesh.corner_uvs
+    )
+    fields = ["x", "y", "z"] + (["s", "t"] if uvs is not None else [])
+    header = _ply_header(fields, len(vertices), len(faces))
+    table = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    table["count"], table["corners"] = 3, faces
+
+    def make(positions: np.ndarray) -> bytes:
+        columns = [positions[vertices]] + ([uvs] if uvs is not None else [])
+        return header + np.concatenate(columns, axis=1).astype("<f4").tobytes() + table.tobytes()
+
+    return make
+
+
+def _ply_header(fields: Sequence[str], num_vertices: int, num_faces: int) -> bytes:
+    """Return the header of a binary PLY file."""
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {num_vertices}",
+        *(f"property float {name}" for name in fields),
+        f"element face {num_faces}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode()
