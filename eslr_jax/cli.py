@@ -1,4 +1,4 @@
-"""The command line: `eslr simulate`, `eslr assets`, `eslr info`.
+"""The command line: `eslr simulate`, `eslr export`, `eslr joints`, `eslr assets`, ...
 
 Results go to stdout (as JSON with `--json`), progress and messages to stderr. Exit codes: 0 done, 1 a bug, 2
 something that the user can put right.
@@ -58,7 +58,7 @@ def _use_compile_cache() -> None:
 @app.command
 def simulate(
     garment: str = "tshirt",
-    motion: str = "cmu_016_32",
+    motion: str | None = None,
     body: str = "anny",
     simulator: Literal["network", "physics"] = "network",
     model: str | None = None,
@@ -69,6 +69,10 @@ def simulate(
     corrector_steps: int = 0,
     budget: str | None = None,
     tolerance: str | None = None,
+    joint_map: Path | None = None,
+    motion_up: Literal["auto", "y", "z"] = "auto",
+    arm_abduction: float | None = None,
+    body_fps: float | None = None,
     out: Path = Path("out"),
     pictures: bool = True,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -78,8 +82,11 @@ def simulate(
     Args:
         garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
             see `eslr fit` where recognition fails.
-        motion: Name of a bundled motion, or a motion file.
-        body: Name of a bundled body, or a body file.
+        motion: Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO
+            (.pkl), glTF or FBX, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
+            cmu_016_32.
+        body: Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
+            character (glTF, FBX), or a moving mesh (.npz, or a folder of OBJ or PLY files).
         simulator: The trained network, or the physics solver.
         model: Name of a bundled network or an exported file; the default network if not given.
         vertices: Resolution of a bundled garment.
@@ -91,6 +98,11 @@ def simulate(
         budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it.
         tolerance: Excess over the optimum relative to what a frame gains, such as 1%: choose the fastest
             simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.
+        joint_map: JSON file of changes to the map of joints that `eslr joints` shows.
+        motion_up: Axis that points up in a BVH motion.
+        arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
+            another body and 0 for the body's own.
+        body_fps: Frames per second of a body that is a moving mesh.
         out: Folder to write to.
         pictures: Render the contact sheet.
         json_: Print the report as JSON.
@@ -104,9 +116,8 @@ def simulate(
 
     import numpy as np
 
-    from eslr_jax.assets import load_body, load_garment_file, load_model, load_motion, prepare_stored
+    from eslr_jax.assets import load_garment_file, load_model, prepare_stored
     from eslr_jax.assets.load import default_model
-    from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.calibrate import SOLVER, choose, read_calibration
     from eslr_jax.evaluation.report import environment, trajectory_report
@@ -118,8 +129,9 @@ def simulate(
 
     budget_ms, share = _parse_budget(budget), _parse_share(tolerance)
     with _stderr.status("loading garment, body and motion"):
-        rig = load_body(body)
-        clip = load_motion(motion)
+        rig, poses, motion = _load_actor(
+            body, motion, frames, joint_map=joint_map, up=motion_up, arm_abduction=arm_abduction, fps=body_fps
+        )
         stored = load_garment_file(garment, vertices=vertices, body=rig)
         choice = None
         if budget_ms is not None or share is not None:
@@ -140,7 +152,7 @@ def simulate(
             }
         cloth = prepare_stored(stored, name=Path(garment).name, **options)
         material = garment_material(fabric, cloth, stored)
-        poses = pose_body(rig, clip, num_frames=frames)
+        _check_skin(garment, cloth, rig, body)
         scene = prepare_scene(cloth, poses, material=material)
     if "fit" in stored.metadata:
         _stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
@@ -253,12 +265,59 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
     print(path)
 
 
+def _load_actor(
+    body: str,
+    motion: str | None,
+    frames: int | None,
+    *,
+    joint_map: Path | None,
+    up: Literal["auto", "y", "z"],
+    arm_abduction: float | None,
+    fps: float | None,
+) -> tuple[Any, Any, str]:
+    """Load a body and set it in motion; returns both, and the name of the motion."""
+    from eslr_jax.assets import load_body, load_motion
+    from eslr_jax.assets.load import own_motion
+    from eslr_jax.body.joints import read_joint_map
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.body.sequence import pose_sequence
+    from eslr_jax.errors import ConfigError
+    from eslr_jax.io.mesh_sequence import is_mesh_sequence, read_mesh_sequence
+
+    if Path(body).exists() and is_mesh_sequence(body):
+        if motion is not None:
+            raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out --motion")
+        return *pose_sequence(read_mesh_sequence(body, fps=fps), num_frames=frames), body
+    if fps is not None:
+        raise ConfigError(f"--body-fps is for bodies that are moving meshes; {body} is none")
+    rig = load_body(body)
+    motion = motion or own_motion(body)
+    changes = None if joint_map is None else read_joint_map(joint_map)
+    clip = load_motion(motion, body=rig, joint_map=changes, up=up)
+    return rig, pose_body(rig, clip, num_frames=frames, arm_abduction=arm_abduction), motion
+
+
+def _check_skin(garment: str, cloth, rig, body: str) -> None:
+    """Refuse a garment that hangs on the joints of another body."""
+    import numpy as np
+
+    from eslr_jax.assets import asset_names, load_body
+    from eslr_jax.errors import ConfigError
+
+    is_bundled = garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment")
+    is_strange = is_bundled and rig.joint_names != load_body().joint_names
+    if is_strange or int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
+        raise ConfigError(
+            f"garment {garment} was made for another body than {body}; give a mesh that fits it"
+        )
+
+
 def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: dict[str, Any]) -> None:
     """Write the trajectory and the animated GLB."""
     import numpy as np
 
     from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
-    from eslr_jax.io.gltf_skin import SkinnedMesh
+    from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR, SkinnedMesh
     from eslr_jax.io.trajectory import write_trajectory
 
     faces = np.asarray(cloth.faces)
@@ -273,15 +332,22 @@ def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: d
         body_faces=np.asarray(poses.faces),
         metadata=report,
     )
-    skinned = SkinnedMesh(
-        rest_positions=np.asarray(poses.rest_positions),
-        faces=np.asarray(poses.faces),
-        skin_weights=np.asarray(rig.skin_weights),
-        skin_indices=np.asarray(rig.skin_indices),
-        joint_transforms=np.asarray(poses.joint_transforms),
-    )
-    garment = AnimatedMesh("garment", positions, faces)
-    write_animated_glb(out / "animation.glb", [garment], timestep, skinned_body=skinned)
+    meshes, skinned = [AnimatedMesh("garment", positions, faces)], None
+    if rig.pose_directions is None and rig.parents.count(-1) == 1:
+        skinned = SkinnedMesh(
+            rest_positions=np.asarray(poses.rest_positions),
+            faces=np.asarray(poses.faces),
+            skin_weights=np.asarray(rig.skin_weights),
+            skin_indices=np.asarray(rig.skin_indices),
+            joint_transforms=np.asarray(poses.joint_transforms),
+            joint_rest_positions=np.asarray(rig.joint_rest_positions),
+            parents=rig.parents,
+            joint_names=rig.joint_names,
+        )
+    else:  # joints alone don't move it as it moved
+        body = AnimatedMesh("body", np.asarray(poses.positions), np.asarray(poses.faces), DEFAULT_BODY_COLOR)
+        meshes.append(body)
+    write_animated_glb(out / "animation.glb", meshes, timestep, skinned_body=skinned)
 
 
 def _write_sheet(out: Path, positions, cloth, poses) -> None:
@@ -494,6 +560,76 @@ def _counted(items, total: int, advance) -> Iterator[Any]:
     for done, item in enumerate(items, 1):
         yield item
         advance(done, total)
+
+
+@app.command
+def joints(
+    motion: str,
+    body: str = "anny",
+    joint_map: Path | None = None,
+    out: Path | None = None,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Show which joint of a motion moves which joint of a body.
+
+    Args:
+        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), glTF or FBX.
+        body: Name of a bundled body, or a body file.
+        joint_map: JSON file of changes: the body's joint to the motion's, "" to keep it still.
+        out: Write the map here, to change it and give it to `eslr simulate --joint-map`.
+        json_: Print as JSON.
+    """
+    from eslr_jax.assets import load_body
+    from eslr_jax.assets.load import read_skeleton_motion
+    from eslr_jax.body.joints import complete_map, read_joint_map
+    from eslr_jax.body.rig import body_skeleton
+    from eslr_jax.io.atomic import atomic_write
+
+    target = body_skeleton(load_body(body))
+    file, _, clip = motion.partition("#")
+    source = read_skeleton_motion(file, clip).skeleton
+    changes = None if joint_map is None else read_joint_map(joint_map)
+    found = complete_map(target, source, changes)
+    values = {name: found.get(name, "") for name in target.joint_names}
+    if out is not None:
+        with atomic_write(out) as temporary:
+            temporary.write_text(json.dumps(values, indent=2))
+    if json_:
+        print(json.dumps(values, indent=2))
+        return
+    table = Table("joint of the body", "follows", box=None)
+    for name, other in values.items():
+        table.add_row(name, other or "-")
+    Console().print(table, markup=False, highlight=False)
+    unused = [name for name in source.joint_names if name not in found.values()]
+    _stderr.print(f"not used: {', '.join(unused) or 'none'}", markup=False, highlight=False)
+
+
+@app.command
+def export(
+    run: Path,
+    out: Path,
+    format_: Annotated[
+        Literal["glb", "usd", "usda", "usdc", "obj", "ply", "pc2", "mdd", "npz"] | None,
+        tyro.conf.arg(name="format"),
+    ] = None,
+    content: Literal["garment", "body", "both"] | None = None,
+) -> None:
+    """Write a simulated run in another program's format.
+
+    The garment has the vertex order and texture coordinates of its own file, so that a point cache lies on it.
+
+    Args:
+        run: Folder that `eslr simulate` wrote, or the trajectory in it.
+        out: File to write; with --format obj or ply a new folder, one file a frame.
+        format_: glb, usd, usda, usdc, obj, ply, pc2, mdd or npz; by default what the suffix says.
+        content: garment, body, or both; by default both to glb and usd, and the garment to all others.
+    """
+    from eslr_jax.io.export import export_trajectory
+    from eslr_jax.io.trajectory import read_trajectory
+
+    trajectory = read_trajectory(run / "trajectory.npz" if run.is_dir() else run)
+    print(export_trajectory(trajectory, out, format=format_, content=content))
 
 
 @app.command

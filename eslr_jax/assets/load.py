@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +13,8 @@ import numpy as np
 from eslr_jax.assets.cache import cached_arrays, content_key
 from eslr_jax.assets.catalog import asset_names, find_asset
 from eslr_jax.body.motion import Motion
+from eslr_jax.body.procedural import PROCEDURAL, make_procedural
+from eslr_jax.body.rig import make_body, make_motion, skeleton_motion
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.fit.fit import fit_garment
@@ -26,10 +29,17 @@ from eslr_jax.io.garment import (
     read_garment_npz,
     read_garment_source,
 )
+from eslr_jax.io.bvh import read_bvh
+from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
+from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_body, read_gltf_motion
 from eslr_jax.io.motion import read_motion_archive
+from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.skeleton import SkeletonMotion
+from eslr_jax.io.smpl import is_smpl_model, read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
+DEFAULT_MOTION = "cmu_016_32"
 Resolution = Literal["1k", "4k", "10k"]
 
 
@@ -42,12 +52,36 @@ def load_body(name: str | Path = "anny") -> Body:
     """Load a rigged body.
 
     Args:
-        name: Name of a bundled body, or path of an npz file in its format.
+        name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
+            character (.gltf, .glb, .vrm, .fbx), or an npz file in the bundled format. `FILE#MESH,MESH` picks
+            the meshes of a character that make up the body.
 
     Raises:
-        AssetError: There is no such body, or the file is damaged.
+        AssetError: There is no such body, the file is damaged, or it is no rigged body in metres.
+        MissingExtraError: The file needs an extra that is not installed.
     """
-    return read_body(name if _is_path(str(name)) else find_asset("body", str(name)))
+    text = str(name)
+    if not _is_path(text):
+        return read_body(find_asset("body", text))
+    file, meshes = _split_name(text)
+    suffix = Path(file).suffix.lower()
+    if suffix in GLTF_SUFFIXES:
+        return make_body(read_gltf_body(file, meshes))
+    if suffix == ".fbx":
+        return make_body(read_fbx_body(file, meshes))
+    if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
+        return make_body(read_smpl_body(file))
+    if suffix == ".npz":
+        return read_body(file)
+    raise AssetError(
+        f"body file {file} has the unknown suffix {suffix!r}; give .npz, .pkl, .glb, .gltf or .fbx"
+    )
+
+
+def _split_name(text: str) -> tuple[str, list[str]]:
+    """Split `FILE#NAME,NAME` into the file and the names."""
+    file, _, names = text.partition("#")
+    return file, [name for name in names.split(",") if name]
 
 
 def load_garment(
@@ -164,17 +198,92 @@ def _motion_archive(path: Path, modified: float):
     return read_motion_archive(path)
 
 
-def load_motion(name: str | Path = "cmu_016_32") -> Motion:
-    """Load a motion.
+def load_motion(
+    name: str | Path = DEFAULT_MOTION,
+    *,
+    body: Body | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    up: Literal["auto", "y", "z"] = "auto",
+) -> Motion:
+    """Load a motion, for the bundled body or carried over to another one.
 
     Args:
-        name: Name of a bundled clip, or path of an npz archive with one clip, or `path#clip`.
+        name: Name of a bundled clip, or turn, jump or swing, which are computed; or path of a motion: .bvh,
+            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm, .fbx), or an archive in
+            the bundled format. `FILE#CLIP` picks one of several clips.
+        body: The body that is to move; the bundled one by default.
+        joint_map: Changes to the map of joints, the body's to the motion's; "" keeps a joint still.
+        up: Axis that points up in a BVH file; by default the one along which its figure stands.
 
     Raises:
         AssetError: There is no such motion, or the file is damaged.
-        MotionError: The file holds no usable motion.
+        MotionError: The file holds no usable motion, or none that this body can follow.
+        MissingExtraError: The file needs an extra that is not installed.
     """
     text = str(name)
+    if text in PROCEDURAL:
+        return make_procedural(text, load_body() if body is None else body)
+    file, _, clip = text.partition("#")
+    if not _is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file)):
+        motion = _bundled_motion(text)
+        if body is None or (_is_made_for(motion, body, is_bundled=not _is_path(text)) and not joint_map):
+            return motion
+        # An archive tells no skeleton: it is the bundled body's.
+        return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
+    source = read_skeleton_motion(file, clip)
+    is_bvh = Path(file).suffix.lower() == ".bvh"
+    return make_motion(
+        source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
+    )
+
+
+def own_motion(body: str) -> str:
+    """Return the motion that a body comes with: the animation in its file, or else a bundled walk."""
+    file, _ = _split_name(body)
+    if Path(file).suffix.lower() in GLTF_SUFFIXES and gltf_clip_names(file):
+        return file
+    return DEFAULT_MOTION
+
+
+def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
+    """Tell whether a clip moves this body as it is; a user's own archive is taken at its joints' names."""
+    if motion.joint_names != body.joint_names:
+        return False
+    rest = np.asarray(body.joint_rest_positions)
+    return not is_bundled or np.allclose(rest, np.asarray(load_body().joint_rest_positions), atol=1e-4)
+
+
+def _is_amass(file: str) -> bool:
+    """Tell an archive of AMASS from one in the bundled format."""
+    return "poses" in read_arrays(file, content="motion", names=("poses",))
+
+
+def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
+    """Read a motion with the skeleton of its file.
+
+    Args:
+        file: .bvh, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb, .vrm or .fbx.
+        clip: Which of several animations.
+
+    Raises:
+        AssetError: The file is missing, damaged, or of an unknown kind.
+        MotionError: The file holds no usable motion.
+        MissingExtraError: The file needs an extra that is not installed.
+    """
+    suffix = Path(file).suffix.lower()
+    if suffix in GLTF_SUFFIXES:
+        return read_gltf_motion(file, clip)
+    if suffix == ".fbx":
+        return read_fbx_motion(file, clip)
+    readers = {".bvh": read_bvh, ".npz": read_amass, ".pkl": read_smpl_pickle}
+    if suffix not in readers:
+        known = ", ".join([*readers, *GLTF_SUFFIXES, ".fbx"])
+        raise AssetError(f"motion file {file} has the unknown suffix {suffix!r}; give one of {known}")
+    return readers[suffix](file)
+
+
+def _bundled_motion(text: str) -> Motion:
+    """Load a clip by name, or from an archive in the bundled format."""
     if _is_path(text):
         file, _, clip = text.partition("#")
         if not Path(file).exists():

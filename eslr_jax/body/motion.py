@@ -28,6 +28,9 @@ class Motion:
     translations: np.ndarray  # position of the root joint [m], shape [frames, 3]
     fps: float
     joint_names: tuple[str, ...]
+    arm_abduction: float = (
+        ARM_ABDUCTION  # degrees that posing adds to both arms, if nothing else is asked for
+    )
 
     def __post_init__(self) -> None:
         """Check the arrays.
@@ -76,7 +79,7 @@ def pose_body(
     motion: Motion,
     *,
     fps: float = 30.0,
-    arm_abduction: float = ARM_ABDUCTION,
+    arm_abduction: float | None = None,
     shape: np.ndarray | None = None,
     num_frames: int | None = None,
 ) -> BodyMotion:
@@ -86,7 +89,8 @@ def pose_body(
         body: A rigged body.
         motion: A motion for the same rig; other rigs need retargeting first.
         fps: Frame rate of the simulation; the motion is resampled to it.
-        arm_abduction: Degrees added to both arms, to keep them from pressing into the torso.
+        arm_abduction: Degrees added to both arms, to keep them from pressing into the torso; by default what
+            the motion asks for: nothing if it was made on this body.
         shape: Body shape in standard deviations, shape [shapes]; None is the average.
         num_frames: Keep this many frames; None keeps all.
 
@@ -107,6 +111,8 @@ def pose_body(
                 f"{num_frames} asked for; ask for fewer or choose a longer motion"
             )
         rotations, translations = rotations[:num_frames], translations[:num_frames]
+    if arm_abduction is None:
+        arm_abduction = motion.arm_abduction
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
     rest, joints = shape_body(body, shape)

@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.joints import Part, complete_map, find_parts, torso_axes
 from eslr_jax.body.motion import Motion
-from eslr_jax.body.retarget import leg_length, local_rotations, minimal_rotation
+from eslr_jax.body.retarget import (
+    ARM_ABDUCTION,
+    global_rotations,
+    leg_length,
+    local_rotations,
+    minimal_rotation,
+)
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.types import Body
@@ -208,9 +214,32 @@ def make_motion(
         translations = _put_on_floor(turned, translations, target, body)
     elif source.root_axes is not None:
         translations = translations + source.root_axes @ target.rest_positions[0]
+    parts = find_parts(target)
+    has_arms = all((side, "upper_arm") in parts for side in ("left", "right"))
     return Motion(
-        source.name, local_rotations(turned, target.parents), translations, source.fps, target.joint_names
+        source.name,
+        local_rotations(turned, target.parents),
+        translations,
+        source.fps,
+        target.joint_names,
+        arm_abduction=ARM_ABDUCTION if has_arms and not is_own else 0.0,
     )
+
+
+def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
+    """Return a body's motion as its moving skeleton: the inverse of `make_motion` on the same rig.
+
+    Raises:
+        MotionError: The motion is for another rig.
+    """
+    if motion.joint_names != body.joint_names:
+        raise MotionError(
+            f"motion {motion.name} is not for this body; its joints are {motion.joint_names[:4]}"
+        )
+    skeleton = body_skeleton(body)
+    turned = global_rotations(motion.rotations, skeleton.parents)
+    positions = chain_positions(turned, motion.translations, skeleton)
+    return SkeletonMotion(motion.name, skeleton, turned, positions, motion.fps)
 
 
 def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:

@@ -27,6 +27,7 @@ from eslr_jax.io.skeleton import (
     unique_names,
 )
 
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
 _TRIANGLES = 4  # primitive mode
 _SCALE_TOLERANCE = 0.01  # by which a bind space may differ in size from the posed skin
 
