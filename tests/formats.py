@@ -108,12 +108,14 @@ def write_vto(path, rotations, pelvis):
 
 
 def smpl_model(body, rng):
-    """The bundled body cut down to SMPL's 24 joints, as the arrays of a SMPL file, with random blend shapes."""
+    """A part of the bundled body on SMPL's 24 joints, as the arrays of a SMPL file, with random blend shapes."""
     names = list(body.joint_names)
+    faces = np.asarray(body.faces)[::40]  # all over the body
+    kept, faces = np.unique(faces, return_inverse=True)
     merged = {ours: names.index(theirs) for ours, theirs in SMPL_FROM_CMU.items()}
     joints = np.asarray(body.joint_rest_positions, np.float64)[[merged[name] for name in SMPL_NAMES]]
     joints[22:] += joints[20:22] - joints[18:20]
-    positions = np.asarray(body.rest_positions, np.float64)
+    positions = np.asarray(body.rest_positions, np.float64)[kept]
     nearest = {}
     for joint, name in enumerate(names):
         while name not in SMPL_FROM_CMU.values():
@@ -121,13 +123,13 @@ def smpl_model(body, rng):
         nearest[joint] = next(k for k, smpl in enumerate(SMPL_NAMES) if SMPL_FROM_CMU[smpl] == name)
     weights = np.zeros((len(positions), 24))
     rows = np.repeat(np.arange(len(positions)), body.skin_indices.shape[1])
-    columns = [nearest[joint] for joint in np.asarray(body.skin_indices).ravel()]
-    np.add.at(weights, (rows, columns), np.asarray(body.skin_weights, np.float64).ravel())
+    columns = [nearest[joint] for joint in np.asarray(body.skin_indices)[kept].ravel()]
+    np.add.at(weights, (rows, columns), np.asarray(body.skin_weights, np.float64)[kept].ravel())
     tree = np.array([SMPL_PARENTS, np.arange(24)], np.int64)
     tree[0, 0] = 2**32 - 1  # as the files have it
     return {
         "v_template": positions,
-        "f": np.asarray(body.faces).astype(np.uint32),
+        "f": faces.reshape(-1, 3).astype(np.uint32),
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "J_regressor": joint_regressor(positions, joints),
         "kintree_table": tree,

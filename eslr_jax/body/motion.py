@@ -196,7 +196,7 @@ def _skin_bent(rest, directions, weights, indices, rotations, transforms):
     """
 
     def pose(frame):
-        turned = jax.vmap(lbs.rotation_matrix)(frame[0]) - jnp.eye(3)
+        turned = jax.vmap(lbs.rotation_matrix)(frame[0]) - jnp.eye(3)[None]
         return lbs.skin(rest + lbs.bend(directions, turned), weights, indices, frame[1])
 
     return jax.lax.map(pose, (rotations, transforms))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.joints import find_named_parts
+from eslr_jax.body.joints import Part, find_named_parts
 from eslr_jax.errors import MotionError
 
 ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bundled walks clear of the torso
@@ -127,7 +127,11 @@ def leg_length(joint_names: Sequence[str], joint_rest_positions: NDArray) -> flo
     Returns:
         The length in the unit of the positions, or None if the rig has no such leg.
     """
-    parts = find_named_parts(joint_names)
+    return leg_of(joint_rest_positions, find_named_parts(joint_names))
+
+
+def leg_of(joint_rest_positions: NDArray, parts: Mapping[Part, Sequence[int]]) -> float | None:
+    """Length of a thigh and shank, by the joints of each part; see `leg_length`."""
     for side in ("left", "right"):
         chain = [parts.get((side, name), [None])[0] for name in ("upper_leg", "lower_leg", "foot")]
         if None not in chain:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.joints import Part, complete_map, find_parts, torso_axes
+from eslr_jax.body.joints import Part, complete_map, find_named_parts, find_parts, torso_axes
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import (
     ARM_ABDUCTION,
@@ -24,6 +24,7 @@ from eslr_jax.types import Body
 
 HEIGHT_RANGE = (0.3, 3.0)  # [m] of a body; outside, the unit of its file is not the metre
 UNITS = {0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
+MODEL_JOINTS = 18  # joints that a body shares with the SMPL family's 22 to be one of it
 SAME_REST = 1e-3  # [m] by which the rest joints of one rig differ from file to file
 ORDINARY_TILT = np.deg2rad(35.0)  # rest poses that lean less than this are taken to stand alike
 MAX_LEG_TURN = np.deg2rad(75.0)  # between the legs of two rest poses that both stand
@@ -197,25 +198,35 @@ def make_motion(
     mapping = complete_map(target, source.skeleton, joint_map)
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
-    is_own = _is_same_rig(target, source, followed)
+    is_model = _is_body_model(target, source)
+    if is_model:  # told by name; joints that the parameters lack rest
+        changed = joint_map or {}
+        followed = [
+            other if name in changed or mapping.get(name) == name else -1
+            for name, other in zip(target.joint_names, followed, strict=True)
+        ]
+    is_own = is_model or _is_same_rig(target, source, followed)
+    ours, theirs = _matched_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if not is_own:
-        alignments = _align_rests(target, source)
+        alignments = _align_rests(target, source, ours, theirs)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:
             turned[:, joint] = source.rotations[:, other] @ alignments[joint]
         else:
             turned[:, joint] = turned[:, parent] if parent >= 0 else np.eye(3)
-    hips = followed[0] if followed[0] >= 0 else find_parts(source.skeleton)["", "hips"][0]
-    translations = source.positions[:, hips]
+    translations = source.positions[:, theirs["", "hips"][0]]
     if not is_own:
-        translations = _scale_of(target, source.skeleton) * translations
+        lengths = [
+            leg_of(rig.rest_positions, parts) for rig, parts in ((target, ours), (source.skeleton, theirs))
+        ]
+        if lengths[0] and lengths[1]:
+            translations = lengths[0] / lengths[1] * translations
         translations = _put_on_floor(turned, translations, target, body)
     elif source.root_axes is not None:
         translations = translations + source.root_axes @ target.rest_positions[0]
-    parts = find_parts(target)
-    has_arms = all((side, "upper_arm") in parts for side in ("left", "right"))
+    has_arms = all((side, "upper_arm") in find_named_parts(target.joint_names) for side in ("left", "right"))
     return Motion(
         source.name,
         local_rotations(turned, target.parents),
@@ -271,17 +282,37 @@ def _stands_along_z(motion: SkeletonMotion) -> bool:
     return bool(rise[2] > abs(rise[1]))
 
 
+def _is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
+    """Tell whether a motion is the parameters of a body model, and the body is of that family."""
+    shared = set(target.joint_names) & set(source.skeleton.joint_names)
+    return source.root_axes is not None and len(shared) >= MODEL_JOINTS
+
+
+def _matched_parts(
+    target: Skeleton, source: Skeleton, followed: list[int]
+) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
+    """Return the joints of each part that both rigs have, by the names of either and by the map."""
+    ours: dict[Part, list[int]] = {}
+    theirs: dict[Part, list[int]] = {}
+    known, others = find_parts(target), find_parts(source)
+    part_of = {joint: part for part, joints in known.items() for joint in joints}
+    part_of_other = {joint: part for part, joints in others.items() for joint in joints}
+    for joint, other in enumerate(followed):
+        part = part_of.get(joint) or part_of_other.get(other)
+        if other >= 0 and part is not None:
+            ours.setdefault(part, []).append(joint)
+            theirs.setdefault(part, []).append(other)
+    if followed[0] < 0:
+        theirs["", "hips"] = others["", "hips"]
+    else:
+        theirs["", "hips"] = [followed[0]]
+    ours["", "hips"] = [0]
+    return ours, theirs
+
+
 def _is_same_rig(target: Skeleton, source: SkeletonMotion, followed: list[int]) -> bool:
     """Tell whether a motion was made for this very rig."""
     names = source.skeleton.joint_names
-    if source.root_axes is not None:
-        # Parameters of a body model: its joints are told by name, those without a value rest.
-        known = [name for name, other in zip(target.joint_names, followed, strict=True) if other >= 0]
-        return (
-            target.joint_names[0] == names[0]
-            and len(known) > 0.8 * min(len(target), 22)
-            and set(known) <= set(names)
-        )
     if any(
         other < 0 or names[other] != name for name, other in zip(target.joint_names, followed, strict=True)
     ):
@@ -291,9 +322,13 @@ def _is_same_rig(target: Skeleton, source: SkeletonMotion, followed: list[int]) 
     return bool(np.abs(difference).max() < SAME_REST)
 
 
-def _align_rests(target: Skeleton, source: SkeletonMotion) -> NDArray:
+def _align_rests(
+    target: Skeleton,
+    source: SkeletonMotion,
+    ours: Mapping[Part, list[int]],
+    theirs: Mapping[Part, list[int]],
+) -> NDArray:
     """Return for each joint the rotation from the body's rest pose to the source's, [joints, 3, 3]."""
-    ours, theirs = find_parts(target), find_parts(source.skeleton)
     upright = _torso_turn(target, ours, source.skeleton, theirs)
     result = np.tile(upright, (len(target), 1, 1))
     for side in ("left", "right"):
@@ -337,12 +372,6 @@ def _torso_turn(
     angles = np.arccos(np.clip((np.einsum("nab,ab->n", quarters, turn) - 1) / 2, -1, 1))
     is_near = angles.min() < ORDINARY_TILT
     return np.round(quarters[angles.argmin()]) if is_near else turn
-
-
-def _scale_of(target: Skeleton, source: Skeleton) -> float:
-    """Return metres of the body's steps per unit of the source's."""
-    ours, theirs = (leg_length(rig.joint_names, rig.rest_positions) for rig in (target, source))
-    return ours / theirs if ours and theirs else 1.0
 
 
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:

@@ -103,6 +103,8 @@ def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[li
     if any(not -1 <= parent < len(names) for parent in parents) or -1 not in parents:
         raise AssetError(f"{what} has joints without a root; export the skeleton again")
     root = parents.index(-1)
+    if root == 0 and all(0 <= parent < joint for joint, parent in enumerate(parents[1:], 1)):
+        return list(range(len(names))), parents  # as the file has it
     children: dict[int, list[int]] = {}
     for joint, parent in enumerate(parents):
         if joint != root:

@@ -254,6 +254,7 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
     is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
     if (
         not is_table
+        or not len(poses)
         or moves.shape != (len(poses), 3)
         or poses.shape[1] // 3 not in JOINT_NAMES
         or poses.shape[1] % 3
