@@ -626,10 +626,15 @@ def export(
         content: garment, body, or both; by default both to glb and usd, and the garment to all others.
     """
     from eslr_jax.io.export import export_trajectory
+    from eslr_jax.io.garment import read_garment_npz
     from eslr_jax.io.trajectory import read_trajectory
 
-    trajectory = read_trajectory(run / "trajectory.npz" if run.is_dir() else run)
-    print(export_trajectory(trajectory, out, format=format_, content=content))
+    file = run / "trajectory.npz" if run.is_dir() else run
+    trajectory = read_trajectory(file)
+    beside = file.with_name("garment.npz")
+    garment = read_garment_npz(beside) if beside.is_file() else None
+    print(export_trajectory(trajectory, out, garment=garment, format=format_, content=content))
+
 
 
 @app.command

@@ -21,6 +21,8 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.io.body import read_body
+from eslr_jax.io.bvh import read_bvh
+from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
 from eslr_jax.io.garment import (
     GarmentFile,
     garment_arrays,
@@ -29,8 +31,6 @@ from eslr_jax.io.garment import (
     read_garment_npz,
     read_garment_source,
 )
-from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_body, read_gltf_motion
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import read_arrays

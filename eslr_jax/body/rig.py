@@ -14,7 +14,7 @@ from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import (
     ARM_ABDUCTION,
     global_rotations,
-    leg_length,
+    leg_of,
     local_rotations,
     minimal_rotation,
 )

@@ -12,6 +12,7 @@ import numpy as np
 
 from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
 from eslr_jax.io.gltf_builder import check_mesh, split_seams
 from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR
@@ -27,7 +28,12 @@ _SCENES = ("glb", "usd", "usda", "usdc")  # formats that hold several meshes
 
 
 def export_trajectory(
-    run: TrajectoryFile, path: str | Path, *, format: Format | None = None, content: Content | None = None
+    run: TrajectoryFile,
+    path: str | Path,
+    *,
+    garment: GarmentFile | None = None,
+    format: Format | None = None,
+    content: Content | None = None,
 ) -> Path:
     """Write a run in another program's format.
 
@@ -36,6 +42,7 @@ def export_trajectory(
     Args:
         run: Of `read_trajectory`.
         path: The file to write; a folder for `obj` and `ply`, which are one file a frame.
+        garment: The garment that was simulated; tells the vertex order and the texture coordinates of its file.
         format: By default what the suffix of `path` says.
         content: What to write; by default both meshes to glb and usd, and the garment to all others.
 
@@ -51,7 +58,7 @@ def export_trajectory(
     content = content or ("both" if chosen in _SCENES and run.body_positions is not None else "garment")
     if content == "both" and chosen not in _SCENES:
         raise AssetError(f"{chosen} holds one mesh; export garment and body to a file each")
-    meshes = [mesh for kind, mesh in _meshes(run).items() if content in (kind, "both")]
+    meshes = [mesh for kind, mesh in _meshes(run, garment).items() if content in (kind, "both")]
     if not meshes:
         raise AssetError("this run has no body; export the garment")
     for mesh in meshes:
@@ -80,16 +87,24 @@ def _format_of(path: Path) -> Format:
     raise AssetError(f"can't tell the format of {path}; name one with --format: {known}")
 
 
-def _meshes(run: TrajectoryFile) -> dict[str, AnimatedMesh]:
-    """Return the garment, in its source's order, and the body if there is one."""
-    positions, faces = run.positions, run.faces
-    if run.vertex_map is not None and (run.vertex_map >= 0).all():
-        first = np.full(positions.shape[1], -1, np.int64)
-        first[run.vertex_map[::-1]] = np.arange(len(run.vertex_map))[::-1]
-        if (first[faces] >= 0).all():
-            positions, faces = positions[:, run.vertex_map], first[faces]
+def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, AnimatedMesh]:
+    """Return the garment, in its source's order, and the body if there is one.
+
+    Raises:
+        AssetError: The garment is another than the one that was simulated.
+    """
+    positions, faces, uvs = run.positions, run.faces, None
+    if garment is not None:
+        if not np.array_equal(garment.faces, faces):
+            raise AssetError("the garment file is not the one of this run; simulate again")
+        uvs, places = garment.corner_uvs, garment.vertex_map
+        if places is not None and len(places) and places.min() >= 0 and places.max() < positions.shape[1]:
+            first = np.full(positions.shape[1], -1, np.int64)  # source vertex of every vertex
+            first[places[::-1]] = np.arange(len(places))[::-1]
+            if (first[faces] >= 0).all():
+                positions, faces = positions[:, places], first[faces]
     name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"
-    meshes = {"garment": AnimatedMesh(name, positions, faces, corner_uvs=run.corner_uvs)}
+    meshes = {"garment": AnimatedMesh(name, positions, faces, corner_uvs=uvs)}
     if run.body_positions is not None and run.body_faces is not None:
         meshes["body"] = AnimatedMesh("body", run.body_positions, run.body_faces, DEFAULT_BODY_COLOR)
     return meshes

@@ -2,15 +2,14 @@
 
 Layout: `positions`, `velocities` [frames, vertices, 3], `faces` [faces, 3], `timestep`, `metadata` (JSON
 text) and `format`; with a body also `body_positions` [frames, body_vertices, 3] and `body_faces`
-[body_faces, 3]; of a garment from a file also `corner_uvs` [faces, 3, 2], `vertex_map` [source vertices],
-`face_parts` [faces] and `part_names`. SI units, Y up, float32.
+[body_faces, 3]. SI units, Y up, float32.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +33,6 @@ class TrajectoryFile:
     body_faces: np.ndarray | None  # [body_faces, 3]
     timestep: float  # seconds between frames
     metadata: dict[str, Any]  # JSON-compatible: garment, motion, versions, ...
-    corner_uvs: np.ndarray | None = None  # texture coordinates of every face's corners [faces, 3, 2]
-    vertex_map: np.ndarray | None = None  # vertex of every vertex of the garment's file; -1: left out
-    face_parts: np.ndarray | None = None  # index into part_names [faces]
-    part_names: tuple[str, ...] = ()
 
     @property
     def num_frames(self) -> int:
@@ -55,10 +50,6 @@ def write_trajectory(
     body_positions: np.ndarray | None = None,
     body_faces: np.ndarray | None = None,
     metadata: Mapping[str, Any] | None = None,
-    corner_uvs: np.ndarray | None = None,
-    vertex_map: np.ndarray | None = None,
-    face_parts: np.ndarray | None = None,
-    part_names: Sequence[str] = (),
 ) -> None:
     """Write a trajectory, atomically.
 
@@ -71,10 +62,6 @@ def write_trajectory(
         body_positions: Body vertex positions [m], shape [frames, body_vertices, 3]; None without a body.
         body_faces: Body triangles, shape [body_faces, 3].
         metadata: Anything JSON can hold.
-        corner_uvs: Texture coordinates of every face's corners, shape [faces, 3, 2].
-        vertex_map: Vertex of every vertex of the garment's file, -1 where it was left out.
-        face_parts: Part of every face, an index into `part_names`, shape [faces].
-        part_names: Names of the parts.
 
     Raises:
         AssetError: If the arrays disagree, the metadata is no JSON, or the file can't be written.
@@ -97,13 +84,6 @@ def write_trajectory(
         arrays["body_positions"] = np.asarray(body_positions, np.float32)
     if body_faces is not None:
         arrays["body_faces"] = np.asarray(body_faces, np.int32)
-    if corner_uvs is not None:
-        arrays["corner_uvs"] = np.asarray(corner_uvs, np.float32)
-    if vertex_map is not None:
-        arrays["vertex_map"] = np.asarray(vertex_map, np.int32)
-    if face_parts is not None:
-        arrays["face_parts"] = np.asarray(face_parts, np.int32)
-        arrays["part_names"] = np.array(list(part_names), np.str_)
     _check(arrays, path)
     write_arrays(path, arrays)
 
@@ -136,10 +116,6 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         body_faces=arrays.get("body_faces"),
         timestep=float(arrays["timestep"]),
         metadata=metadata,
-        corner_uvs=arrays.get("corner_uvs"),
-        vertex_map=arrays.get("vertex_map"),
-        face_parts=arrays.get("face_parts"),
-        part_names=tuple(str(name) for name in arrays.get("part_names", ())),
     )
 
 
@@ -161,7 +137,6 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
             f"trajectory {path} has timestep {arrays['timestep']}; it must be a positive number of seconds"
         )
     _check_mesh(arrays, "positions", "faces", path)
-    _check_source(arrays, path)
     if arrays["velocities"].shape != arrays["positions"].shape or arrays["velocities"].dtype.kind != "f":
         raise AssetError(
             f"trajectory {path} has velocities of shape {arrays['velocities'].shape} for positions of shape "
@@ -178,29 +153,6 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
                 f"trajectory {path} has {len(arrays['positions'])} garment frames and "
                 f"{len(arrays['body_positions'])} body frames; they must agree"
             )
-
-
-def _check_source(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Raise AssetError unless what links a garment to its file fits the garment."""
-    faces, vertices = len(arrays["faces"]), arrays["positions"].shape[1]
-    expected = {"corner_uvs": ("f", (faces, 3, 2)), "face_parts": ("iu", (faces,))}
-    for name, (kinds, shape) in expected.items():
-        if name in arrays and (arrays[name].shape != shape or arrays[name].dtype.kind not in kinds):
-            raise AssetError(
-                f"trajectory {path} has {name} of shape {arrays[name].shape}, not {shape}; write it again"
-            )
-    places = arrays.get("vertex_map")
-    if places is not None and (
-        places.ndim != 1
-        or places.dtype.kind not in "iu"
-        or (places.size and not (places.min() >= -1 and places.max() < vertices))
-    ):
-        raise AssetError(f"trajectory {path} has a vertex_map that names no vertex of it; write it again")
-    names, parts = arrays.get("part_names", np.zeros(0, np.str_)), arrays.get("face_parts")
-    if names.ndim != 1 or names.dtype.kind != "U":
-        raise AssetError(f"trajectory {path} has part_names that are no names; write it again")
-    if parts is not None and parts.size and not (parts.min() >= 0 and parts.max() < len(names)):
-        raise AssetError(f"trajectory {path} has face_parts without names; write it again")
 
 
 def _check_mesh(arrays: Mapping[str, np.ndarray], positions: str, faces: str, path: str | Path) -> None:
