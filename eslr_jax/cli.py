@@ -607,7 +607,7 @@ def joints(
 
 @app.command
 def export(
-    run: Path,
+    run: tyro.conf.Positional[Path],
     out: Path,
     format_: Annotated[
         Literal["glb", "usd", "usda", "usdc", "obj", "ply", "pc2", "mdd", "npz"] | None,
