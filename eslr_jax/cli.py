@@ -636,7 +636,6 @@ def export(
     print(export_trajectory(trajectory, out, garment=garment, format=format_, content=content))
 
 
-
 @app.command
 def assets(
     kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
