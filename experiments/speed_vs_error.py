@@ -1,0 +1,180 @@
+"""Speed against error: excess over the optimum against time per frame, for the solver, networks and both.
+
+    python experiments/speed_vs_error.py                 # 1k and 4k, about twenty minutes on two cores
+    python experiments/speed_vs_error.py --smoke --out DIR
+
+Every method starts from the same states, those of the near-optimal rollout on a test clip, so errors are
+teacher-forced. A method's time is a fixed part (contacts, network) and a part per L-BFGS iteration, measured in
+turns. Free rollouts follow for a few settings. Writes speed_vs_error.json and .png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from eslr_jax.assets import asset_names, load_model
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.calibrate import (
+    SOLVER,
+    Method,
+    device_name,
+    example_scene,
+    measure_methods,
+    with_iterations,
+)
+from eslr_jax.evaluation.report import environment, trajectory_report
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.simulate.scan import simulate_scene
+
+RESULTS = Path(__file__).parent / "results"
+CLIP = "cmu_016_32"  # of the test split
+GARMENTS = ("tshirt", "dress", "pants")
+ROLLOUTS = {SOLVER: (5, 10, 20, 50, 100), "network": (0, 5, 20)}  # iterations of the free rollouts
+COLORS = {SOLVER: "#1b1b1b"}
+
+
+def points(method: Method) -> list[dict]:
+    """Return a method's measured points: iterations, milliseconds, relative excess."""
+    return [
+        {
+            "iterations": int(count),
+            "frame_ms": method.fixed_ms + int(count) * method.iteration_ms,
+            "excess_relative_median": excess,
+            "excess_relative_p99": method.p99[count],
+        }
+        for count, excess in method.median.items()
+    ]
+
+
+def free_rollouts(model: str | None, garment: str, size: str, num_frames: int) -> list[dict]:
+    """Return the report of free rollouts with several iteration counts."""
+    scene = example_scene(garment, size, CLIP, num_frames)
+    params, config = None, SimConfig(simulator="physics")
+    if model is not None:
+        params, architecture = load_model(model)
+        config = SimConfig(model=architecture)
+    reports = []
+    for count in ROLLOUTS[SOLVER if model is None else "network"]:
+        trajectory = simulate_scene(params, scene, PhysicsParameters(), with_iterations(config, count))
+        report = trajectory_report(trajectory, scene)
+        kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
+        reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})
+    return reports
+
+
+def who_wins(methods: list[Method]) -> list[dict]:
+    """Return, for a range of budgets, the best excess of the solver and of the best network with corrector."""
+    by_name = {method.name: points(method) for method in methods}
+    least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
+    most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
+    rows = []
+    for budget in np.geomspace(least, most, 8):
+        best = {
+            name: min(
+                (entry["excess_relative_median"] for entry in entries if entry["frame_ms"] <= budget),
+                default=None,
+            )
+            for name, entries in by_name.items()
+        }
+        rows.append({"budget_ms": float(budget), **best})
+    return rows
+
+
+def draw(result: dict, path: Path) -> None:
+    """Draw the frontier, one panel per size."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    sizes = list(result["sizes"])
+    figure, axes = plt.subplots(1, len(sizes), figsize=(5.2 * len(sizes), 4.2), sharey=True, squeeze=False)
+    for axis, size in zip(axes[0], sizes, strict=True):
+        for name, entries in result["sizes"][size]["methods"].items():
+            shown = [entry for entry in entries if entry["excess_relative_median"] > 1e-6]
+            label = "L-BFGS" if name == SOLVER else f"{name} + L-BFGS"
+            times, errors = (
+                [entry[key] for entry in shown] for key in ("frame_ms", "excess_relative_median")
+            )
+            axis.loglog(times, errors, "o-", label=label, color=COLORS.get(name), markersize=4)
+            for entry in shown:
+                axis.annotate(
+                    str(entry["iterations"]),
+                    (entry["frame_ms"], entry["excess_relative_median"]),
+                    fontsize=7,
+                    textcoords="offset points",
+                    xytext=(3, 3),
+                )
+        axis.set_title(f"{size} vertices")
+        axis.set_xlabel("time per frame [ms]")
+        axis.grid(True, which="both", alpha=0.2)
+    axes[0][0].set_ylabel("excess over the optimum / the frame's drop (median)")
+    axes[0][0].legend(fontsize=8)
+    figure.tight_layout()
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+
+
+def main() -> None:
+    """Measure, draw and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
+    parser.add_argument("--models", nargs="*", default=list(asset_names("model")))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
+    arguments = parser.parse_args()
+    garments, frames, rollout_frames = GARMENTS, 60, 100
+    if arguments.smoke:
+        garments, frames, rollout_frames = GARMENTS[:1], 8, 6
+        arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
+    result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "sizes": {}}
+    for size in arguments.sizes:
+        scenes = [example_scene(garment, size, CLIP, frames) for garment in garments]
+        methods = measure_methods((None, *arguments.models), scenes)
+        rollouts = {
+            name or SOLVER: [
+                entry for g in garments for entry in free_rollouts(name, g, size, rollout_frames)
+            ]
+            for name in (None, *arguments.models[:1])
+        }
+        result["sizes"][size] = {
+            "methods": {method.name: points(method) for method in methods},
+            "costs": [
+                {
+                    key: value
+                    for key, value in dataclasses.asdict(method).items()
+                    if key not in ("median", "p99")
+                }
+                for method in methods
+            ],
+            "budgets": who_wins(methods),
+            "rollouts": rollouts,
+        }
+        jax.clear_caches()
+    result["environment"] = environment()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    draw(result, arguments.out / "speed_vs_error.png")
+    with atomic_write(arguments.out / "speed_vs_error.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    for size, measured in result["sizes"].items():
+        print(size)
+        for row in measured["budgets"]:
+            cells = ", ".join(
+                f"{name} {'-' if value is None else f'{value:.3%}'}"
+                for name, value in row.items()
+                if name != "budget_ms"
+            )
+            print(f"  {row['budget_ms']:7.1f} ms: {cells}")
+
+
+if __name__ == "__main__":
+    main()
