@@ -81,9 +81,17 @@ def motions() -> list[dict]:
 def models() -> list[dict]:
     """Return the bundled networks; the first is the default."""
     entries = []
-    for file in sorted((DATA / "models").glob("*.npz")):
+    for file in sorted((DATA / "models").glob("*.npz"), key=lambda file: file.stem):
         training = json.loads(file.with_suffix(".json").read_text())["training"]
-        entries.append(entry("model", file.stem, file, "model", training.get("description", "")))
+        entries.append(
+            entry(
+                "model",
+                file.stem,
+                file,
+                "model",
+                f"{training['iterations']} steps of {' and '.join(training['vertices'])}",
+            )
+        )
     return entries
 
 

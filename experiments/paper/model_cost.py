@@ -2,8 +2,8 @@
 
     python experiments/paper/model_cost.py [--smoke]
 
-Latency is a frame of the T-shirt at 4k vertices, contacts included, the networks in turns. Memory is what XLA sets
-aside for the call, weights included. The loss column needs networks of this size trained, which takes a GPU.
+Latency is a frame of the T-shirt at 4k vertices, contacts included, the networks in turns. Memory is what XLA
+sets aside for the call, weights included. The loss column needs networks of this size trained, which takes a GPU.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ from eslr_jax.types import Scene, Trajectory
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
 OPTIMUM = "optimum"
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
+_ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
 _OPTIMUM_ITERATIONS = 60  # of L-BFGS: 0.05 % of the drop
 
 
@@ -83,19 +84,27 @@ def table(
             rows = []
             for poses in motions.values():
                 scene = prepare_scene(cloth, poses, surface=surface)
-                rows.append(measure(simulate_scene(params, scene, PhysicsParameters(), config), scene))
+                trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
+                rows.append(measure(trajectory, scene, float(body.joint_rest_positions[0, 1])))
             measured[model][garment] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
             print(garment, model, {name: round(value, 4) for name, value in measured[model][garment].items()})
     return measured
 
 
-def measure(trajectory: Trajectory, scene: Scene) -> dict[str, float]:
-    """Return the terms [J] as means over frames, their Total, and what the Total does not see."""
+def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[str, float]:
+    """Return the terms [J] as means over frames, their Total, and what the Total does not see.
+
+    Args:
+        trajectory: A rollout.
+        scene: Its scene.
+        root_height: Of the body's root joint at rest [m]: potential energy counts from near it, as in HOOD.
+    """
     assert scene.surface is not None
     assert scene.body_positions is not None
+    origin = np.array([0.0, root_height + _ORIGIN_ABOVE_ROOT, 0.0], np.float32)
     metrics = hood_metrics(
-        trajectory.positions,
-        scene.body_positions,
+        trajectory.positions - origin,
+        scene.body_positions - origin,
         scene.surface.faces,
         scene.garment,
         scene.material,
