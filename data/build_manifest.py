@@ -83,15 +83,8 @@ def models() -> list[dict]:
     entries = []
     for file in sorted((DATA / "models").glob("*.npz"), key=lambda file: file.stem):
         training = json.loads(file.with_suffix(".json").read_text())["training"]
-        entries.append(
-            entry(
-                "model",
-                file.stem,
-                file,
-                "model",
-                f"{training['iterations']} steps of {' and '.join(training['vertices'])}",
-            )
-        )
+        description = f"{training['iterations']} steps at {' and '.join(training['vertices'])}"
+        entries.append(entry("model", file.stem, file, "model", description))
     return entries
 
 

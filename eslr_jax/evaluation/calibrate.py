@@ -143,10 +143,11 @@ def _measure(model: str | None, scenes: list[Scene], truths: list[Any]) -> Metho
 
 def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
     """Return milliseconds per frame with few and with many iterations, measured in turns."""
+    frames = min(_TIMED_FRAMES, scene.num_frames)
     short = scene.replace(
-        body_positions=None if scene.body_positions is None else scene.body_positions[:_TIMED_FRAMES],
-        pin_targets=None if scene.pin_targets is None else scene.pin_targets[:_TIMED_FRAMES],
-        num_frames=_TIMED_FRAMES,
+        body_positions=None if scene.body_positions is None else scene.body_positions[:frames],
+        pin_targets=None if scene.pin_targets is None else scene.pin_targets[:frames],
+        num_frames=frames,
     )
     runs = {count: with_iterations(config, count) for count in _TIMED_ITERATIONS}
     best = dict.fromkeys(runs, np.inf)
@@ -156,7 +157,7 @@ def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
             jax.block_until_ready(simulate_scene(params, short, PhysicsParameters(), chosen))
             if turn:  # the first compiles
                 best[count] = min(best[count], time.perf_counter() - began)
-    return {count: seconds * 1e3 / (_TIMED_FRAMES - 1) for count, seconds in best.items()}
+    return {count: seconds * 1e3 / (frames - 1) for count, seconds in best.items()}
 
 
 def with_iterations(config: SimConfig, iterations: int, tolerance: float = 0.0) -> SimConfig:

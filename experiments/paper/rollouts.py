@@ -85,7 +85,8 @@ def table(
             for poses in motions.values():
                 scene = prepare_scene(cloth, poses, surface=surface)
                 trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
-                rows.append(measure(trajectory, scene, float(body.joint_rest_positions[0, 1])))
+                root = poses.joint_transforms[0, 0] @ np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
+                rows.append(measure(trajectory, scene, float(root[1])))
             measured[model][garment] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
             print(garment, model, {name: round(value, 4) for name, value in measured[model][garment].items()})
     return measured
@@ -97,7 +98,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     Args:
         trajectory: A rollout.
         scene: Its scene.
-        root_height: Of the body's root joint at rest [m]: potential energy counts from near it, as in HOOD.
+        root_height: Of the body's root joint in the first frame [m]: potential energy counts from near it, as in HOOD.
     """
     assert scene.surface is not None
     assert scene.body_positions is not None
