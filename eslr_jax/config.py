@@ -87,7 +87,8 @@ class SimConfig:
     # Stop a frame's iterations where what is left to gain is estimated to be below this share of what the
     # frame gains from its pushed-out inertial guess; 0.01 is kept on 99 % of frames.
     tolerance: float = 0.0
-    self_contact: bool = False
+    self_contact: bool = False  # layers of cloth keep apart
+    tip_contact: bool = False  # the body's vertices collide too: tips finer than the cloth's mesh
 
 
 @dataclasses.dataclass(frozen=True)

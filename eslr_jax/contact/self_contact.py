@@ -1,7 +1,8 @@
-"""Where cloth comes close to itself: vertex-face pairs of fixed capacity, found in sorted cells."""
+"""Where points come close to faces of cloth: pairs of fixed capacity, found in sorted cells."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,26 +14,29 @@ from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3
 from eslr_jax.types import Garment
 
+TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
 SEARCH_RADIUS = 0.02  # [m] within which layers see each other: they may approach by this much in a frame
 _NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to approach (ContourCraft)
-_MIN_COSINE = 0.5  # between a pair's direction and the face normal; beside a hem there is nothing to hit
+_MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a hem there is nothing to hit
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
 _CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
 _CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
-_PAIRS_PER_VERTEX = 4  # default capacity, a mean over vertices
+_PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
 
 
 @struct.dataclass
-class SelfContacts:
-    """Pairs of a vertex and a face of the same cloth that are close at t.
+class FacePairs:
+    """Pairs of a point and a face of the cloth that are close at t.
 
-    A row that is not used has `side` zero and names the last vertex.
+    The points are the cloth's own vertices, or vertices of the body. A row that is not used has `side` zero,
+    and names the last point and the last vertex.
     """
 
-    vertices: Int[Array, " pairs"]
+    vertices: Int[Array, " pairs"]  # the points' rows
     corners: Int[Array, "pairs 3"]  # vertices of the face
-    weights: Float[Array, "pairs 3"]  # barycentric, of the point of the face nearest to the vertex at t
-    side: Float[Array, " pairs"]  # 1 where the vertex is on the side of the face's normal at t, -1 behind
+    weights: Float[Array, "pairs 3"]  # barycentric, of the place on the face nearest to the point at t
+    side: Float[Array, " pairs"]  # 1 where the point is on the side of the face's normal at t, -1 behind
+    areas: Float[Array, " pairs"]  # of cloth that the point stands for [m^2]
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
@@ -54,7 +58,7 @@ def find_self_contacts(
     radius: Float[Array, ""] | float = SEARCH_RADIUS,
     capacity: int | None = None,
     cell_capacity: int = _CELL_CAPACITY,
-) -> SelfContacts:
+) -> FacePairs:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
     A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
@@ -67,39 +71,113 @@ def find_self_contacts(
         predicted: A guess of the vertices at t + 1 [m], such as the inertial one.
         garment: Rest mesh.
         radius: Of the search [m].
-        capacity: Rows for pairs; four per vertex by default. Static.
+        capacity: Rows for pairs; eight per vertex by default. Static.
         cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
             centroid is close; static.
     """
-    num_vertices = position.shape[0]
-    capacity = _PAIRS_PER_VERTEX * num_vertices if capacity is None else capacity
+    capacity = _PAIRS_PER_VERTEX * position.shape[0] if capacity is None else capacity
+    pairs = _find_pairs(
+        _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, is_cloth=True),
+        position,
+        predicted,
+        garment,
+        radius=radius,
+        capacity=capacity,
+        cell_capacity=cell_capacity,
+    )
+    is_around = _is_around(pairs.vertices, pairs.corners, garment)
+    return dataclasses.replace(pairs, side=jnp.where(is_around, 0.0, pairs.side))
+
+
+def find_tip_contacts(
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    next_body: Float[Array, "surface_vertices 3"],
+    garment: Garment,
+    *,
+    radius: Float[Array, ""] | float = TIP_RADIUS,
+    capacity: int | None = None,
+    cell_capacity: int = _CELL_CAPACITY,
+) -> FacePairs:
+    """Pair every body vertex with the faces of the cloth that it could touch during the frame.
+
+    The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh; its own
+    vertices see the faces.
+
+    Args:
+        position: Cloth vertices at t [m].
+        predicted: A guess of them at t + 1 [m].
+        body: Body vertices at t [m].
+        next_body: At t + 1 [m].
+        garment: Rest mesh.
+        radius: Of the search [m].
+        capacity: Rows for pairs; one per vertex of cloth and body by default. Static.
+        cell_capacity: See `find_self_contacts`.
+    """
+    capacity = position.shape[0] + body.shape[0] if capacity is None else capacity
+    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
+    count = body.shape[0]
+    points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), is_cloth=False)
+    return _find_pairs(
+        points,
+        position,
+        predicted,
+        garment,
+        radius=radius,
+        capacity=capacity,
+        cell_capacity=cell_capacity,
+    )
+
+
+class _Points(NamedTuple):
+    """What is paired with the faces of the cloth."""
+
+    position: Float[Array, "points 3"]  # at t [m]
+    predicted: Float[Array, "points 3"]  # at t + 1 [m]
+    mask: Bool[Array, " points"]
+    areas: Float[Array, " points"]  # of cloth [m^2]
+    is_cloth: bool  # the points are the vertices of the faces
+
+
+def _find_pairs(
+    points: _Points,
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    garment: Garment,
+    *,
+    radius: Float[Array, ""] | float,
+    capacity: int,
+    cell_capacity: int,
+) -> FacePairs:
+    """Return pairs of points and faces; see `find_self_contacts`."""
+    num_points, num_vertices = points.position.shape[0], position.shape[0]
     corners = [_gather(position, garment.faces[:, k]) for k in range(3)]
     centroid = _mean(corners)
     reach = _largest_reach(corners, centroid, garment.rest_areas > 0)
     grid = _sort_faces(centroid, garment.rest_areas > 0, radius + reach)
-    faces, is_listed, most = _listed_faces(position, grid, cell_capacity)
+    faces, is_listed, most = _listed_faces(points.position, grid, cell_capacity)
     # First by distance of centroids, which is cheap, then exactly.
-    x, y, z = components(position)
+    x, y, z = components(points.position)
     listed = (centroid[0][faces], centroid[1][faces], centroid[2][faces])
     squared = _squared_distance((x[:, None], y[:, None], z[:, None]), listed)
-    is_close = is_listed & garment.vertex_mask[:, None] & (squared < grid.cell_size**2)
-    limit = cell_capacity * num_vertices
+    is_close = is_listed & points.mask[:, None] & (squared < grid.cell_size**2)
+    limit = cell_capacity * num_points
     rows, num_close = _compact(is_close.ravel(), limit)
-    vertex = jnp.minimum(rows // faces.shape[1], num_vertices - 1)
+    point = jnp.minimum(rows // faces.shape[1], num_points - 1)
     face = faces.ravel()[jnp.minimum(rows, faces.size - 1)]
-    is_pair, weights, side = _is_pair(vertex, face, position, predicted, garment, radius)
+    is_pair, weights, side = _is_pair(point, face, points, position, predicted, garment, radius)
     rows, count = _compact(is_pair & (jnp.arange(limit) < num_close), capacity)
     is_used = jnp.arange(capacity) < count
     rows = jnp.minimum(rows, limit - 1)
-    vertex = jnp.where(is_used, vertex[rows], num_vertices - 1)
-    corner = jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1)
-    is_used = is_used & ~_is_around(vertex, corner, garment)
+    point = jnp.where(is_used, point[rows], num_points - 1)
     is_full = (most > cell_capacity) | (num_close > limit) | (count > capacity)
-    return SelfContacts(
-        vertices=vertex,
-        corners=corner,
+    return FacePairs(
+        vertices=point,
+        corners=jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1),
         weights=weights[rows],
         side=jnp.where(is_used, side[rows], 0.0),
+        areas=jnp.where(is_used, points.areas[point], 0.0),
         count=count,
         status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
     )
@@ -140,22 +218,22 @@ def _sort_faces(centroid: Vector3, is_real: Bool[Array, " faces"], cell_size: Ar
 
 
 def _listed_faces(
-    position: Float[Array, "vertices 3"], grid: _Grid, capacity: int
-) -> tuple[Int[Array, "vertices listed"], Bool[Array, "vertices listed"], Int[Array, ""]]:
-    """Return the faces in the 27 cells around every vertex, which slots are real, and the longest column."""
+    position: Float[Array, "points 3"], grid: _Grid, capacity: int
+) -> tuple[Int[Array, "points listed"], Bool[Array, "points listed"], Int[Array, ""]]:
+    """Return the faces in the 27 cells around every point, which slots are real, and the longest column."""
     cell = jnp.floor((position - grid.origin[None]) / grid.cell_size).astype(jnp.int32) + 1
     steps = jnp.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], jnp.int32)
-    columns = cell[:, None, :] + jnp.pad(steps, ((0, 0), (0, 1)))[None]  # [vertices, 9, 3]
+    columns = cell[:, None, :] + jnp.pad(steps, ((0, 0), (0, 1)))[None]  # [points, 9, 3]
     up = jnp.array([[[0, 0, 1]]], jnp.int32)
     first = jnp.searchsorted(grid.keys, _cell_key(columns - up), side="left")
     last = jnp.searchsorted(grid.keys, _cell_key(columns + up), side="right")
-    slot = first[..., None] + jnp.arange(capacity, dtype=first.dtype)[None, None]  # [vertices, 9, capacity]
+    slot = first[..., None] + jnp.arange(capacity, dtype=first.dtype)[None, None]  # [points, 9, capacity]
     is_listed = slot < last[..., None]
     faces = grid.faces[jnp.minimum(slot, grid.faces.shape[0] - 1)]
-    num_vertices = position.shape[0]
+    num_points = position.shape[0]
     return (
-        faces.reshape(num_vertices, -1),
-        is_listed.reshape(num_vertices, -1),
+        faces.reshape(num_points, -1),
+        is_listed.reshape(num_points, -1),
         jnp.max(last - first),
     )
 
@@ -171,26 +249,29 @@ def _compact(mask: Bool[Array, " rows"], capacity: int) -> tuple[Int[Array, " ca
 
 
 def _is_pair(
-    vertex: Int[Array, " rows"],
+    point: Int[Array, " rows"],
     face: Int[Array, " rows"],
+    points: _Points,
     position: Float[Array, "vertices 3"],
     predicted: Float[Array, "vertices 3"],
     garment: Garment,
     radius: Float[Array, ""] | float,
 ) -> tuple[Bool[Array, " rows"], Float[Array, "rows 3"], Float[Array, " rows"]]:
-    """Return which rows are pairs, the barycentric weights of the nearest point, and the vertex's side."""
+    """Return which rows are pairs, the barycentric weights of the nearest place, and the point's side."""
     corner = garment.faces[face]
-    point, a, b, c = (_gather(position, ids) for ids in (vertex, corner[:, 0], corner[:, 1], corner[:, 2]))
-    squared, u, v = point_triangle(point, a, b, c)
+    here = _gather(points.position, point)
+    a, b, c = (_gather(position, corner[:, k]) for k in range(3))
+    squared, u, v = point_triangle(here, a, b, c)
     weights = (1.0 - u - v, u, v)
-    height, slope = _height(point, (a, b, c), weights)
-    moved = [_gather(predicted, ids) for ids in (vertex, corner[:, 0], corner[:, 1], corner[:, 2])]
-    predicted_height, _ = _height(moved[0], moved[1:], weights)
+    height, size = _height(here, (a, b, c), weights)
+    moved = [_gather(predicted, corner[:, k]) for k in range(3)]
+    predicted_height, _ = _height(_gather(points.predicted, point), moved, weights)
     side = jnp.where(height < 0, -1.0, 1.0).astype(position.dtype)
     is_over = jnp.abs(height) >= _MIN_COSINE * jnp.sqrt(squared)
     is_reached = (squared < _NEAR**2) | (side * predicted_height < _NEAR)
-    holds = jnp.any(corner == vertex[:, None], axis=1)
-    is_pair = (squared < jnp.square(radius)) & is_over & is_reached & ~holds & (slope > 0)
+    is_pair = (squared < jnp.square(radius)) & is_over & is_reached & (size > 0)
+    if points.is_cloth:
+        is_pair = is_pair & ~jnp.any(corner == point[:, None], axis=1)
     return is_pair, jnp.stack(weights, axis=-1), side
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.contact.self_contact import SelfContacts
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.types import Contacts, Garment, Material
 
@@ -160,7 +160,7 @@ def _friction_blocks(
     return (load / length)[:, None, None] * curvature
 
 
-def pair_table(contacts: SelfContacts | None) -> Int[np.ndarray, "pairs 4"]:
+def pair_table(contacts: FacePairs | None) -> Int[np.ndarray, "pairs 4"]:
     """Return the vertex and the face's corners of every self-contact pair in use."""
     if contacts is None:
         return np.zeros((0, 4), np.int64)

@@ -76,6 +76,14 @@ def potential_terms(
             collision = collision + collision_energy(
                 position, problem.across, garment, parameters.collision_stiffness, problem.collision_thickness
             )
+        if problem.tips is not None:
+            collision = collision + repulsion_energy(
+                position,
+                problem.tips,
+                parameters.collision_stiffness,
+                parameters.collision_thickness,
+                problem.next_body,
+            )
         friction = friction_energy(
             position,
             problem.position,
@@ -89,7 +97,6 @@ def potential_terms(
         repulsion = repulsion_energy(
             position,
             problem.self_contacts,
-            garment,
             parameters.repulsion_stiffness,
             parameters.repulsion_thickness,
         )

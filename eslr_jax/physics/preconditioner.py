@@ -60,6 +60,14 @@ def hessian_diagonal(
         if problem.across is not None:
             depth = depth + penetration(position, problem.across, problem.collision_thickness)
         slip = parameters.friction_speed * problem.timestep
+        if problem.tips is not None:
+            diagonal = diagonal + repulsion_diagonal(
+                position,
+                problem.tips,
+                parameters.collision_stiffness,
+                parameters.collision_thickness,
+                problem.next_body,
+            )
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * parameters.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + parameters.friction_coefficient * problem.friction_load / (3.0 * slip)
@@ -67,7 +75,6 @@ def hessian_diagonal(
         diagonal = diagonal + repulsion_diagonal(
             position,
             problem.self_contacts,
-            garment,
             problem.parameters.repulsion_stiffness,
             problem.parameters.repulsion_thickness,
         )

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from eslr_jax.contact.self_contact import SelfContacts
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.repulsion import push_apart
 from eslr_jax.types import ClothState, Contacts, Garment
 
@@ -41,7 +41,9 @@ class FrameProblem:
     collision_thickness: Float[Array, ""] | None  # of `contact_thickness` [m]
     parameters: PhysicsParameters
     across: Contacts | None = None  # with the body part on the other side of the cloth; None without a body
-    self_contacts: SelfContacts | None = None  # None: layers of cloth pass through each other
+    self_contacts: FacePairs | None = None  # None: layers of cloth pass through each other
+    tips: FacePairs | None = None  # of body vertices with the cloth; None: a tip may pass between vertices
+    next_body: Float[Array, "surface_vertices 3"] | None = None  # at t + 1 [m], where there are tips
 
 
 def contact_thickness(garment: Garment, parameters: PhysicsParameters) -> Float[Array, ""]:
@@ -62,8 +64,10 @@ def make_problem(
     pin_targets: Float[Array, "vertices 3"] | None,
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
-    self_contacts: SelfContacts | None = None,
+    self_contacts: FacePairs | None = None,
     across: Contacts | None = None,
+    tips: FacePairs | None = None,
+    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> FrameProblem:
     """Collect what one frame's potential depends on.
 
@@ -76,6 +80,8 @@ def make_problem(
         parameters: Constants of the scene.
         self_contacts: Pairs of vertices and faces of the cloth that are close, or None.
         across: Contacts with the body part on the other side of the cloth, or None.
+        tips: Pairs of body vertices and faces of the cloth that are close, or None.
+        next_body: Body vertices at t + 1 [m]; needed with tips.
     """
     return FrameProblem(
         position=state.position,
@@ -88,6 +94,8 @@ def make_problem(
         parameters=parameters,
         across=across,
         self_contacts=self_contacts,
+        tips=tips,
+        next_body=None if tips is None else next_body,
     )
 
 
@@ -122,10 +130,14 @@ def push_out(
 def start_guess(problem: FrameProblem, garment: Garment) -> Float[Array, "vertices 3"]:
     """Return the inertial guess pushed out of the body: the best cheap start that was found.
 
-    With self-contact its layers are pushed apart as well.
+    With self-contact its layers are pushed apart as well, and its faces off the body's tips.
     """
     position = push_out(problem, garment, problem.inertial_guess)
-    if problem.self_contacts is None:
-        return position
-    thickness = problem.parameters.repulsion_thickness
-    return push_out(problem, garment, push_apart(position, problem.self_contacts, thickness))
+    parameters = problem.parameters
+    if problem.tips is not None:
+        position = push_apart(position, problem.tips, parameters.collision_thickness, problem.next_body)
+        position = push_out(problem, garment, position)
+    if problem.self_contacts is not None:
+        position = push_apart(position, problem.self_contacts, parameters.repulsion_thickness)
+        position = push_out(problem, garment, position)
+    return position

@@ -64,6 +64,7 @@ def scan_frames(
             scene.timestep,
             parameters,
             self_contact=config.self_contact,
+            tip_contact=config.tip_contact,
         )
         report: StepReport
         state, report = step(params, scene.garment, scene.material, problem, state, config)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach, find_both_sides
-from eslr_jax.contact.self_contact import find_self_contacts
+from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
@@ -47,19 +47,30 @@ def frame_problem(
     parameters: PhysicsParameters,
     *,
     self_contact: bool = False,
+    tip_contact: bool = False,
 ) -> FrameProblem:
     """Find the frame's contacts and state its minimisation problem."""
-    contacts = across = None
+    contacts = across = tips = self_contacts = None
+    guess = state.position + timestep * state.velocity
     if surface is not None:
         assert frame.body is not None
         assert frame.next_body is not None
         contacts, across = find_both_sides(state.position, frame.body, frame.next_body, surface)
-    self_contacts = None
+        if tip_contact:
+            tips = find_tip_contacts(state.position, guess, frame.body, frame.next_body, garment)
     if self_contact:
-        guess = state.position + timestep * state.velocity
         self_contacts = find_self_contacts(state.position, guess, garment)
     return make_problem(
-        garment, state, contacts, frame.pin_targets, timestep, parameters, self_contacts, across
+        garment,
+        state,
+        contacts,
+        frame.pin_targets,
+        timestep,
+        parameters,
+        self_contacts=self_contacts,
+        across=across,
+        tips=tips,
+        next_body=frame.next_body,
     )
 
 
@@ -149,8 +160,9 @@ def next_state(
         moved = approach(contacts.points, contacts.next_points, contacts.normals)
         is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & garment.vertex_mask)
         status = status | jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
-    if problem.self_contacts is not None:
-        status = status | problem.self_contacts.status
+    for pairs in (problem.self_contacts, problem.tips):
+        if pairs is not None:
+            status = status | pairs.status
     is_finite = jnp.all(jnp.isfinite(position))
     status = state.status | status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
     return ClothState(

@@ -456,8 +456,8 @@ def _build_needle(options: dict[str, Any]) -> Scenes:
     edge = capsule(_TIP, 0.7, around=12, rings=60)
     bar = Capsule(np.array([-0.35, 0.0, 0.0]), np.array([0.35, 0.0, 0.0]), _TIP)
     return {
-        "needle": make_scene(garment, start, 46, body=mesh, colliders=lambda frame: (cone,)),
-        "thin edge": make_scene(garment, start, 46, body=edge, colliders=lambda frame: (bar,)),
+        "needle": make_scene(garment, start, 46, body=mesh, colliders=lambda frame: (cone,), is_sharp=True),
+        "thin edge": make_scene(garment, start, 46, body=edge, colliders=lambda frame: (bar,), is_sharp=True),
     }
 
 

@@ -204,6 +204,7 @@ def make_scene(
     pin_targets: Float[np.ndarray, "frames vertices 3"] | None = None,
     parameters: PhysicsParameters | None = None,
     self_contact: bool = False,
+    is_sharp: bool = False,
 ) -> StressScene:
     """Put cloth, body and pins together.
 
@@ -214,18 +215,19 @@ def make_scene(
         velocity: At frame 0 [m/s]; zero if not given.
         timestep: Seconds between frames.
         material: Fabric.
-        body: Body mesh in any pose, or None.
-        body_positions: Where it is in every frame [m]; still if not given.
+        body: Body mesh, or None.
+        body_positions: Where it is in every frame [m]; still if not given. In frame 0 it must not touch itself.
         colliders: What the body stands for, exactly, by frame.
         pin_targets: Where pinned vertices are in every frame [m]; at the start if not given.
         parameters: Physical constants.
         self_contact: Whether layers must be kept apart.
+        is_sharp: Whether the body has tips finer than the cloth's mesh.
     """
     position = jnp.asarray(start, jnp.float32)
     surface = tracks = faces = None
     if body is not None:
-        surface, faces = prepare_surface(*body), body[1]
         tracks = body[0][None] if body_positions is None else body_positions
+        surface, faces = prepare_surface(np.asarray(tracks[0]), body[1]), body[1]
         tracks = jnp.asarray(np.broadcast_to(tracks, (num_frames, *body[0].shape)), jnp.float32)
     pins = None
     if bool(np.any(garment.is_pinned)):
@@ -243,4 +245,4 @@ def make_scene(
         pin_targets=pins,
         num_frames=num_frames,
     )
-    return StressScene(scene, faces, colliders, parameters or PhysicsParameters(), self_contact)
+    return StressScene(scene, faces, colliders, parameters or PhysicsParameters(), self_contact, is_sharp)

@@ -183,18 +183,18 @@ class Gaps(NamedTuple):
 
 
 def own_gaps(run: Run, every: int) -> Gaps:
-    """Compare some of a trajectory's frames with the optimum from the same state."""
+    """Compare some of a trajectory's frames with the optimum from the same state, without self-contact."""
     assert run.trajectory is not None
     assert run.stress is not None
     answer, start, best = jax.device_get(
-        _gaps(run.trajectory, run.stress.scene, run.stress.parameters, every, run.stress.self_contact)
+        _gaps(run.trajectory, run.stress.scene, run.stress.parameters, every)
     )
     drop = np.maximum(start - best, 1e-9)
     return Gaps(answer - best, (answer - best) / drop)
 
 
-@partial(jax.jit, static_argnames=("every", "self_contact"))
-def _gaps(trajectory, scene, parameters: PhysicsParameters, every: int, self_contact: bool):
+@partial(jax.jit, static_argnames="every")
+def _gaps(trajectory, scene, parameters: PhysicsParameters, every: int):
     states, inputs = trajectory_states(trajectory, scene, parameters)
     answers = trajectory.positions[1:]
     garment, material = scene.garment, scene.material
@@ -202,9 +202,7 @@ def _gaps(trajectory, scene, parameters: PhysicsParameters, every: int, self_con
 
     def compare(frame):
         state, inputs, answer = frame
-        problem = frame_problem(
-            garment, state, inputs, scene.surface, scene.timestep, parameters, self_contact=self_contact
-        )
+        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
         start = start_guess(problem, garment)
         best = [
             solve(

@@ -29,6 +29,7 @@ class StressScene:
     colliders: Callable[[int], Sequence[Collider]] | None = None  # what the body stands for, by frame
     parameters: PhysicsParameters = dataclasses.field(default_factory=PhysicsParameters)
     self_contact: bool = False  # layers must not pass through each other
+    is_sharp: bool = False  # the body has tips finer than the cloth's mesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +128,7 @@ def physics_simulator(
             solver_iterations=iterations,
             tolerance=tolerance,
             self_contact=self_contact and stress.self_contact,
+            tip_contact=stress.is_sharp,
         )
         fine = dataclasses.replace(stress, scene=split_frames(stress.scene, substeps))
         return join_substeps(simulate(None, fine, config), substeps)
@@ -158,6 +160,7 @@ def network_simulator(
             model=model,
             corrector_steps=corrector_steps,
             self_contact=self_contact and stress.self_contact,
+            tip_contact=stress.is_sharp,
         )
         return simulate(params, stress, config)
 
