@@ -73,6 +73,7 @@ def simulate(
     motion_up: Literal["auto", "y", "z"] = "auto",
     arm_abduction: float | None = None,
     body_fps: float | None = None,
+    self_contact: bool = False,
     out: Path = Path("out"),
     pictures: bool = True,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -103,6 +104,7 @@ def simulate(
         arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
             another body and 0 for the body's own.
         body_fps: Frames per second of a body that is a moving mesh.
+        self_contact: Keep layers of cloth apart; the network does so only in its corrector.
         out: Folder to write to.
         pictures: Render the contact sheet.
         json_: Print the report as JSON.
@@ -162,6 +164,7 @@ def simulate(
         solver_iterations=iterations,
         corrector_steps=corrector_steps,
         tolerance=0.0 if choice is None else choice.tolerance,
+        self_contact=self_contact,
     )
     with _progress("simulating", scene.num_frames - 1) as advance:
         trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)

@@ -88,7 +88,26 @@ class SimConfig:
     # frame gains from its pushed-out inertial guess; 0.01 is kept on 99 % of frames.
     tolerance: float = 0.0
     self_contact: bool = False  # layers of cloth keep apart
+    self_contact_capacity: int | None = None  # rows for pairs; None is eight per vertex
+    self_contact_cell_capacity: int | None = None  # faces in a column of search cells; None is 96
     tip_contact: bool = False  # the body's vertices collide too: tips finer than the cloth's mesh
+
+    def __post_init__(self) -> None:
+        """Reject impossible values.
+
+        Raises:
+            ValueError: Names the field.
+        """
+        for name in ("solver_iterations", "solver_memory"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("corrector_steps", "tolerance"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("self_contact_capacity", "self_contact_cell_capacity"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, or null for the default, got {value}")
 
 
 @dataclasses.dataclass(frozen=True)

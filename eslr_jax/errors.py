@@ -56,7 +56,7 @@ class Status(enum.IntFlag):
             Status.NON_FINITE: "positions became NaN or infinite; use the physics simulator, more corrector "
             "steps, or a smaller timestep",
             Status.WORLD_EDGE_OVERFLOW: "more world edges than their capacity; raise world_edge_capacity",
-            Status.SELF_CONTACT_OVERFLOW: "more self-contact pairs than their capacity; "
+            Status.SELF_CONTACT_OVERFLOW: "more self-contact than its capacities hold; "
             "raise self_contact_capacity",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
             "resample the motion to a smaller timestep",

@@ -217,6 +217,9 @@ def raise_for_status(trajectory: Trajectory) -> None:
     if status == Status.OK:
         return
     message = f"frame {int(trajectory.first_bad_frame)}: {status.describe()}"
+    if Status.SELF_CONTACT_OVERFLOW in status and trajectory.needed_capacity is not None:
+        pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.needed_capacity), axis=0))
+        message += f" to at least {pairs}, and self_contact_cell_capacity to at least {faces}"
     error: type[EslrError] = CapacityError
     if Status.NON_FINITE in status:
         error = NonFiniteError

@@ -146,6 +146,8 @@ class Trajectory:
     iterations: Int[Array, " frames"]  # solver or corrector iterations spent on each frame
     status: Int[Array, ""]
     first_bad_frame: Int[Array, ""]
+    needed_capacity: Int[Array, "frames 2"] | None = None
+    """What self-contact needed of `self_contact_capacity` and `self_contact_cell_capacity`; None without."""
 
     @property
     def num_frames(self) -> int:

@@ -20,8 +20,8 @@ _NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to appro
 _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a hem there is nothing to hit
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
 _CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
-_CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
-_PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
+CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
+PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
 
 
 @struct.dataclass
@@ -38,6 +38,7 @@ class FacePairs:
     side: Float[Array, " pairs"]  # 1 where the point is on the side of the face's normal at t, -1 behind
     areas: Float[Array, " pairs"]  # of cloth that the point stands for [m^2]
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
+    listed: Int[Array, ""]  # the cell capacity that would have held all faces looked at
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
@@ -57,7 +58,7 @@ def find_self_contacts(
     *,
     radius: Float[Array, ""] | float = SEARCH_RADIUS,
     capacity: int | None = None,
-    cell_capacity: int = _CELL_CAPACITY,
+    cell_capacity: int = CELL_CAPACITY,
 ) -> FacePairs:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
@@ -75,7 +76,7 @@ def find_self_contacts(
         cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
             centroid is close; static.
     """
-    capacity = _PAIRS_PER_VERTEX * position.shape[0] if capacity is None else capacity
+    capacity = PAIRS_PER_VERTEX * position.shape[0] if capacity is None else capacity
     pairs = _find_pairs(
         _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, is_cloth=True),
         position,
@@ -98,7 +99,7 @@ def find_tip_contacts(
     *,
     radius: Float[Array, ""] | float = TIP_RADIUS,
     capacity: int | None = None,
-    cell_capacity: int = _CELL_CAPACITY,
+    cell_capacity: int = CELL_CAPACITY,
 ) -> FacePairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 
@@ -171,7 +172,8 @@ def _find_pairs(
     is_used = jnp.arange(capacity) < count
     rows = jnp.minimum(rows, limit - 1)
     point = jnp.where(is_used, point[rows], num_points - 1)
-    is_full = (most > cell_capacity) | (num_close > limit) | (count > capacity)
+    listed = jnp.maximum(most, -(-num_close // num_points))
+    is_full = (listed > cell_capacity) | (count > capacity)
     return FacePairs(
         vertices=point,
         corners=jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1),
@@ -179,6 +181,7 @@ def _find_pairs(
         side=jnp.where(is_used, side[rows], 0.0),
         areas=jnp.where(is_used, points.areas[point], 0.0),
         count=count,
+        listed=listed,
         status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
     )
 

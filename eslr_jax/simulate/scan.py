@@ -22,6 +22,7 @@ class Frames(NamedTuple):
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
     residuals: Float[Array, " frames"]
     iterations: Int[Array, " frames"]
+    needed_capacity: Int[Array, "frames capacities"] | None  # see Trajectory
 
 
 def frame_inputs(scene: Scene) -> FrameInput:
@@ -57,18 +58,13 @@ def scan_frames(
 
     def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
         problem = frame_problem(
-            scene.garment,
-            state,
-            frame,
-            scene.surface,
-            scene.timestep,
-            parameters,
-            self_contact=config.self_contact,
-            tip_contact=config.tip_contact,
+            scene.garment, state, frame, scene.surface, scene.timestep, parameters, config
         )
         report: StepReport
         state, report = step(params, scene.garment, scene.material, problem, state, config)
-        return state, Frames(state.position, state.velocity, report.residual, report.iterations)
+        return state, Frames(
+            state.position, state.velocity, report.residual, report.iterations, report.needed_capacity
+        )
 
     return jax.lax.scan(advance, state, inputs, length=length)
 
@@ -93,11 +89,17 @@ def simulate_scene(params: Any, scene: Scene, parameters: PhysicsParameters, con
 
 def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajectory:
     """Return the trajectory of a start, the frames after it, and the state it ended in."""
+
+    def after_nothing(values: Array) -> Array:
+        return jnp.concatenate([jnp.zeros_like(values[:1]), values])
+
+    needed = frames.needed_capacity
     return Trajectory(
         positions=jnp.concatenate([start.position[None], frames.positions]),
         velocities=jnp.concatenate([start.velocity[None], frames.velocities]),
-        residuals=jnp.concatenate([jnp.zeros_like(frames.residuals[:1]), frames.residuals]),
-        iterations=jnp.concatenate([jnp.zeros_like(frames.iterations[:1]), frames.iterations]),
+        residuals=after_nothing(frames.residuals),
+        iterations=after_nothing(frames.iterations),
+        needed_capacity=None if needed is None else after_nothing(needed),
         status=end.status,
         first_bad_frame=end.first_bad_frame,
     )

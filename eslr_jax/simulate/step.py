@@ -10,7 +10,12 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach, find_both_sides
-from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
+from eslr_jax.contact.self_contact import (
+    CELL_CAPACITY,
+    FacePairs,
+    find_self_contacts,
+    find_tip_contacts,
+)
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
@@ -36,6 +41,7 @@ class StepReport(NamedTuple):
 
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]
+    needed_capacity: Int[Array, " capacities"] | None  # see Trajectory
 
 
 def frame_problem(
@@ -45,21 +51,36 @@ def frame_problem(
     surface: BodySurface | None,
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
-    *,
-    self_contact: bool = False,
-    tip_contact: bool = False,
+    config: SimConfig | None = None,
 ) -> FrameProblem:
-    """Find the frame's contacts and state its minimisation problem."""
+    """Find the frame's contacts and state its minimisation problem.
+
+    Args:
+        garment: Rest mesh.
+        state: Cloth at t.
+        frame: The outside world from t to t + 1.
+        surface: Search tables of the body; None without one.
+        timestep: Duration of the frame [s].
+        parameters: Constants of the scene.
+        config: Says whether layers and tips collide; neither does by default.
+    """
+    config = config or SimConfig()
     contacts = across = tips = self_contacts = None
     guess = state.position + timestep * state.velocity
     if surface is not None:
         assert frame.body is not None
         assert frame.next_body is not None
         contacts, across = find_both_sides(state.position, frame.body, frame.next_body, surface)
-        if tip_contact:
+        if config.tip_contact:
             tips = find_tip_contacts(state.position, guess, frame.body, frame.next_body, garment)
-    if self_contact:
-        self_contacts = find_self_contacts(state.position, guess, garment)
+    if config.self_contact:
+        self_contacts = find_self_contacts(
+            state.position,
+            guess,
+            garment,
+            capacity=config.self_contact_capacity,
+            cell_capacity=config.self_contact_cell_capacity or CELL_CAPACITY,
+        )
     return make_problem(
         garment,
         state,
@@ -141,8 +162,17 @@ def step(
         minimum = Minimum(start, value, gradient, jnp.int32(0))
     position = pin(problem, garment, minimum.position)
     weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
-    report = StepReport(safe_norm(minimum.gradient.reshape(-1)) / weight, minimum.iterations)
+    report = StepReport(
+        residual=safe_norm(minimum.gradient.reshape(-1)) / weight,
+        iterations=minimum.iterations,
+        needed_capacity=_needed_capacity(problem.self_contacts),
+    )
     return next_state(position, problem, garment, state, status), report
+
+
+def _needed_capacity(pairs: FacePairs | None) -> Int[Array, " capacities"] | None:
+    """Return the capacities that self-contact needed, for pairs and for faces in a search column."""
+    return None if pairs is None else jnp.stack([pairs.count, pairs.listed])
 
 
 def next_state(

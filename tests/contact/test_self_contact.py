@@ -161,12 +161,15 @@ def test_flat_cloth_has_no_pairs(cloth):
 
 
 @pytest.mark.parametrize("options", [{"capacity": 50}, {"cell_capacity": 4}])
-def test_too_small_a_capacity_sets_the_bit(cloth, options):
+def test_too_small_a_capacity_sets_the_bit_and_says_what_is_needed(cloth, options):
     position = jnp.asarray(roll_up(cloth), jnp.float32)
     contacts = find_self_contacts(position, position, cloth, **options)
     assert int(contacts.status) == Status.SELF_CONTACT_OVERFLOW
-    if "capacity" in options:
-        assert int(contacts.count) > 50  # names the capacity needed
+    needed = {"capacity": int(contacts.count), "cell_capacity": int(contacts.listed)}
+    for name, value in options.items():
+        assert needed[name] > value
+    enough = find_self_contacts(position, position, cloth, **{name: needed[name] for name in options})
+    assert int(enough.status) == Status.OK
 
 
 def test_padding_changes_no_pair(cloth):
@@ -194,6 +197,7 @@ def pair_of(height, side=1.0, dtype=jnp.float32):
         side=jnp.array([side], dtype),
         areas=jnp.asarray(garment.vertex_areas[3:], dtype),
         count=jnp.int32(1),
+        listed=jnp.int32(1),
         status=jnp.int32(0),
     )
     return garment, jnp.asarray(position, dtype), contacts

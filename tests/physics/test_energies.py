@@ -44,7 +44,12 @@ def oracle_terms(case, position=None):
     case = to_numpy(case)
     garment, material, problem = case.garment, case.material, case.problem
     position = case.position if position is None else position
-    rest, faces, parameters, contacts = garment.rest_positions, garment.faces, problem.parameters, problem.contacts
+    rest, faces, parameters, contacts = (
+        garment.rest_positions,
+        garment.faces,
+        problem.parameters,
+        problem.contacts,
+    )
     mass = reference.masses(rest, faces, material.density)
     area = reference.masses(rest, faces, 1.0)
     slip = parameters.friction_speed * problem.timestep

@@ -74,8 +74,9 @@ def oracle(frames, case, parameters, criterion, position=None):
     at, current, previous, bodies, faces = frames
     position = at if position is None else position
     garment, material = case.garment, case.material
-    rest, mass = garment.rest_positions, reference.masses(
-        garment.rest_positions, garment.faces, material.density
+    rest, mass = (
+        garment.rest_positions,
+        reference.masses(garment.rest_positions, garment.faces, material.density),
     )
     query, search, body = {
         "postcvpr": (current, bodies.current, bodies.next),
@@ -97,7 +98,13 @@ def oracle(frames, case, parameters, criterion, position=None):
             reference.inertia(position, 2 * current - previous, mass, TIMESTEP),
             reference.gravity(position, 0.0, mass, parameters.gravity),
             reference.hood_collision(
-                position, query, search, body, faces, parameters.collision_weight, parameters.collision_thickness
+                position,
+                query,
+                search,
+                body,
+                faces,
+                parameters.collision_weight,
+                parameters.collision_thickness,
             ),
             reference.hood_friction(
                 position,

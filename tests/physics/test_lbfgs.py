@@ -32,15 +32,15 @@ def quadratic(x, matrix, center):
     return 0.5 * offset @ matrix @ offset
 
 
-def test_a_quadratic_takes_as_many_steps_as_it_has_unknowns():
-    """With all pairs kept; steps are backtracked, not exact, so a few more are granted."""
+def test_a_quadratic_takes_a_few_times_as_many_steps_as_it_has_unknowns():
+    """As many pairs kept as unknowns; exact steps would take six, backtracked ones take longer."""
     with jax.enable_x64(True):
-        matrix, center = make_quadratic()
+        matrix, center = make_quadratic(count=2)
         function = partial(quadratic, matrix=matrix, center=center)
-        start = jnp.zeros((4, 3))
-        found = minimize(function, start, jnp.ones(4), iterations=24, memory=24)
+        start = jnp.zeros((2, 3))
+        found = minimize(function, start, jnp.ones(2), iterations=24, memory=6)
         assert float(found.value) < 1e-12 * float(function(start))
-        half = minimize(function, start, jnp.ones(4), iterations=6, memory=24)
+        half = minimize(function, start, jnp.ones(2), iterations=3, memory=6)
         assert float(half.value) > 1e-6 * float(function(start)), "the test must be able to fail"
 
 
@@ -117,11 +117,14 @@ def test_stiffness_solve_is_linear_symmetric_and_positive(case64):
         np.testing.assert_allclose(columns, columns.T, rtol=1e-10, atol=1e-18)
         smallest = np.linalg.eigvalsh(columns)[0]
         assert smallest > 0
-        # It approximates the inverse of diagonal minus 0.9 springs better than the diagonal's does.
+        # Its error in inverting diagonal minus 0.9 springs is at most 1 / T_4(1 / 0.9), the bound of Chebyshev
+        # iteration; the diagonal alone leaves up to 0.9.
         dense = np.diag(matrix.diagonal)
         np.add.at(dense, (np.arange(count)[:, None], garment.neighbors), -0.9 * np.asarray(matrix.springs))
-        errors = [np.abs(np.linalg.eigvals(guess @ dense) - 1).max() for guess in (columns, 1 / np.diag(dense) * units)]
-        assert errors[0] < 0.35 * errors[1]
+        guesses = (np.asarray(columns), np.diag(1 / np.diag(dense)))
+        errors = [np.abs(np.linalg.eigvals(guess @ dense) - 1).max() for guess in guesses]
+        bound = 1 / np.polynomial.chebyshev.chebval(1 / 0.9, [0, 0, 0, 0, 1])
+        assert errors[0] < 1.001 * bound < 0.5 * errors[1]
 
 
 def test_springs_are_symmetric_and_carried_by_the_diagonal(case32):
@@ -137,6 +140,7 @@ def test_springs_are_symmetric_and_carried_by_the_diagonal(case32):
 # --- cloth --------------------------------------------------------------------------------------------------
 
 
+@partial(jax.jit, static_argnames=("iterations", "preconditioner"))
 def solve(case, iterations, preconditioner=stiffness):
     position, problem, garment, material = case.position, case.problem, case.garment, case.material
     return minimize(
@@ -155,8 +159,8 @@ def test_cloth_reaches_its_minimum(case64):
 
 
 def test_springs_beat_the_diagonal(case32):
-    values = {kind: float(solve(case32, 30, kind).value) for kind in (hessian_diagonal, stiffness)}
-    assert values[stiffness] <= values[hessian_diagonal]
+    values = {kind: float(solve(case32, 10, kind).value) for kind in (hessian_diagonal, stiffness)}
+    assert values[stiffness] < values[hessian_diagonal]
 
 
 def test_pinned_vertices_stay_in_place():
@@ -179,9 +183,8 @@ def test_padding_moves_nothing(case32):
 def test_vmap_equals_a_loop(case32):
     starts = jnp.stack([case32.position, case32.position + 0.002])
     batched = jax.jit(jax.vmap(lambda start: solve(case32._replace(position=start), 10)))(starts)
-    single = jax.jit(lambda start: solve(case32._replace(position=start), 10))
     for k, start in enumerate(starts):
-        alone = single(start)
+        alone = solve(case32._replace(position=start), 10)
         np.testing.assert_allclose(batched.position[k], alone.position, atol=2e-5)
         assert int(batched.iterations[k]) == int(alone.iterations)
 

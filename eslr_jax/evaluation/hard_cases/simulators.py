@@ -195,13 +195,17 @@ def join_substeps(trajectory: Trajectory, substeps: int) -> Trajectory:
     if substeps == 1:
         return trajectory
     spent = trajectory.iterations[1:].reshape(-1, substeps).sum(axis=1)
-    first_bad = trajectory.first_bad_frame
+    first_bad, needed = trajectory.first_bad_frame, trajectory.needed_capacity
+    if needed is not None:
+        most = jnp.max(needed[1:].reshape(-1, substeps, 2), axis=1)
+        needed = jnp.concatenate([needed[:1], most])
     return dataclasses.replace(
         trajectory,
         positions=trajectory.positions[::substeps],
         velocities=trajectory.velocities[::substeps],
         residuals=trajectory.residuals[::substeps],
         iterations=jnp.concatenate([trajectory.iterations[:1], spent]),
+        needed_capacity=needed,
         first_bad_frame=jnp.where(first_bad > 0, (first_bad + substeps - 1) // substeps, first_bad),
     )
 
