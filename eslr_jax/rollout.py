@@ -17,6 +17,7 @@ from eslr_jax.geometry.padding import choose_bucket
 from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.physics.validate import validate_material, validate_parameters, validate_timestep
 from eslr_jax.scene import SceneOptions, prepare_scene, prepare_scenes
 from eslr_jax.simulate.batch import SCENES, simulate_scenes, stack_scenes
 from eslr_jax.simulate.scan import frame_inputs, join_frames, scan_frames, simulate_scene
@@ -49,16 +50,18 @@ def rollout(
         The trajectory; frame 0 is the garment skinned to the first pose and pushed out of the body.
 
     Raises:
-        ConfigError: The network is asked for without weights or without its architecture.
+        ConfigError: The network is asked for without weights or without its architecture, or the fabric, a
+            constant or the timestep is out of its physical range.
         CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
         CapacityError: A buffer was too small.
         MotionError: The motion is too short, or too fast to follow.
     """
-    config = config or SimConfig(simulator="physics")
+    config, parameters = config or SimConfig(simulator="physics"), parameters or PhysicsParameters()
     check_network(params, config)
     scene = prepare_scene(garment, poses, material=material, options=options)
-    trajectory = simulate_scene(params, scene, parameters or PhysicsParameters(), config)
+    check_scene(scene, parameters)
+    trajectory = simulate_scene(params, scene, parameters, config)
     raise_for_status(trajectory)
     return trajectory
 
@@ -160,9 +163,13 @@ def rollout_in_chunks(
 
     Returns:
         The trajectory, with its status unchecked, and its timing.
+
+    Raises:
+        ConfigError: As for `rollout`.
     """
     check_network(params, config)
     parameters = parameters or PhysicsParameters()
+    check_scene(scene, parameters)
     total = scene.num_frames - 1
     chunk = min(chunk, total)
     inputs = frame_inputs(scene)
@@ -189,6 +196,17 @@ def rollout_in_chunks(
     frame_ms = (time.perf_counter() - began) * 1e3 / (chunk * len(done))
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
     return join_frames(scene.start, joined, state), Timing(compile_s, frame_ms)
+
+
+def check_scene(scene: Scene, parameters: PhysicsParameters) -> None:
+    """Check that the fabric, the constants and the timestep of a scene are physical.
+
+    Raises:
+        ConfigError: Names the value and what is accepted.
+    """
+    validate_material(scene.material, scene.garment)
+    validate_parameters(parameters)
+    validate_timestep(scene.timestep)
 
 
 def check_network(params: Any, config: SimConfig) -> None:
@@ -220,6 +238,8 @@ def raise_for_status(trajectory: Trajectory) -> None:
     if Status.SELF_CONTACT_OVERFLOW in status and trajectory.needed_capacity is not None:
         pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.needed_capacity), axis=0))
         message += f" to at least {pairs}, and self_contact_cell_capacity to at least {faces}"
+    if Status.WORLD_EDGE_OVERFLOW in status:
+        message += f"; world_edge_capacity {trajectory.positions.shape[1]} always suffices"
     error: type[EslrError] = CapacityError
     if Status.NON_FINITE in status:
         error = NonFiniteError

@@ -20,6 +20,7 @@ from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
+from eslr_jax.geometry.validate import validate_body
 from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
@@ -59,10 +60,11 @@ def load_body(name: str | Path = "anny") -> Body:
     Raises:
         AssetError: There is no such body, the file is damaged, or it is no rigged body in metres.
         MissingExtraError: The file needs an extra that is not installed.
+        MeshError: A body in the bundled format is not closed, or inside out.
     """
     text = str(name)
     if not _is_path(text):
-        return read_body(find_asset("body", text))
+        return _closed(read_body(find_asset("body", text)), text)
     file, meshes = _split_name(text)
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
@@ -72,10 +74,19 @@ def load_body(name: str | Path = "anny") -> Body:
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
         return make_body(read_smpl_body(file))
     if suffix == ".npz":
-        return read_body(file)
+        return _closed(read_body(file), Path(file).name)
     raise AssetError(
         f"body file {file} has the unknown suffix {suffix!r}; give .npz, .pkl, .glb, .gltf or .fbx"
     )
+
+
+def _closed(body: Body, name: str) -> Body:
+    """Return the body if it has an inside; raise a MeshError if not."""
+    positions, faces, is_obstacle = (
+        np.asarray(leaf) for leaf in (body.rest_positions, body.faces, body.is_obstacle)
+    )
+    validate_body(positions, faces, is_obstacle, name=name)
+    return body
 
 
 def _split_name(text: str) -> tuple[str, list[str]]:

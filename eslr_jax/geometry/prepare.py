@@ -23,7 +23,7 @@ def prepare_garment(
     *,
     skin_weights: Float[np.ndarray, "vertices influences"],
     skin_indices: Int[np.ndarray, "vertices influences"],
-    is_pinned: Bool[np.ndarray, " vertices"] | None = None,
+    is_pinned: Bool[np.ndarray, " vertices"] | Int[np.ndarray, " pins"] | None = None,
     sewn_positions: Float[np.ndarray, "vertices 3"] | None = None,
     embedding_size: int = 8,
     embedding_mode: EmbeddingMode = "canonical",
@@ -39,7 +39,8 @@ def prepare_garment(
         faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
         skin_weights: Joint weights, normalised to rows that sum to one, shape [vertices, influences].
         skin_indices: Joint of every weight, shape [vertices, influences].
-        is_pinned: Vertices that follow their skinned position; none by default, shape [vertices].
+        is_pinned: Vertices that follow their skinned position: a mask, shape [vertices], or indices; none by
+            default.
         sewn_positions: The shape that lengths, areas and angles are measured on [m], where the rest positions
             were taken out of the body or into another pose; the rest positions by default, shape [vertices, 3].
         embedding_size: Coordinates of the geodesic embedding.
@@ -66,10 +67,10 @@ def prepare_garment(
         validate_mesh(sewn, faces, name=f"{name}, as sewn", allow_components=allow_components)
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
-    is_pinned = np.zeros(num_vertices, bool) if is_pinned is None else np.asarray(is_pinned, bool)
+    is_pinned = _pin_mask(name, num_vertices, is_pinned)
     skin_weights = np.asarray(skin_weights, np.float64)
     skin_indices = np.asarray(skin_indices)
-    _check_rows(name, num_vertices, skin_weights, skin_indices, is_pinned)
+    _check_rows(name, num_vertices, skin_weights, skin_indices)
 
     areas = topology.face_areas(sewn, faces)
     hinges, hinge_faces = topology.find_hinges(faces)
@@ -122,9 +123,8 @@ def _check_rows(
     num_vertices: int,
     skin_weights: np.ndarray,
     skin_indices: np.ndarray,
-    is_pinned: np.ndarray,
 ) -> None:
-    """Raise where skinning or pins don't fit the mesh."""
+    """Raise where skinning doesn't fit the mesh."""
     if (
         skin_weights.ndim != 2
         or len(skin_weights) != num_vertices
@@ -142,7 +142,31 @@ def _check_rows(
             f"{name}: skin weights of vertex {vertex} are {skin_weights[vertex]}; "
             "give finite, non-negative weights with a positive sum"
         )
-    if is_pinned.shape != (num_vertices,):
+
+
+def _pin_mask(name: str, num_vertices: int, is_pinned: np.ndarray | None) -> Bool[np.ndarray, " vertices"]:
+    """Return which vertices are pinned, from a mask or from their indices.
+
+    Raises:
+        MeshError: The mask doesn't fit the mesh, or an index names a missing vertex.
+    """
+    mask = np.zeros(num_vertices, bool)
+    if is_pinned is None:
+        return mask
+    given = np.asarray(is_pinned)
+    if given.dtype.kind in "iu":
+        is_missing = (given < 0) | (given >= num_vertices)
+        if given.ndim != 1 or is_missing.any():
+            missing = given[is_missing].ravel()[:1]
+            cause = f"vertex {missing[0]}" if len(missing) else f"an array of shape {given.shape}"
+            raise MeshError(
+                f"{name}: {cause} can't be pinned; give a list of indices from 0 to {num_vertices - 1}"
+            )
+        mask[given] = True
+        return mask
+    if given.dtype.kind != "b" or given.shape != (num_vertices,):
         raise MeshError(
-            f"{name}: is_pinned has shape {is_pinned.shape} for {num_vertices} vertices; give one per vertex"
+            f"{name}: is_pinned has shape {given.shape} and dtype {given.dtype} for {num_vertices} vertices; "
+            "give one boolean per vertex, or indices"
         )
+    return given

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -206,6 +206,45 @@ def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
         f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
         f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
     )
+
+
+def validate_body(
+    positions: Float[np.ndarray, "body_vertices 3"],
+    faces: Int[np.ndarray, "body_faces 3"],
+    is_obstacle: Bool[np.ndarray, " body_faces"],
+    *,
+    name: str = "body",
+) -> None:
+    """Check that a body has an inside: its obstacles have no open edges, and its faces point outside.
+
+    Cloth is kept on the side that normals point to; over a hole it would slip in, and be held there.
+
+    Args:
+        positions: Body vertices [m], shape [body_vertices, 3].
+        faces: Triangles, counter-clockwise seen from outside.
+        is_obstacle: Faces that cloth may touch; others may have open edges.
+        name: What messages call the body.
+
+    Raises:
+        MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
+    """
+    positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
+    _check_arrays(positions, faces, name)
+    if np.shape(is_obstacle) != (len(faces),):
+        raise MeshError(
+            f"{name}: {np.shape(is_obstacle)} obstacle marks for {len(faces)} faces; give one per face"
+        )
+    starts, ends, owners = half_edges(faces.astype(np.int64))
+    is_open = (twin_half_edges(faces) < 0) & np.asarray(is_obstacle)[np.arange(len(starts)) // 3]
+    if is_open.any():
+        edge = int(np.argmax(is_open))
+        raise MeshError(
+            f"{name}: {is_open.sum()} edges have a face on one side only, the first is "
+            f"{_ids(np.array([starts[edge], ends[edge]]))} of face {edge // 3}: the body is not closed; fill its "
+            "holes, or mark the faces around them as no obstacles"
+        )
+    if np.sum(np.linalg.det(positions[faces] - positions.mean(axis=0))) < 0:
+        raise MeshError(f"{name}: its faces point inside; flip the normals")
 
 
 def validate_orientation(

@@ -143,7 +143,7 @@ def test_own_bucket_changes_nothing(garment):
             "skin weights .5, 4. and indices .153, 4. do not fit 153 vertices",
         ),
         ({"skin_weights": np.zeros((153, 4))}, "skin weights of vertex 0"),
-        ({"is_pinned": np.zeros(4, bool)}, "is_pinned has shape .4,. for 153 vertices"),
+        ({"is_pinned": np.zeros(4, bool)}, "is_pinned has shape .4,. and dtype bool for 153 vertices"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(builders, change, message):
