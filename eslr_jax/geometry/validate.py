@@ -234,7 +234,7 @@ def validate_body(
         raise MeshError(
             f"{name}: {np.shape(is_obstacle)} obstacle marks for {len(faces)} faces; give one per face"
         )
-    starts, ends, owners = half_edges(faces.astype(np.int64))
+    starts, ends, _ = half_edges(faces.astype(np.int64))
     is_open = (twin_half_edges(faces) < 0) & np.asarray(is_obstacle)[np.arange(len(starts)) // 3]
     if is_open.any():
         edge = int(np.argmax(is_open))

@@ -160,33 +160,57 @@ def _friction_blocks(
     return (load / length)[:, None, None] * curvature
 
 
-def pair_table(contacts: FacePairs | None) -> Int[np.ndarray, "pairs 4"]:
-    """Return the vertex and the face's corners of every self-contact pair in use."""
-    if contacts is None:
-        return np.zeros((0, 4), np.int64)
-    table = np.concatenate([np.asarray(contacts.vertices)[:, None], np.asarray(contacts.corners)], axis=1)
-    return table[np.asarray(contacts.side) != 0]
+def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
+    """Return the vertices of every pair in use: of the point, where it is of the cloth, and of the face."""
+    if pairs is None:
+        return np.zeros((0, 3 + is_cloth), np.int64)
+    corners, is_used = np.asarray(pairs.corners), np.asarray(pairs.side) != 0
+    table = np.concatenate([np.asarray(pairs.vertices)[:, None], corners], axis=1) if is_cloth else corners
+    return table[is_used]
 
 
 def pair_blocks(
-    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem, garment: Garment
-) -> Float[np.ndarray, "pairs 12 12"]:
-    """Return 6 k a depth g g^T per self-contact pair in use, with the direction held: g = (n, -w_k n)."""
-    contacts, parameters = problem.self_contacts, problem.parameters
-    if contacts is None:
-        return np.zeros((0, 12, 12))
-    side = np.asarray(contacts.side)
-    table, is_used = pair_table(contacts), side != 0
-    vertex, a, b, c = np.swapaxes(position[table], 0, 1)
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    normal = normal * (side[is_used] / np.where(length > 0, length, 1.0))[:, None]
-    weights = np.asarray(contacts.weights, np.float64)[is_used]
-    foot = np.einsum("pk,pka->pa", weights, np.stack([a, b, c], axis=1))
-    height = np.sum((vertex - foot) * normal, axis=1)
-    depth = np.maximum(float(parameters.repulsion_thickness) - height, 0.0)
-    shares = np.concatenate([np.ones((len(weights), 1)), -weights], axis=1)
-    gradient = (shares[:, :, None] * normal[:, None, :]).reshape(-1, 12)
-    areas = np.asarray(garment.vertex_areas, np.float64)[table[:, 0]]
-    stiffness = 6.0 * float(parameters.repulsion_stiffness) * areas * depth
-    return stiffness[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+    position: Float[np.ndarray, "vertices 3"],
+    pairs: FacePairs | None,
+    stiffness: float,
+    thickness: float,
+    next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
+) -> Float[np.ndarray, "pairs size size"]:
+    """Return the Gauss-Newton Hessian of the repulsion per pair in use: 6 k a depth g g^T, g = dd/dx.
+
+    Args:
+        position: Vertex positions [m].
+        pairs: Points and faces; None gives no blocks.
+        stiffness: k [J/m^5].
+        thickness: Distance kept [m].
+        next_body: Body vertices at t + 1 [m], where the points are the body's and don't move.
+    """
+    is_cloth = next_body is None
+    if pairs is None:
+        size = 9 + 3 * is_cloth
+        return np.zeros((0, size, size))
+    side = np.asarray(pairs.side, np.float64)
+    is_used = side != 0
+    points = (position if next_body is None else np.asarray(next_body, np.float64))[
+        np.asarray(pairs.vertices)
+    ]
+    point, weights, side = points[is_used], np.asarray(pairs.weights, np.float64)[is_used], side[is_used]
+    corners = position[np.asarray(pairs.corners)[is_used]]
+    edges = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    size = np.linalg.norm(normal, axis=1)[:, None]
+    size = np.where(size > 0, size, 1.0)
+    normal = normal * (side[:, None] / size)
+    offset = point - np.einsum("pk,pka->pa", weights, corners)
+    height = np.sum(offset * normal, axis=1)
+    # The plane turns with its corners; that moves the height by what of the offset lies within the plane.
+    tangential = (offset - height[:, None] * normal) * (side[:, None] / size)
+    turn = np.stack([np.cross(edges[:, 1], tangential), np.cross(tangential, edges[:, 0])], axis=1)
+    turn = np.concatenate([-turn.sum(axis=1, keepdims=True), turn], axis=1)
+    gradient = turn - weights[:, :, None] * normal[:, None]
+    if is_cloth:
+        gradient = np.concatenate([normal[:, None], gradient], axis=1)
+    gradient = gradient.reshape(len(side), -1)
+    curvature = 6.0 * stiffness * np.asarray(pairs.areas, np.float64)[is_used]
+    curvature = curvature * np.maximum(thickness - height, 0.0)
+    return curvature[:, None, None] * gradient[:, :, None] * gradient[:, None, :]

@@ -69,11 +69,14 @@ def minimize_newton(
     problem, garment, material = to_float64((problem, garment, material))
     evaluate = _evaluator(problem, garment, material)
     is_free = _free_vertices(problem, garment)
-    bands = _find_bands(garment, hessian.pair_table(problem.self_contacts), is_free)
+    bands = _find_bands(garment, problem, is_free)
     masses = material.density * garment.vertex_areas
     weight = float(problem.parameters.gravity) * np.linalg.norm(masses)
 
-    x = np.array(start_guess(problem, garment) if start is None else start, np.float64)
+    if start is None:
+        with jax.enable_x64(True):
+            start = np.asarray(start_guess(problem, garment))
+    x = np.array(start, np.float64)
     if problem.pin_targets is not None:
         x = np.where(np.asarray(garment.is_pinned)[:, None], problem.pin_targets, x)
     value, gradient = evaluate(x)
@@ -128,10 +131,16 @@ def _free_vertices(problem: FrameProblem, garment: Garment) -> np.ndarray:
     return is_free
 
 
-def _find_bands(garment: Garment, pairs: np.ndarray, is_free: np.ndarray) -> _Bands:
+def _find_bands(garment: Garment, problem: FrameProblem, is_free: np.ndarray) -> _Bands:
     """Order the free vertices so that the matrix has a narrow band, and map the blocks' entries to it."""
     count = len(is_free)
-    tables = (np.asarray(garment.faces), np.asarray(garment.hinges), pairs, np.arange(count)[:, None])
+    tables = (
+        np.asarray(garment.faces),
+        np.asarray(garment.hinges),
+        hessian.pair_table(problem.self_contacts),
+        hessian.pair_table(problem.tips, is_cloth=False),
+        np.arange(count)[:, None],
+    )
     rows, columns = (np.concatenate(part) for part in zip(*map(_couples, tables), strict=True))
     links = scipy.sparse.csr_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count))
     ordered = reverse_cuthill_mckee(links, symmetric_mode=True)
@@ -169,10 +178,23 @@ def _newton_direction(
     bands: _Bands,
 ) -> np.ndarray:
     """Return minus the inverse of the projected Hessian times the gradient [m]; zero where fixed."""
+    parameters = problem.parameters
     blocks = (
         hessian.stretch_blocks(x, garment, material),
         hessian.bending_blocks(x, garment, material),
-        hessian.pair_blocks(x, problem, garment),
+        hessian.pair_blocks(
+            x,
+            problem.self_contacts,
+            float(parameters.repulsion_stiffness),
+            float(parameters.repulsion_thickness),
+        ),
+        hessian.pair_blocks(
+            x,
+            problem.tips,
+            float(parameters.collision_stiffness),
+            float(parameters.collision_thickness),
+            problem.next_body if problem.tips is not None else np.zeros((0, 3)),
+        ),
         hessian.vertex_blocks(x, problem, garment, material),
     )
     values = np.concatenate([block.ravel() for block in blocks])[bands.entries]

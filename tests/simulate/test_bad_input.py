@@ -77,7 +77,7 @@ def test_self_contact_that_overflows_names_the_capacities_needed():
     )
     trajectory = fall(config, scene)
     assert Status(int(trajectory.status)) == Status.SELF_CONTACT_OVERFLOW
-    with pytest.raises(CapacityError, match="^frame 1: ") as caught:
+    with pytest.raises(CapacityError, match=r"^frame 1: ") as caught:
         raise_for_status(trajectory)
     pairs, faces = map(int, re.findall(r"_capacity to at least (\d+)", str(caught.value)))
     assert pairs > 5
@@ -94,7 +94,7 @@ def test_an_open_body_is_refused():
     positions, faces = icosphere(2, 0.2)
     is_obstacle = np.ones(len(faces), bool)
     validate_body(positions, faces, is_obstacle)
-    with pytest.raises(MeshError, match="3 edges have a face on one side only.* not closed"):
+    with pytest.raises(MeshError, match=r"3 edges have a face on one side only.* not closed"):
         validate_body(positions, faces[1:], is_obstacle[1:])
     around = np.isin(faces, faces[0]).sum(axis=1) >= 2
     validate_body(positions, faces[1:], ~around[1:])  # a hole where no cloth goes is accepted
@@ -123,5 +123,5 @@ def test_a_body_too_fast_for_the_contact_search_sets_the_bit():
     trajectory = fall(SimConfig(simulator="physics", solver_iterations=2), scene)
     assert Status(int(trajectory.status)) == Status.BODY_TOO_FAST
     assert int(trajectory.first_bad_frame) == 3
-    with pytest.raises(MotionError, match="^frame 3: the body moved farther .* resample"):
+    with pytest.raises(MotionError, match=r"^frame 3: the body moved farther .* resample"):
         raise_for_status(trajectory)
