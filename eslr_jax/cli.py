@@ -28,7 +28,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from eslr_jax.errors import AssetError, EslrError
+from eslr_jax.errors import AssetError, EslrError, MissingExtraError
 from eslr_jax.fit.options import FitOptions
 
 app = tyro.extras.SubcommandApp()
@@ -357,7 +357,6 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
     """Render the contact sheet; without the extra `render` say so and go on."""
     import numpy as np
 
-    from eslr_jax.errors import MissingExtraError
     from eslr_jax.render import contact_sheet, write_png
 
     try:
@@ -981,6 +980,79 @@ def evaluate(
         )
     Console().print(table, markup=False)
     print(json.dumps(result["rollout"], indent=2))
+
+
+@app.command
+def stress(
+    simulator: Literal["physics", "network", "corrected"] = "physics",
+    model: str | None = None,
+    case: tuple[str, ...] = (),
+    iterations: int = 200,
+    corrector_steps: int = 20,
+    out: Path | None = None,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Run the hard cases: fifteen situations that break simulators. Exits with 0 if they ran, passed or not.
+
+    Args:
+        simulator: The physics solver, a trained network, or a network with the solver behind it.
+        model: Name of a bundled network or an exported file; the default network if not given.
+        case: Only these; all if not given.
+        iterations: Solver iterations per frame of the physics simulator.
+        corrector_steps: Solver iterations behind the network, where it is corrected.
+        out: Folder for a picture of each case, a sheet of all, and the figures with versions.
+        json_: Print one row per measure as JSON: case, passed, measure, value, bar.
+    """
+    from eslr_jax.assets import load_model
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.evaluation.hard_cases import CASES, find_case, network_simulator, physics_simulator
+    from eslr_jax.evaluation.stress import rows, summary, write_pictures
+    from eslr_jax.evaluation.stress import stress as run
+    from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+
+    for name in case:
+        find_case(name)
+    out = None if out is None else ensure_output_dir(out)
+    _use_compile_cache()
+    if simulator == "physics":
+        chosen = physics_simulator(iterations=iterations)
+    else:
+        model = model or default_model()
+        steps = corrector_steps if simulator == "corrected" else 0
+        label = f"{model}, {steps} corrector iterations" if steps else model
+        chosen = network_simulator(*load_model(model), name=label, corrector_steps=steps)
+    table = Table("case", "measure", "value", "bar", "passed", title=chosen.name, box=None)
+    total = len(case or CASES)
+    with _progress("hard cases", total) as advance:
+        done: list[str] = []
+
+        def show(name: str, outcome: Any, seconds: float) -> None:
+            done.append(name)
+            advance(len(done), total)
+            for row in outcome.rows():
+                value = "not finite" if row["value"] is None else f"{row['value']:.4g}"
+                bar = "" if row["bar"] is None else f"{row['bar']:g}"
+                passed = "" if row["bar"] is None else "yes" if row["passed"] else "NO"
+                table.add_row(name, row["measure"], value, bar, passed)
+
+        outcomes = run(chosen, case, on_case=show)
+    if out is not None:
+        with atomic_write(out / "hard_cases.json") as temporary:
+            temporary.write_text(json.dumps(summary(chosen, outcomes), indent=2))
+        try:
+            with _progress("rendering", total) as advance:
+                write_pictures(outcomes, out, on_picture=advance)
+        except MissingExtraError as error:
+            _stderr.print(f"no pictures: {error}", markup=False, highlight=False)
+    if json_:
+        print(json.dumps(rows(outcomes), indent=2))
+        return
+    Console().print(table, markup=False)
+    passed = sum(outcome.is_passed for outcome in outcomes)
+    for outcome in outcomes:
+        if not outcome.is_passed:
+            print(f"failed: {outcome.case}: {CASES[outcome.case].reason}")
+    print(f"{passed} of {total} cases passed")
 
 
 def main() -> None:

@@ -98,7 +98,8 @@ def rollout_batch(
         bad scene shall not cost the others; see `raise_for_status`.
 
     Raises:
-        ConfigError: As many motions as garments are needed; or the network lacks weights.
+        ConfigError: As many motions as garments are needed; or the network lacks weights; or a fabric, a
+            constant or a timestep is out of its physical range.
         CheckpointError: The weights are for another architecture.
         MotionError: A motion has fewer than two frames.
     """
@@ -116,6 +117,8 @@ def rollout_batch(
         )
         # Devices get equal shares: the last scene is repeated, and what is simulated twice is dropped.
         missing = -len(scenes) % max(len(devices), 1)
+        for scene in scenes:
+            check_scene(scene, parameters)
         stacked = stack_scenes(scenes + scenes[-1:] * missing)
         together = simulate_scenes(params, stacked, parameters, config, batch_size=batch_size, mesh=mesh)
         for row, i in enumerate(group):

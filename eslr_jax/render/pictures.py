@@ -194,15 +194,18 @@ def contact_sheet(
     return _tile(pictures, columns)
 
 
-def side_by_side(pictures: Sequence[np.ndarray], labels: Sequence[str]) -> np.ndarray:
-    """Return pictures of one size in a row, each with a label in its corner.
+def side_by_side(
+    pictures: Sequence[np.ndarray], labels: Sequence[str], *, columns: int | None = None
+) -> np.ndarray:
+    """Return pictures of one size in rows, each with a label in its corner.
 
     Args:
         pictures: sRGB pictures, uint8, each of shape [height, width, 3].
         labels: A short text each.
+        columns: Pictures per row; all in one row by default.
     """
     labelled = [_label(picture, text) for picture, text in zip(pictures, labels, strict=True)]
-    return _tile(labelled, len(labelled))
+    return _tile(labelled, columns or len(labelled))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -38,7 +38,7 @@ def test_a_quadratic_takes_a_few_times_as_many_steps_as_it_has_unknowns():
         matrix, center = make_quadratic(count=2)
         function = partial(quadratic, matrix=matrix, center=center)
         start = jnp.zeros((2, 3))
-        found = minimize(function, start, jnp.ones(2), iterations=24, memory=6)
+        found = minimize(function, start, jnp.ones(2), iterations=60, memory=6)
         assert float(found.value) < 1e-12 * float(function(start))
         half = minimize(function, start, jnp.ones(2), iterations=3, memory=6)
         assert float(half.value) > 1e-6 * float(function(start)), "the test must be able to fail"

@@ -1,0 +1,74 @@
+"""Run the fifteen hard cases with a simulator and keep the figures, with device and versions.
+
+    python experiments/hard_cases.py physics
+    python experiments/hard_cases.py network --model eslr-small
+    python experiments/hard_cases.py corrected --model eslr-small --sheet
+
+Writes `experiments/results/hard_cases_<simulator>.json` and, with `--sheet`, a picture of all cases beside it.
+Cases that are named run alone, and replace their own entries of an earlier file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def merge(old: dict, new: dict) -> dict:
+    """Return the new summary, filled up with the cases that only the old one holds, in the usual order."""
+    from eslr_jax.evaluation.hard_cases import CASES
+
+    cases = {**old["cases"], **new["cases"]}
+    measures = [row for row in old["measures"] if row["case"] not in new["cases"]] + new["measures"]
+    order = list(CASES)
+    cases = {name: cases[name] for name in order if name in cases}
+    measures.sort(key=lambda row: order.index(row["case"]))
+    passed = sum(case["passed"] for case in cases.values())
+    return {**new, "passed": passed, "cases": cases, "measures": measures}
+
+
+def main() -> None:
+    """Run what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("simulator", choices=["physics", "network", "corrected"])
+    parser.add_argument("--model", default="eslr-small")
+    parser.add_argument("--iterations", type=int, default=200)
+    parser.add_argument("--corrector-steps", type=int, default=20)
+    parser.add_argument("--case", nargs="*", default=[])
+    parser.add_argument("--sheet", action="store_true")
+    options = parser.parse_args()
+
+    from eslr_jax.assets import load_model
+    from eslr_jax.evaluation.hard_cases import network_simulator, physics_simulator
+    from eslr_jax.evaluation.stress import stress, summary, write_pictures
+
+    if options.simulator == "physics":
+        simulator = physics_simulator(iterations=options.iterations)
+    else:
+        steps = options.corrector_steps if options.simulator == "corrected" else 0
+        name = f"{options.model}, {steps} corrector iterations" if steps else options.model
+        simulator = network_simulator(*load_model(options.model), name=name, corrector_steps=steps)
+
+    def show(name, outcome, seconds):
+        print(f"{name}: {'passed' if outcome.is_passed else 'FAILED'} in {seconds:.0f} s", flush=True)
+        for row in outcome.rows():
+            if not row["passed"]:
+                print(f"    {row['measure']}: {row['value']} > {row['bar']}", flush=True)
+
+    outcomes = stress(simulator, options.case, on_case=show)
+    result, path = summary(simulator, outcomes), RESULTS / f"hard_cases_{options.simulator}.json"
+    if options.case and path.exists():
+        result = merge(json.loads(path.read_text()), result)
+    path.write_text(json.dumps(result, indent=1) + "\n")
+    if options.sheet:
+        with tempfile.TemporaryDirectory() as folder:
+            write_pictures(outcomes, Path(folder))
+            path.with_suffix(".png").write_bytes((Path(folder) / "sheet.png").read_bytes())
+
+
+if __name__ == "__main__":
+    main()
