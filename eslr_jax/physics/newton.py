@@ -186,7 +186,7 @@ def _newton_direction(
             x,
             problem.self_contacts,
             float(parameters.repulsion_stiffness),
-            float(parameters.repulsion_thickness),
+            0.0 if problem.repulsion_thickness is None else float(problem.repulsion_thickness),
         ),
         hessian.pair_blocks(
             x,

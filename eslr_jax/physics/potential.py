@@ -94,11 +94,12 @@ def potential_terms(
         )
     repulsion: Float[Array, ""] | float = 0.0
     if problem.self_contacts is not None:
+        assert problem.repulsion_thickness is not None
         repulsion = repulsion_energy(
             position,
             problem.self_contacts,
             parameters.repulsion_stiffness,
-            parameters.repulsion_thickness,
+            problem.repulsion_thickness,
         )
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),

@@ -76,7 +76,7 @@ def hessian_diagonal(
             position,
             problem.self_contacts,
             problem.parameters.repulsion_stiffness,
-            problem.parameters.repulsion_thickness,
+            problem.repulsion_thickness,
         )
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
 

@@ -48,7 +48,7 @@ class Outcome:
                 "case": self.case,
                 "passed": measure.is_passed,
                 "measure": measure.name,
-                "value": measure.value if np.isfinite(measure.value) else None,
+                "value": float(measure.value) if np.isfinite(measure.value) else None,
                 "bar": measure.bar,
             }
             for measure in self.measures

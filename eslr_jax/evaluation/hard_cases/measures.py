@@ -42,7 +42,7 @@ class Measure(NamedTuple):
     @property
     def is_passed(self) -> bool:
         """Whether the value is a number at or below the bar."""
-        return self.bar is None or (bool(np.isfinite(self.value)) and self.value <= self.bar)
+        return self.bar is None or bool(np.isfinite(self.value) and self.value <= self.bar)
 
 
 def not_finite(run: Run) -> float:
