@@ -229,7 +229,7 @@ def validate_body(
         MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
     """
     positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
-    _check_arrays(positions, faces, name)
+    check_arrays(positions, faces, name)
     if np.shape(is_obstacle) != (len(faces),):
         raise MeshError(
             f"{name}: {np.shape(is_obstacle)} obstacle marks for {len(faces)} faces; give one per face"
