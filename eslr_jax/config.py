@@ -98,10 +98,9 @@ class SimConfig:
         Raises:
             ValueError: Names the field.
         """
-        for name in ("solver_iterations", "solver_memory"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("corrector_steps", "tolerance"):
+        if self.solver_memory < 1:
+            raise ValueError(f"solver_memory must be at least 1, got {self.solver_memory}")
+        for name in ("solver_iterations", "corrector_steps", "tolerance"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("self_contact_capacity", "self_contact_cell_capacity"):
