@@ -118,7 +118,7 @@ def physics_simulator(
     Args:
         iterations: Per step, at most.
         substeps: Steps per frame.
-        tolerance: Stop at this force norm over weight.
+        tolerance: See `SimConfig`.
         self_contact: Keep layers apart in scenes that ask for it.
     """
 
