@@ -98,7 +98,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     Args:
         trajectory: A rollout.
         scene: Its scene.
-        root_height: Of the body's root joint in the first frame [m]: potential energy counts from near it, as in HOOD.
+        root_height: Of the root joint in the first frame [m]: potential energy counts from near it (HOOD).
     """
     assert scene.surface is not None
     assert scene.body_positions is not None
