@@ -123,7 +123,7 @@ def simulate(
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.calibrate import SOLVER, choose, read_calibration
     from eslr_jax.evaluation.report import environment, trajectory_report
-    from eslr_jax.fabric import garment_material
+    from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import describe_fit
     from eslr_jax.io.garment import write_garment_npz
     from eslr_jax.rollout import raise_for_status, rollout_in_chunks
@@ -154,8 +154,12 @@ def simulate(
             }
         cloth = prepare_stored(stored, name=Path(garment).name, **options)
         material = garment_material(fabric, cloth, stored)
+        unseen = beyond_training(material) if simulator == "network" else ()
         _check_skin(garment, cloth, rig, body)
         scene = prepare_scene(cloth, poses, material=material)
+    if unseen:
+        text = f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics"
+        _stderr.print(text, markup=False, highlight=False, soft_wrap=True)
     if "fit" in stored.metadata:
         _stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
     config = SimConfig(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from eslr_jax.errors import ConfigError
+from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.materials import COTTON, fabric_material, fabric_names
 from eslr_jax.types import Garment, Material
@@ -47,6 +48,21 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
     if not parts or stored.face_parts is None:
         return whole
     return _mixed(whole, parts, np.asarray(stored.face_parts), garment)
+
+
+def beyond_training(material: Material) -> tuple[str, ...]:
+    """Return the constants that leave the ranges on which networks are trained (HOOD's)."""
+    ranges = {
+        "lame_mu": LAME_MU_RANGE,
+        "lame_lambda": LAME_LAMBDA_RANGE,
+        "bending_stiffness": BENDING_RANGE,
+    }
+    return tuple(
+        name
+        for name, (low, high) in ranges.items()
+        if np.any(np.asarray(getattr(material, name)) < 0.99 * low)
+        or np.any(np.asarray(getattr(material, name)) > 1.01 * high)
+    )
 
 
 def parse_fabric(text: str) -> Material:

@@ -6,7 +6,7 @@ from garment_files import bundled
 
 from eslr_jax.assets import prepare_stored
 from eslr_jax.errors import ConfigError
-from eslr_jax.fabric import garment_material, parse_fabric
+from eslr_jax.fabric import beyond_training, garment_material, parse_fabric
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.materials import COTTON, FABRICS, fabric_material, fabric_names
 from eslr_jax.physics.membrane import stretch_energy
@@ -71,6 +71,12 @@ def test_fabric_per_part(two_fabrics):
         for mask, fabric in ((left, denim), (~left, silk))
     ]
     assert float(stretch_energy(stretched, garment, material)) == pytest.approx(sum(parts), rel=1e-4)
+
+
+def test_fabrics_beyond_the_networks_are_told():
+    assert beyond_training(COTTON) == ()
+    assert beyond_training(fabric_material("denim")) == ("lame_mu", "lame_lambda")
+    assert beyond_training(COTTON.replace(bending_stiffness=np.float32(1e-9))) == ("bending_stiffness",)
 
 
 def test_fabric_of_the_file_is_the_default(two_fabrics):

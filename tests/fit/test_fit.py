@@ -71,6 +71,24 @@ def test_what_is_given_is_not_recognised(body, shirt):
         fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(up="z", front="-z"))
 
 
+def test_options_come_from_the_command_line():
+    tyro = pytest.importorskip("tyro")
+    words = [
+        "--units",
+        "0.5",
+        "--up",
+        "z",
+        "--front",
+        "-y",
+        "--pin",
+        "loop:top",
+        "region:y>0.2",
+        "--no-push-out",
+    ]
+    expected = FitOptions(units=0.5, up="z", front="-y", pin=("loop:top", "region:y>0.2"), push_out=False)
+    assert tyro.cli(FitOptions, args=words) == expected
+
+
 def test_arms_are_found_by_the_rig_alone(body):
     names = [[body.joint_names[joint] for joint in arm] for arm in find_arms(body)]
     assert names == [["LeftArm", "LeftForeArm"], ["RightArm", "RightForeArm"]]
