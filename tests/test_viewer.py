@@ -199,4 +199,9 @@ def test_page_in_headless_chromium(view, tmp_path):
             time.sleep(1.0)
         assert blue_pixels() > 1500  # two blue garments
         assert page.get_by_text("colour by").count() > 0
+        with page.expect_download(timeout=240_000) as saved:
+            page.get_by_role("button", name="save picture").click()
+        exported = np.asarray(Image.open(saved.value.path()).convert("RGB"))
+        assert exported.shape == (960, 1280, 3)
+        assert len(np.unique(exported.reshape(-1, 3), axis=0)) > 100  # not one colour
         browser.close()

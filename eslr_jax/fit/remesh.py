@@ -40,8 +40,8 @@ def remesh(
             f"{_MIN_VERTICES} to {_MAX_VERTICES}"
         )
     try:
-        import pyacvd
-        import pyvista
+        import pyacvd  # pyright: ignore[reportMissingImports]
+        import pyvista  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingExtraError(
             'remeshing needs pyacvd, which is not installed: pip install "eslr-jax[remesh]"'

@@ -1,0 +1,53 @@
+"""What a user's file says about a garment beyond its mesh."""
+
+import pickle
+
+import numpy as np
+import pytest
+from garment_bytes import FACES, POSITIONS, whole_file
+
+from eslr_jax.errors import AssetError
+from eslr_jax.io.garment import is_garment_file, read_garment_source
+
+
+@pytest.fixture(scope="module")
+def hood(tmp_path_factory):
+    """HOOD's dictionary of garments, in its layout."""
+
+    def entry(scale):
+        return {
+            "rest_pos": (POSITIONS * scale).astype(np.float32),
+            "faces": FACES,
+            "node_type": np.array([[0], [3], [0], [0], [3]]),
+            "center": np.array([2]),
+            "coarse_edges": {0: np.array([[0, 1]])},
+            "lbs": {"v": POSITIONS, "f": FACES, "lbs_weights": np.ones((5, 24)) / 24},
+        }
+
+    path = tmp_path_factory.mktemp("hood") / "garments_dict.pkl"
+    path.write_bytes(pickle.dumps({"tshirt": entry(1.0), "dress": entry(2.0)}))
+    return path
+
+
+def test_hood_garments_by_name_with_their_pins(hood):
+    source = read_garment_source(f"{hood}#dress")
+    np.testing.assert_allclose(source.mesh.positions, POSITIONS * 2)
+    np.testing.assert_array_equal(source.mesh.faces, FACES)
+    assert np.flatnonzero(source.is_pinned).tolist() == [1, 4]
+    assert source.name == "dress"
+    assert source.is_metric
+    with pytest.raises(AssetError, match=r"the garments tshirt, dress; name one, as in .*pkl#NAME"):
+        read_garment_source(hood)
+    with pytest.raises(AssetError, match="has no garment 'coat'; it has tshirt, dress"):
+        read_garment_source(f"{hood}#coat")
+
+
+def test_formats_that_prescribe_metres_are_known(tmp_path):
+    for kind, is_metric in (("glb", True), ("obj", False), ("ply", False)):
+        path = tmp_path / f"scarf.{kind}"
+        path.write_bytes(whole_file(kind, tmp_path))
+        assert read_garment_source(path).is_metric is is_metric
+        assert not is_garment_file(path)
+    path = tmp_path / "fitted.npz"
+    path.write_bytes(whole_file("fitted.npz", tmp_path))
+    assert is_garment_file(path)
