@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,7 @@ def workplace(tmp_path_factory, body):
     """A folder with what the guides presuppose: a user's shirt, and the recipes."""
     folder = tmp_path_factory.mktemp("docs")
     scanned_tshirt(folder / "shirt.obj", body)
+    shutil.copy(ROOT / "tests" / "fixtures" / "cmu_01_01.bvh", folder / "walk.bvh")
     (folder / "experiments").symlink_to(ROOT / "experiments")
     return folder
 
