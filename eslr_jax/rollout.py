@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -54,7 +55,8 @@ def rollout(
             constant or the timestep is out of its physical range.
         CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
-        CapacityError: A buffer was too small.
+        CapacityError: A buffer was too small; where it was that of world edges, the rollout was done anew with
+            a larger one instead.
         MotionError: The motion is too short, or too fast to follow.
     """
     config, parameters = config or SimConfig(simulator="physics"), parameters or PhysicsParameters()
@@ -62,8 +64,24 @@ def rollout(
     scene = prepare_scene(garment, poses, material=material, options=options)
     check_scene(scene, parameters)
     trajectory = simulate_scene(params, scene, parameters, config)
+    while (larger := more_world_edges(trajectory, config)) is not None:
+        config = larger
+        trajectory = simulate_scene(params, scene, parameters, config)
     raise_for_status(trajectory)
     return trajectory
+
+
+def more_world_edges(trajectory: Trajectory, config: SimConfig) -> SimConfig | None:
+    """Return a configuration with twice the room for world edges where a rollout ran out of it, else None.
+
+    Doubling ends: a row for every vertex always suffices.
+    """
+    if Status.WORLD_EDGE_OVERFLOW not in Status(int(jax.device_get(trajectory.status))):
+        return None
+    assert config.model is not None
+    assert config.model.world_edge_capacity is not None
+    model = dataclasses.replace(config.model, world_edge_capacity=2 * config.model.world_edge_capacity)
+    return dataclasses.replace(config, model=model)
 
 
 def rollout_batch(

@@ -2,8 +2,8 @@
 
     python experiments/benchmarks/train_throughput.py [--json] [--smoke]
 
-The whole step also poses the body, searches contacts, states the frame's problem, moves the trajectory on and keeps
-the metrics. The bare step has its problem given. Both are called in turns on the same frame.
+The whole step also poses the body, searches contacts, states the frame's problem, moves the trajectory on and
+keeps the metrics. The bare step has its problem given. Both are called in turns on the same frame.
 """
 
 from __future__ import annotations

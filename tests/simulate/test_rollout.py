@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError
+from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
 from eslr_jax.evaluation.excess import measure_excess, trajectory_states
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.rollout import raise_for_status, rollout, rollout_in_chunks
+from eslr_jax.rollout import more_world_edges, raise_for_status, rollout, rollout_in_chunks
 from eslr_jax.scene import SceneOptions, prepare_scene
 from eslr_jax.simulate.scan import simulate_scene
 from eslr_jax.simulate.step import frame_problem
@@ -164,3 +164,16 @@ def test_one_trace_per_shape(scene):
     faster = scene.replace(start=scene.start.replace(velocity=2 * scene.start.velocity))
     simulate_scene(None, faster, PhysicsParameters(gravity=3.0), PHYSICS)
     assert simulate_scene._cache_size() == before
+
+
+def test_too_few_world_edges_are_doubled_until_they_suffice(tshirt, walk, params, learned):
+    few = dataclasses.replace(NETWORK, model=dataclasses.replace(SMALL, world_edge_capacity=300))
+    scene = prepare_scene(tshirt, walk)
+    short = simulate_scene(params, scene, PhysicsParameters(), few)
+    assert Status.WORLD_EDGE_OVERFLOW in Status(int(short.status))
+    more = more_world_edges(short, few)
+    assert more.model.world_edge_capacity == 600
+    assert more_world_edges(learned, NETWORK) is None
+    trajectory = rollout(params, tshirt, walk, config=few)
+    assert int(trajectory.status) == 0
+    np.testing.assert_allclose(trajectory.positions[:3], learned.positions[:3], atol=1e-4)
