@@ -66,7 +66,7 @@ def simulate(
     fabric: tuple[str, ...] = (),
     frames: int | None = None,
     iterations: int = 100,
-    corrector_steps: int = 0,
+    corrector_steps: int = 10,
     budget: str | None = None,
     tolerance: str | None = None,
     joint_map: Path | None = None,
@@ -95,7 +95,7 @@ def simulate(
             density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
         frames: Simulate this many frames, the start included; all if not given.
         iterations: Solver iterations per frame of the physics simulator.
-        corrector_steps: Solver iterations behind the network.
+        corrector_steps: Solver iterations behind the network; 0 is the network alone.
         budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it.
         tolerance: Excess over the optimum relative to what a frame gains, such as 1%: choose the fastest
             simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.

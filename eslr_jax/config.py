@@ -119,6 +119,7 @@ class TrainConfig:
     split: str = "train"  # clips of this split
     iterations: int = 20_000  # optimiser steps
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
+    self_contact: bool = False  # layers of cloth keep apart, as in SimConfig
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine

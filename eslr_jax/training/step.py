@@ -14,7 +14,7 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from eslr_jax.config import TrainConfig
+from eslr_jax.config import SimConfig, TrainConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import Normalizer
@@ -226,7 +226,10 @@ def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConf
     transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
     frame = FrameInput(data.body(transforms), data.body(later), skin(garment, later))
     parameters = PhysicsParameters(collision_stiffness=config.collision_stiffness)
-    problem = frame_problem(garment, slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters)
+    scene = SimConfig(self_contact=config.self_contact)
+    problem = frame_problem(
+        garment, slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters, scene
+    )
     return jax.lax.stop_gradient(problem)
 
 

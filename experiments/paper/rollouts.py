@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-from eslr_jax.body.motion import pose_body
+from eslr_jax.body.motion import pose_body, skin_garment
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
+from eslr_jax.geometry.padding import pad_garment, stacking_bucket
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.hood import HoodParameters, hood_metrics
 from eslr_jax.physics.problem import PhysicsParameters
@@ -72,18 +74,23 @@ def table(
         garment_options: Passed on to `load_garment`, over the model's own.
     """
     body = load_body()
-    measured: dict[str, dict[str, dict[str, float]]] = {model: {} for model in models}
-    motions = {
-        clip: pose_body(body, back_and_forth(load_motion(clip), frames), num_frames=frames) for clip in clips
-    }
-    for garment in garments:
-        for model in models:
-            params, config, options = simulator(model)
-            cloth = load_garment(garment, vertices=vertices, **(options | garment_options))  # type: ignore[arg-type]
-            surface = shared_surface([cloth], body)
+    motions = [
+        pose_body(body, back_and_forth(load_motion(clip), frames), num_frames=frames) for clip in clips
+    ]
+    measured: dict[str, dict[str, dict[str, float]]] = {}
+    for model in models:
+        params, config, options = simulator(model)
+        cloths = [load_garment(name, vertices=vertices, **(options | garment_options)) for name in garments]  # type: ignore[arg-type]
+        # One size and one body surface for all: one compilation per model.
+        bucket = stacking_bucket(cloths)
+        cloths = [to_device(pad_garment(cloth, bucket)) for cloth in cloths]
+        surface = shared_surface(cloths, body)
+        measured[model] = {}
+        for garment, cloth in zip(garments, cloths, strict=True):
             rows = []
-            for poses in motions.values():
+            for poses in motions:
                 scene = prepare_scene(cloth, poses, surface=surface)
+                scene = scene.replace(pin_targets=skin_garment(cloth, poses.joint_transforms))
                 trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
                 root = poses.joint_transforms[0, 0] @ np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
                 rows.append(measure(trajectory, scene, float(root[1])))
