@@ -4,8 +4,8 @@
     python experiments/hard_cases.py network --model eslr-small
     python experiments/hard_cases.py corrected --model eslr-small --sheet
 
-Writes `experiments/results/hard_cases_<simulator>.json` and, with `--sheet`, a picture of all cases beside it.
-Cases that are named run alone, and replace their own entries of an earlier file.
+Writes `experiments/results/hard_cases_<simulator>.json` after every case and, with `--sheet`, a picture of all
+that ran beside it. Entries of an earlier file stay until their case is run anew.
 """
 
 from __future__ import annotations
@@ -53,17 +53,19 @@ def main() -> None:
         name = f"{options.model}, {steps} corrector iterations" if steps else options.model
         simulator = network_simulator(*load_model(options.model), name=name, corrector_steps=steps)
 
-    def show(name, outcome, seconds):
+    path = RESULTS / f"hard_cases_{options.simulator}.json"
+
+    def keep(name, outcome, seconds):
+        result = summary(simulator, [outcome])
+        if path.exists():
+            result = merge(json.loads(path.read_text()), result)
+        path.write_text(json.dumps(result, indent=1) + "\n")
         print(f"{name}: {'passed' if outcome.is_passed else 'FAILED'} in {seconds:.0f} s", flush=True)
         for row in outcome.rows():
             if not row["passed"]:
                 print(f"    {row['measure']}: {row['value']} > {row['bar']}", flush=True)
 
-    outcomes = stress(simulator, options.case, on_case=show)
-    result, path = summary(simulator, outcomes), RESULTS / f"hard_cases_{options.simulator}.json"
-    if options.case and path.exists():
-        result = merge(json.loads(path.read_text()), result)
-    path.write_text(json.dumps(result, indent=1) + "\n")
+    outcomes = stress(simulator, options.case, on_case=keep)
     if options.sheet:
         with tempfile.TemporaryDirectory() as folder:
             write_pictures(outcomes, Path(folder))
