@@ -1055,7 +1055,10 @@ def stress(
     passed = sum(outcome.is_passed for outcome in outcomes)
     for outcome in outcomes:
         if not outcome.is_passed:
-            print(f"failed: {outcome.case}: {CASES[outcome.case].reason}")
+            case_ = CASES[outcome.case]
+            print(f"failed: {outcome.case}: {case_.reason}")
+            if simulator == "physics" and case_.limit:
+                print(f"    known: {case_.limit}")
     print(f"{passed} of {total} cases passed")
 
 

@@ -63,7 +63,11 @@ def summary(simulator: Simulator, outcomes: Sequence[Outcome]) -> dict[str, Any]
         "simulator": simulator.name,
         "passed": sum(outcome.is_passed for outcome in outcomes),
         "cases": {
-            outcome.case: {"passed": outcome.is_passed, "reason": CASES[outcome.case].reason}
+            outcome.case: {
+                "passed": outcome.is_passed,
+                "reason": CASES[outcome.case].reason,
+                "limit": CASES[outcome.case].limit,
+            }
             for outcome in outcomes
         },
         "measures": rows(outcomes),

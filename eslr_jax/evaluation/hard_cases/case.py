@@ -26,6 +26,7 @@ class HardCase:
     measure: Callable[[Runs], list[Measure]]
     picture: str  # the scene to show
     may_refuse: bool = False  # a named error is an answer
+    limit: str = ""  # what the solver itself can't do here, with figures
 
 
 @dataclasses.dataclass(frozen=True)

@@ -151,6 +151,9 @@ LAYERS = HardCase(
     build=_build_layers,
     measure=_measure_layers,
     picture="skirt over trousers",
+    limit="vertices meet faces, edges do not meet edges: two free sheets that crumple over a ball cross in 17 "
+    "pairs of triangles after 2 s; the folded sheet and the skirt stay clean. Without the edges' sagitta in the "
+    "thickness it was the other way round: 0 pairs, and 4 at the hem of the skirt",
 )
 
 LAYER_CASES: tuple[HardCase, ...] = (LAYERS,)
