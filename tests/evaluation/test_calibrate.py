@@ -1,0 +1,89 @@
+"""What is chosen for a budget or a tolerance, from measurements that are given."""
+
+import pytest
+
+from eslr_jax.cli import _parse_budget, _parse_share
+from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax.evaluation.calibrate import (
+    SOLVER,
+    Calibration,
+    Method,
+    choose,
+    read_calibration,
+    write_calibration,
+)
+
+# The solver falls tenfold every ten iterations; the network saves the first ten, and costs as much as 20.
+SLOW = Method("net", 1000, 21.0, 1.0, {"0": 0.1, "10": 0.01, "20": 1e-3}, {"0": 0.2, "10": 0.02, "20": 2e-3})
+PLAIN = Method(SOLVER, 1000, 1.0, 1.0, {"1": 0.9, "10": 0.1, "30": 1e-3}, {"1": 0.95, "10": 0.2, "30": 2e-3})
+# Another device: there the network's passes are nearly free.
+FAST = Method("net", 1000, 2.0, 1.0, SLOW.median, SLOW.p99)
+LARGE = Method(SOLVER, 4000, 4.0, 4.0, PLAIN.median, PLAIN.p99)
+
+
+def test_a_budget_buys_the_least_excess():
+    choice = choose(Calibration("here", (PLAIN, SLOW)), 1000, budget_ms=22.0)
+    assert (choice.method, choice.iterations) == (SOLVER, 21)
+    assert choice.expected_ms <= 22.0
+    assert "net" in choice.reason
+    choice = choose(Calibration("there", (PLAIN, FAST)), 1000, budget_ms=12.0)
+    assert (choice.method, choice.iterations) == ("net", 10)
+    assert choice.expected_excess == pytest.approx(0.01)
+
+
+def test_a_tolerance_takes_the_least_time():
+    choice = choose(Calibration("here", (PLAIN, SLOW)), 1000, tolerance=0.0201)
+    assert choice.method == SOLVER
+    assert choice.tolerance == 0.0201
+    assert choice.expected_ms == pytest.approx(21.0)  # 20 iterations: a decade in ten from 0.2 at 10
+    assert choice.iterations >= 20  # room for hard frames
+    choice = choose(Calibration("there", (PLAIN, FAST)), 1000, tolerance=0.0201)
+    assert (choice.method, choice.expected_ms) == ("net", 12.0)
+
+
+def test_costs_grow_with_the_garment_from_the_nearest_size():
+    calibration = Calibration("here", (PLAIN, LARGE))
+    assert choose(calibration, 8000, budget_ms=100.0).iterations == 11  # 8 ms, and 8 ms an iteration
+    assert choose(calibration, 500, budget_ms=10.0).iterations == 19
+
+
+def test_what_is_out_of_reach_is_said():
+    calibration = Calibration("here", (PLAIN,))
+    with pytest.raises(ConfigError, match=r"fastest frame here takes 2\.0 ms"):
+        choose(calibration, 1000, budget_ms=1.0)
+    with pytest.raises(ConfigError, match=r"best that was measured here is 0\.200%"):
+        choose(calibration, 1000, tolerance=1e-5)
+    with pytest.raises(ConfigError, match="either"):
+        choose(calibration, 1000)
+
+
+def test_calibrations_survive_a_round_trip_and_damage_is_named(tmp_path):
+    path = tmp_path / "calibration.json"
+    calibration = Calibration("here", (PLAIN, SLOW))
+    write_calibration(calibration, path)
+    assert read_calibration(path) == calibration
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(AssetError, match="eslr calibrate"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(("text", "value"), [("20ms", 20.0), ("0.1s", 100.0), (None, None)])
+def test_budgets_are_times(text, value):
+    assert _parse_budget(text) == (None if value is None else pytest.approx(value))
+
+
+@pytest.mark.parametrize("text", ["20", "fast", "-3ms", "nanms", "infs", "ms"])
+def test_other_budgets_are_refused(text):
+    with pytest.raises(ConfigError, match="20ms"):
+        _parse_budget(text)
+
+
+@pytest.mark.parametrize(("text", "value"), [("1%", 0.01), ("0.02", 0.02), (None, None)])
+def test_tolerances_are_shares(text, value):
+    assert _parse_share(text) == (None if value is None else pytest.approx(value))
+
+
+@pytest.mark.parametrize("text", ["0", "100%", "1", "-1%", "nan", "few"])
+def test_other_tolerances_are_refused(text):
+    with pytest.raises(ConfigError, match="1%"):
+        _parse_share(text)
