@@ -30,6 +30,7 @@ from eslr_jax.io.skeleton import (
 GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
 _TRIANGLES = 4  # primitive mode
 _SCALE_TOLERANCE = 0.01  # by which a bind space may differ in size from the posed skin
+_SAME_SPACE = 1e-4  # relative difference of joints that show the bind pose, in float32
 
 
 @dataclasses.dataclass
@@ -186,7 +187,7 @@ def _read_joints(document: GltfDocument) -> _Joints:
         rest = spaces[number] @ np.linalg.inv(bind)
         for node, frame in zip(nodes, rest, strict=True):
             frames.setdefault(node, frame)
-    nodes = [node for node in document.order if node in frames]
+    nodes = list(frames)
     place = {node: joint for joint, node in enumerate(nodes)}
     parents = []
     for node in nodes:
@@ -226,25 +227,22 @@ def _bind_space(
     """Return the matrix that takes a skin's mesh space to the world in the bind pose.
 
     In the pose that the nodes show, joint j takes the mesh space to the world by G_j B_j. Where they show the
-    bind pose these agree, and are the answer. Else it is the node of the mesh, the parent of the skeleton, or
-    the skeleton's first joint, whichever has the right size and is nearest to all joints.
+    bind pose these agree, and are the answer. Else it is the node of the mesh or the parent of the skeleton,
+    whichever has the right size and is nearer to the joints; failing both, the skeleton's first joint.
     """
     posed = world[nodes] @ bind
-    candidates = [posed[0]]
+    size = np.cbrt(abs(np.linalg.det(posed[0, :3, :3])))
+    if np.abs(posed - posed[0])[:, :3, :3].max() <= _SAME_SPACE * size:
+        return posed[0]
     top = min(nodes, key=document.order.index)
-    candidates.append(world[document.parents[top]] if document.parents[top] >= 0 else np.eye(4))
+    candidates = [np.eye(4) if document.parents[top] < 0 else world[document.parents[top]]]
     if user is not None:
         candidates.append(world[user])
-    size = np.cbrt(np.abs(np.linalg.det(posed[:, :3, :3])).clip(1e-12))
     best, least = posed[0], np.inf
     for candidate in candidates:
         own = np.cbrt(abs(np.linalg.det(candidate[:3, :3])))
-        if own < 1e-9 or abs(own / size[0] - 1) > _SCALE_TOLERANCE:
-            continue
-        away = np.abs((posed - candidate)[:, :3, :3]).mean() / own
-        # The first joint's own turn is the last resort, unless all others agree with it.
-        away += 0.0 if candidate is not posed[0] else 1e-6
-        if away < least:
+        away = np.abs(posed - candidate)[:, :3, :3].mean()
+        if abs(own - size) <= _SCALE_TOLERANCE * size and away < least:
             best, least = candidate, away
     return best
 

@@ -1,0 +1,238 @@
+"""Skinned characters: posed by the reader's numbers they are where the file's own nodes put them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pygltflib as gltf
+import pytest
+from broken import refuses
+from formats import GlbWriter, write_character
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body.motion import pose_body
+from eslr_jax.body.rig import make_body, make_motion
+from eslr_jax.io.gltf_document import sample_keys
+from eslr_jax.io.gltf_rig import gltf_clip_names, read_gltf_body, read_gltf_motion
+from eslr_jax.io.skeleton import Skeleton, chain_positions
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+NAMES = ("mixamorig:Hips", "mixamorig:Spine", "mixamorig:Head", "mixamorig:LeftUpLeg", "mixamorig:RightUpLeg")
+SKELETON = Skeleton(
+    NAMES, (-1, 0, 1, 0, 0), np.array([[0, 1, 0], [0, 1.2, 0], [0, 1.6, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0.0]])
+)
+
+
+def make_mesh(rng, count=40):
+    """Random triangles around a skeleton, with four influences each."""
+    positions = rng.uniform([-0.4, 0.0, -0.2], [0.4, 1.8, 0.2], (count, 3)).astype(np.float32).astype(float)
+    faces = rng.permutation(count)[: count // 3 * 3].reshape(-1, 3)
+    indices = np.stack([rng.permutation(5)[:4] for _ in range(count)])
+    weights = rng.dirichlet(np.ones(4), count)
+    return positions, faces, weights, indices
+
+
+def make_clip(rng, frames=6):
+    turned = Rotation.from_rotvec(0.5 * rng.normal(size=(frames * 5, 3))).as_matrix().reshape(frames, 5, 3, 3)
+    root = SKELETON.rest_positions[0] + 0.2 * rng.normal(size=(frames, 3))
+    return turned, chain_positions(turned, root, SKELETON)
+
+
+def write(path, rng, **options):
+    mesh, clip = make_mesh(rng), make_clip(rng)
+    write_character(path, SKELETON, *mesh, motion=clip, **options)
+    return mesh, clip
+
+
+def skinned(mesh, clip, frame):
+    positions, _, weights, indices = mesh
+    turned, places = clip
+    moved = np.einsum(
+        "vkab,vkb->vka", turned[frame][indices], positions[:, None] - SKELETON.rest_positions[indices]
+    )
+    return np.einsum("vk,vka->va", weights, moved + places[frame][indices])
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_a_character_moves_as_it_was_animated(tmp_path, unit, is_turned):
+    rng = np.random.default_rng(0)
+    frames = Rotation.from_rotvec(rng.normal(size=(5, 3))).as_matrix() if is_turned else None
+    mesh, clip = write(tmp_path / "avatar.glb", rng, unit=unit, frames=frames)
+    body = make_body(read_gltf_body(tmp_path / "avatar.glb"))
+    assert body.joint_names == NAMES
+    np.testing.assert_allclose(body.rest_positions, mesh[0], atol=1e-6)
+    np.testing.assert_allclose(body.joint_rest_positions, SKELETON.rest_positions, atol=1e-6)
+    motion = make_motion(read_gltf_motion(tmp_path / "avatar.glb"), body)
+    assert motion.arm_abduction == 0.0  # its own motion is played as it is
+    poses = pose_body(body, motion)
+    assert poses.positions.shape[0] == 6
+    for frame in range(6):
+        np.testing.assert_allclose(poses.positions[frame], skinned(mesh, clip, frame), atol=3e-6)
+
+
+def test_the_bind_pose_is_the_rest_pose_though_the_nodes_are_posed(tmp_path):
+    """Exporters leave the nodes in the first frame of the animation."""
+    rng = np.random.default_rng(1)
+    path = tmp_path / "avatar.glb"
+    mesh, _ = write(path, rng)
+    document = gltf.GLTF2().load(str(path))
+    for node in document.nodes[:5]:
+        node.rotation = (
+            (Rotation.from_quat(node.rotation) * Rotation.from_rotvec([0.3, 0.1, -0.2])).as_quat().tolist()
+        )
+    document.save(str(path))
+    body = read_gltf_body(path)
+    np.testing.assert_allclose(body.positions, mesh[0], atol=1e-6)
+    np.testing.assert_allclose(body.skeleton.rest_positions, SKELETON.rest_positions, atol=1e-6)
+
+
+def test_split_vertices_become_one_and_hips_come_first(tmp_path):
+    positions = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0.0]])
+    skeleton = Skeleton(
+        ("root", "pelvis", "thigh_l", "thigh_r", "spine_01"),
+        (-1, 0, 1, 1, 1),
+        np.array([[0, 0, 0], [0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0, 1.2, 0.0]]),
+    )
+    weights, indices = np.tile([1.0, 0, 0, 0], (6, 1)), np.tile([2, 0, 0, 0], (6, 1))
+    write_character(
+        tmp_path / "a.glb", skeleton, positions, np.array([[0, 2, 1], [3, 4, 5]]), weights, indices
+    )
+    body = make_body(read_gltf_body(tmp_path / "a.glb"))
+    assert len(body.rest_positions) == 4
+    np.testing.assert_array_equal(body.faces, [[0, 2, 1], [1, 2, 3]])
+    assert body.joint_names[0] == "pelvis"
+    assert body.parents[0] == -1
+    assert np.all(np.asarray(body.joint_names)[np.asarray(body.skin_indices)[:, 0]] == "thigh_l")
+
+
+def test_the_simple_skin_of_the_gltf_samples():
+    body = read_gltf_body(FIXTURES / "simple_skin.gltf")
+    motion = read_gltf_motion(FIXTURES / "simple_skin.gltf")
+    assert body.positions.shape == (10, 3)
+    assert gltf_clip_names(FIXTURES / "simple_skin.gltf") == ("clip0",)
+    assert motion.fps == pytest.approx(2.0)
+    # Its only track turns the second joint about z, a quarter turn there and back.
+    angles = Rotation.from_matrix(motion.rotations[:, 1]).as_rotvec()[:, 2]
+    assert np.degrees(angles.max()) == pytest.approx(90.0, abs=1e-3)
+    np.testing.assert_allclose(motion.positions[:, 0], np.tile([0, 1, 0], (12, 1)), atol=1e-6)
+
+
+def test_key_frames_between_keys():
+    times = np.array([0.0, 1.0, 3.0])
+    at = np.array([-1.0, 0.5, 2.0, 9.0])
+    values = np.array([[0.0], [2.0], [6.0]]) * np.ones(3)
+    np.testing.assert_allclose(sample_keys("translation", "LINEAR", times, values, at)[:, 0], [0, 1, 4, 6])
+    np.testing.assert_allclose(sample_keys("translation", "STEP", times, values, at)[:, 0], [0, 0, 2, 6])
+    # A cubic spline with the slopes of a parabola is that parabola.
+    spline = np.stack([2 * times, times**2, 2 * times], axis=1).reshape(-1, 1) * np.ones(3)
+    found = sample_keys("translation", "CUBICSPLINE", times, spline, np.array([0.5, 2.0]))
+    np.testing.assert_allclose(found[:, 0], [0.25, 4.0])
+    turns = Rotation.from_euler("z", [[0], [90], [180]], degrees=True).as_quat()
+    half = Rotation.from_quat(sample_keys("rotation", "LINEAR", times, turns, np.array([0.5])))
+    assert np.degrees(half.magnitude()[0]) == pytest.approx(45.0)
+
+
+def edit(path, change):
+    document = gltf.GLTF2().load(str(path))
+    change(document)
+    document.save(str(path))
+
+
+def unbind(document):
+    for node in document.nodes:
+        node.skin = None
+
+
+BROKEN = {
+    "no skin": (lambda d: setattr(d, "skins", []), "skin"),
+    "no bound mesh": (unbind, "no triangles"),
+    "a joint beyond": (lambda d: d.skins[0].joints.append(99), "99"),
+    "a cycle": (lambda d: d.nodes[2].children.append(0), "node"),
+    "an accessor beyond": (lambda d: setattr(d.accessors[1], "count", 10**9), "values"),
+    "a view beyond": (lambda d: setattr(d.bufferViews[0], "byteOffset", 10**9), "values"),
+    "compressed": (lambda d: setattr(d, "extensionsRequired", ["KHR_draco_mesh_compression"]), "draco"),
+    "strips": (lambda d: setattr(d.meshes[0].primitives[0], "mode", 5), "strips"),
+    "no size": (lambda d: setattr(d.nodes[0], "rotation", [0.0, 0.0, 0.0, 0.0]), "rotation"),
+    "a file elsewhere": (lambda d: setattr(d.buffers[0], "uri", "../../secret.bin"), "beside"),
+    "a file that is missing": (lambda d: setattr(d.buffers[0], "uri", "other.bin"), "not there"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_characters_are_named_in_one_line(tmp_path, kind):
+    change, word = BROKEN[kind]
+    path = tmp_path / "avatar.glb"
+    write(path, np.random.default_rng(0))
+    document = gltf.GLTF2().load(str(path))
+    change(document)
+    blob, uri = document.binary_blob(), document.buffers[0].uri
+    document.buffers[0].uri = None
+    document.set_binary_blob(blob)
+    text = json.loads(document.gltf_to_json())
+    if uri:
+        text["buffers"][0]["uri"] = uri
+    path.write_bytes(pack(text, blob))
+    refuses(read_gltf_body, path, word)
+
+
+def pack(tables, blob):
+    """A GLB of JSON tables and a binary chunk."""
+    text = json.dumps(tables).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = (
+        len(text).to_bytes(4, "little") + b"JSON" + text + len(blob).to_bytes(4, "little") + b"BIN\0" + blob
+    )
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"", "avatar"),
+        (b"glTF", "avatar"),
+        (b"{}", "no glTF"),
+        (b"[1, 2]", "no glTF"),
+        (b"{" * 5000, "avatar"),
+    ],
+)
+def test_what_is_no_gltf_is_refused(tmp_path, content, word):
+    path = tmp_path / "avatar.glb"
+    path.write_bytes(content)
+    for read in (read_gltf_body, read_gltf_motion):
+        refuses(read, path, word)
+
+
+def test_truncated_files_are_refused(tmp_path):
+    path = tmp_path / "avatar.glb"
+    write(path, np.random.default_rng(0))
+    data = path.read_bytes()
+    for share in (0.2, 0.6, 0.95):
+        path.write_bytes(data[: int(share * len(data))])
+        refuses(read_gltf_body, path)
+
+
+def test_clips_and_meshes_are_picked_by_name(tmp_path):
+    path = tmp_path / "avatar.glb"
+    write(path, np.random.default_rng(0), clip="dance", mesh_name="Skin")
+    assert read_gltf_motion(path, "dance").name == "dance"
+    refuses(lambda file: read_gltf_motion(file, "walk"), path, "dance")
+    assert len(read_gltf_body(path, ["Skin"]).positions) == 40
+    refuses(lambda file: read_gltf_body(file, ["Hat"]), path, "Skin")
+
+
+def test_a_sparse_accessor_overwrites_its_base(tmp_path):
+    writer = GlbWriter()
+    base = writer.accessor(np.zeros((4, 3), np.float32), "VEC3")
+    rows = writer.accessor(np.array([1, 3], np.uint8), "SCALAR")
+    values = writer.accessor(np.ones((2, 3), np.float32), "VEC3")
+    views = [writer.document.accessors[index].bufferView for index in (rows, values)]
+    writer.document.accessors[base].sparse = gltf.Sparse(
+        count=2,
+        indices=gltf.AccessorSparseIndices(bufferView=views[0], componentType=5121),
+        values=gltf.AccessorSparseValues(bufferView=views[1]),
+    )
+    (tmp_path / "a.glb").write_bytes(writer.bytes())
+    from eslr_jax.io.gltf_document import GltfDocument
+
+    np.testing.assert_array_equal(GltfDocument(tmp_path / "a.glb").array(base)[:, 0], [0, 1, 0, 1])
