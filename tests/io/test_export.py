@@ -1,0 +1,236 @@
+"""A run in other programs' formats, read back by other people's code: frame by frame the same positions."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pygltflib as gltf
+import pytest
+import trimesh
+from broken import refuses
+
+from eslr_jax.errors import AssetError, MeshError
+from eslr_jax.io.export import export_trajectory
+from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.mesh_sequence import read_mesh_sequence
+from eslr_jax.io.point_cache import read_mdd, read_pc2, write_mdd, write_pc2
+from eslr_jax.io.trajectory import TrajectoryFile
+
+FRAMES, STEP = 4, 1 / 30
+SPHERE = trimesh.creation.icosphere(subdivisions=1)
+VERTICES = len(SPHERE.vertices)
+
+
+@pytest.fixture(scope="module")
+def run():
+    rng = np.random.default_rng(0)
+    positions = (SPHERE.vertices + 0.1 * rng.normal(size=(FRAMES, VERTICES, 3))).astype(np.float32)
+    return TrajectoryFile(
+        positions=positions,
+        velocities=np.zeros_like(positions),
+        faces=np.asarray(SPHERE.faces),
+        body_positions=positions[:, ::-1] + np.float32(2),
+        body_faces=VERTICES - 1 - np.asarray(SPHERE.faces),
+        timestep=STEP,
+        metadata={"garment": "/home/me/My shirt.obj"},
+    )
+
+
+@pytest.fixture(scope="module")
+def garment():
+    """A garment whose file had its vertices in another order, one of them twice, and a seam in its texture."""
+    rng = np.random.default_rng(1)
+    places = np.append(rng.permutation(VERTICES), 7)
+    faces = np.asarray(SPHERE.faces)
+    uvs = rng.random((VERTICES, 2))[faces].round(3)
+    uvs[:20] += 0.5  # the other side of a seam
+    return GarmentFile(
+        np.asarray(SPHERE.vertices),
+        faces,
+        np.ones((VERTICES, 1)),
+        np.zeros((VERTICES, 1), int),
+        np.zeros(VERTICES, bool),
+        corner_uvs=uvs,
+        vertex_map=places,
+    )
+
+
+def corner_points(positions, faces):
+    return np.asarray(positions)[np.asarray(faces)]
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc", "usd"])
+def test_usd_holds_every_frame(tmp_path, run, garment, suffix):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
+    stage = usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(30.0)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, FRAMES - 1)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/My_shirt"))
+    assert mesh.GetPrim().GetDisplayName() == "My shirt"
+    assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    body = UsdGeom.Mesh(stage.GetPrimAtPath("/World/body"))
+    for frame in range(FRAMES):
+        points = np.array(mesh.GetPointsAttr().Get(frame))
+        np.testing.assert_array_equal(points, run.positions[frame][garment.vertex_map])
+        np.testing.assert_array_equal(
+            corner_points(points, faces), corner_points(run.positions[frame], run.faces)
+        )
+        np.testing.assert_array_equal(np.array(body.GetPointsAttr().Get(frame)), run.body_positions[frame])
+    st = UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvar("st")
+    assert st.GetInterpolation() == "faceVarying"
+    np.testing.assert_allclose(np.array(st.Get()).reshape(-1, 3, 2), garment.corner_uvs, atol=1e-6)
+
+
+def test_glb_holds_every_frame(tmp_path, run, garment):
+    path = export_trajectory(run, tmp_path / "run.glb", garment=garment)
+    document = gltf.GLTF2().load(str(path))
+    blob = document.binary_blob()
+
+    def read(index, width, dtype=np.float32):
+        accessor = document.accessors[index]
+        offset = document.bufferViews[accessor.bufferView].byteOffset
+        return np.frombuffer(blob, dtype, accessor.count * width, offset).reshape(-1, width)
+
+    assert [mesh.name for mesh in document.meshes] == ["My shirt", "body"]
+    primitive = document.meshes[0].primitives[0]
+    base = read(primitive.attributes.POSITION, 3)
+    faces = read(primitive.indices, 1, np.uint16).reshape(-1, 3)
+    for frame in range(FRAMES):
+        points = base + (read(primitive.targets[frame - 1]["POSITION"], 3) if frame else 0)
+        count = len(garment.vertex_map)
+        np.testing.assert_allclose(points[:count], run.positions[frame][garment.vertex_map], atol=1e-6)
+        expected = corner_points(run.positions[frame], run.faces)
+        np.testing.assert_allclose(corner_points(points, faces), expected, atol=1e-6)
+    uvs = read(primitive.attributes.TEXCOORD_0, 2)
+    np.testing.assert_allclose(corner_points(uvs, faces) * [1, -1] + [0, 1], garment.corner_uvs, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_sequences_hold_every_frame_and_come_back_exactly(tmp_path, run, garment, kind):
+    folder = export_trajectory(run, tmp_path / "frames", garment=garment, format=kind)
+    files = sorted(folder.iterdir())
+    assert [file.name for file in files] == [f"My shirt_{frame:04d}.{kind}" for frame in range(FRAMES)]
+    assert sorted(os.listdir(tmp_path)) == ["frames"]
+    for frame, file in enumerate(files):
+        theirs = trimesh.load(file, process=False)
+        expected = corner_points(run.positions[frame], run.faces)
+        np.testing.assert_allclose(corner_points(theirs.vertices, theirs.faces), expected, atol=1e-6)
+        uvs = corner_points(theirs.visual.uv, theirs.faces)
+        np.testing.assert_allclose(uvs, garment.corner_uvs, atol=1e-6)
+    back = read_mesh_sequence(folder)
+    count = len(garment.vertex_map)
+    np.testing.assert_array_equal(
+        back.positions[:, :count].astype(np.float32), run.positions[:, garment.vertex_map]
+    )
+
+
+def test_point_caches_hold_every_frame(tmp_path, run, garment):
+    expected = run.positions[:, garment.vertex_map]
+    export_trajectory(run, tmp_path / "run.pc2", garment=garment)
+    raw = (tmp_path / "run.pc2").read_bytes()  # the layout, by hand
+    assert raw[:12] == b"POINTCACHE2\0"
+    assert np.frombuffer(raw, "<i4", 2, 12).tolist() == [1, expected.shape[1]]
+    assert np.frombuffer(raw, "<i4", 1, 28)[0] == FRAMES
+    np.testing.assert_array_equal(np.frombuffer(raw, "<f4", offset=32).reshape(expected.shape), expected)
+    np.testing.assert_array_equal(read_pc2(tmp_path / "run.pc2").positions, expected)
+    export_trajectory(run, tmp_path / "run.mdd", garment=garment)
+    raw = (tmp_path / "run.mdd").read_bytes()
+    assert np.frombuffer(raw, ">i4", 2).tolist() == [FRAMES, expected.shape[1]]
+    np.testing.assert_allclose(np.frombuffer(raw, ">f4", FRAMES, 8), np.arange(FRAMES) * STEP, atol=1e-7)
+    cache = read_mdd(tmp_path / "run.mdd")
+    np.testing.assert_array_equal(cache.positions, expected)
+
+
+def test_npz_comes_back_as_a_mesh_sequence(tmp_path, run):
+    export_trajectory(run, tmp_path / "body.npz", content="body")
+    back = read_mesh_sequence(tmp_path / "body.npz")
+    np.testing.assert_array_equal(back.positions.astype(np.float32), run.body_positions)
+    np.testing.assert_array_equal(back.faces, run.body_faces)
+    assert back.fps == pytest.approx(30.0)
+
+
+@pytest.mark.slow
+def test_blender_opens_what_is_written(tmp_path, run, garment):
+    bpy = pytest.importorskip("bpy")
+    for name in ("run.usdc", "run.glb"):
+        export_trajectory(run, tmp_path / name, garment=garment, content="garment")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.usd_import(filepath=str(tmp_path / "run.usdc"))
+    cloth = next(entry for entry in bpy.data.objects if entry.type == "MESH")
+    for frame in range(FRAMES):
+        bpy.context.scene.frame_set(frame)
+        shown = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        points = np.array([shown.matrix_world @ vertex.co for vertex in shown.data.vertices])
+        expected = run.positions[frame][garment.vertex_map] @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # Z up
+        np.testing.assert_allclose(points, expected, atol=1e-5)
+
+
+def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):
+    for path, options, word in (
+        (tmp_path / "run.fbx", {}, "--format"),
+        (tmp_path / "run.pc2", {"content": "both"}, "one mesh"),
+        (tmp_path / "nowhere" / "run.glb", {}, "folder"),
+    ):
+        with pytest.raises(AssetError, match=word):
+            export_trajectory(run, path, **options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("")
+    with pytest.raises(AssetError, match="exists already"):
+        export_trajectory(run, tmp_path / "full", format="obj")
+    assert sorted(os.listdir(tmp_path)) == ["full"]
+
+
+def test_another_garment_is_refused(tmp_path, run, garment):
+    from dataclasses import replace
+
+    with pytest.raises(AssetError, match="not the one of this run"):
+        export_trajectory(run, tmp_path / "a.glb", garment=replace(garment, faces=garment.faces[::-1]))
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3, 3)), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)])
+def test_point_caches_of_nothing_are_not_written(tmp_path, points):
+    with pytest.raises(MeshError):
+        write_pc2(tmp_path / "a.pc2", points)
+    with pytest.raises(MeshError):
+        write_mdd(tmp_path / "a.mdd", points, STEP)
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("read", "write"), [(read_pc2, write_pc2), (read_mdd, lambda p, x: write_mdd(p, x, STEP))]
+)
+def test_broken_point_caches_are_named_in_one_line(tmp_path, read, write):
+    path = tmp_path / "cache.bin"
+    write(path, np.zeros((3, 5, 3)))
+    good = path.read_bytes()
+    for content in (b"", good[:10], good[:-4], good + b"1234", b"\xff" * 64):
+        path.write_bytes(content)
+        refuses(read, path)
+
+
+def test_the_command_exports_a_run(tmp_path, run):
+    from eslr_jax.io.trajectory import write_trajectory
+
+    fields = ("positions", "velocities", "faces", "timestep", "body_positions", "body_faces", "metadata")
+    write_trajectory(tmp_path / "trajectory.npz", **{name: getattr(run, name) for name in fields})
+    command = [
+        sys.executable,
+        "-m",
+        "eslr_jax.cli",
+        "export",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "a.mdd"),
+    ]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
+    np.testing.assert_array_equal(read_mdd(tmp_path / "a.mdd").positions, run.positions)

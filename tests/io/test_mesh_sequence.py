@@ -1,0 +1,109 @@
+"""Bodies that are meshes in motion: read from archives and folders, carried by patches that move rigidly."""
+
+import numpy as np
+import pytest
+import trimesh
+from broken import refuses
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body.sequence import pose_sequence
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, obj_text, read_mesh_sequence
+
+CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
+FACES = np.asarray(CAPSULE.faces)
+TURNS = Rotation.from_euler("y", [[0], [20], [40], [60]], degrees=True)
+MOVING = np.stack([turn.apply(CAPSULE.vertices) for turn in TURNS])
+MOVING[..., 1] += 0.1 * np.arange(4)[:, None]
+
+
+def write_folder(folder, positions=MOVING, suffix=".obj", faces=FACES):
+    folder.mkdir()
+    for frame, points in enumerate(positions):
+        path = folder / f"body{frame}{suffix}"  # without leading zeros: 10 comes after 9
+        if suffix == ".obj":
+            path.write_text(obj_text("body", points, faces))
+        else:
+            trimesh.Trimesh(points, faces, process=False).export(path)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_folders_are_read_in_the_order_of_their_numbers(tmp_path, suffix):
+    positions = np.concatenate([MOVING, MOVING + 0.1, MOVING + 0.2])
+    write_folder(tmp_path / "frames", positions, suffix)
+    sequence = read_mesh_sequence(tmp_path / "frames", fps=24.0)
+    np.testing.assert_allclose(sequence.positions, positions, atol=1e-6)
+    np.testing.assert_array_equal(sequence.faces, FACES)
+    assert sequence.fps == 24.0
+    assert is_mesh_sequence(tmp_path / "frames")
+
+
+@pytest.mark.parametrize("key", ["positions", "vertices", "verts"])
+def test_archives_are_read(tmp_path, key):
+    np.savez(tmp_path / "a.npz", **{key: MOVING, "faces": FACES, "fps": 60})
+    sequence = read_mesh_sequence(tmp_path / "a.npz")
+    np.testing.assert_array_equal(sequence.positions, MOVING)
+    assert sequence.fps == 60.0
+    assert read_mesh_sequence(tmp_path / "a.npz", fps=30.0).fps == 30.0
+    assert is_mesh_sequence(tmp_path / "a.npz")
+
+
+def test_patches_follow_a_rigid_motion_exactly():
+    body, poses = pose_sequence(MeshSequence("body", MOVING, FACES, 30.0))
+    np.testing.assert_allclose(poses.positions, MOVING, atol=1e-6)
+    rest = np.asarray(body.rest_positions)
+    for frame in range(4):
+        transforms = np.asarray(poses.joint_transforms[frame])
+        moved = np.einsum("pab,vb->vpa", transforms[..., :3], rest) + transforms[..., 3]
+        np.testing.assert_allclose(moved, np.repeat(MOVING[frame][:, None], len(transforms), 1), atol=1e-5)
+    np.testing.assert_allclose(np.asarray(body.skin_weights).sum(axis=1), 1.0, atol=1e-6)
+
+
+def test_frames_between_frames_lie_on_straight_lines():
+    _, poses = pose_sequence(MeshSequence("body", MOVING, FACES, 15.0), fps=30.0)
+    assert len(poses.positions) == 7
+    np.testing.assert_allclose(poses.positions[3], 0.5 * (MOVING[1] + MOVING[2]), atol=1e-6)
+    _, short = pose_sequence(MeshSequence("body", MOVING, FACES, 15.0), num_frames=3)
+    assert len(short.positions) == 3
+    with pytest.raises(MotionError, match="fewer"):
+        pose_sequence(MeshSequence("body", MOVING, FACES, 15.0), num_frames=30)
+
+
+def test_other_units_are_refused():
+    with pytest.raises(AssetError, match="metres"):
+        pose_sequence(MeshSequence("body", 100 * MOVING, FACES, 30.0))
+
+
+BROKEN = {
+    "no faces": ({"faces": None}, "lacks faces"),
+    "no positions": ({"positions": None}, "positions"),
+    "one frame without the axis": ({"positions": MOVING[0]}, "frames, vertices, 3"),
+    "a face beyond": ({"faces": FACES + 10_000}, "names vertex"),
+    "not finite": ({"positions": np.full_like(MOVING, np.nan)}, "frame 0"),
+    "no rate": ({"fps": np.array(0.0)}, "frames per second"),
+    "a rate of words": ({"fps": np.array("fast")}, "frame rate"),
+    "faces of floats": ({"faces": FACES.astype(float)}, "faces"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_archives_are_named_in_one_line(tmp_path, kind):
+    changes, word = BROKEN[kind]
+    values = {"positions": MOVING, "faces": FACES} | changes
+    path = tmp_path / "body.npz"
+    np.savez(path, **{key: value for key, value in values.items() if value is not None})
+    refuses(read_mesh_sequence, path, word)
+
+
+def test_broken_folders_are_named_in_one_line(tmp_path):
+    (tmp_path / "empty").mkdir()
+    refuses(read_mesh_sequence, tmp_path / "empty", "holds no")
+    write_folder(tmp_path / "mixed")
+    (tmp_path / "mixed" / "body9.ply").write_bytes(b"ply")
+    refuses(read_mesh_sequence, tmp_path / "mixed", "both")
+    write_folder(tmp_path / "changing")
+    (tmp_path / "changing" / "body4.obj").write_text(obj_text("body", MOVING[0], FACES[:-1]))
+    refuses(read_mesh_sequence, tmp_path / "changing", "topology")
+    write_folder(tmp_path / "broken")
+    (tmp_path / "broken" / "body4.obj").write_text("v 1 2 three\n")
+    refuses(read_mesh_sequence, tmp_path / "broken")
