@@ -279,7 +279,8 @@ ARRAYS = {
     "body": (
         lambda: {
             "rest_positions": GRID[0], "shape_directions": np.zeros((12, 3, 2)),
-            "joint_rest_positions": GRID[0][:2], "joint_shape_directions": np.zeros((2, 3, 2)), "parents": np.array([-1, 0]),
+            "joint_rest_positions": GRID[0][:2], "joint_shape_directions": np.zeros((2, 3, 2)),
+            "parents": np.array([-1, 0]),
             "joint_names": np.array(["a", "b"]), "skin_weights": np.full((12, 2), 0.5),
             "skin_indices": np.tile([0, 1], (12, 1)), "faces": FACES, "obstacle_faces": np.ones(4, bool),
         },

@@ -1,0 +1,162 @@
+"""Joints by any name, and motions carried from rig to rig."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.assets import load_motion
+from eslr_jax.body.joints import complete_map, find_parts, name_part, read_joint_map, torso_axes
+from eslr_jax.body.motion import pose_body
+from eslr_jax.body.procedural import PROCEDURAL, make_procedural
+from eslr_jax.body.retarget import global_rotations
+from eslr_jax.body.rig import body_skeleton, hips_first, make_motion, skeleton_motion
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.skeleton import Skeleton, SkeletonMotion, chain_positions
+
+RIGS = {
+    "Mixamo": """
+        mixamorig:Hips mixamorig:Spine2 mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot
+        mixamorig:LeftShoulder mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand
+        mixamorig:LeftHandIndex1 mixamorig:Head
+    """,
+    "SMPL": """
+        pelvis spine3 left_hip left_knee left_ankle left_collar left_shoulder left_elbow left_wrist
+        left_index1 head
+    """,
+    "Unreal": "pelvis spine_03 thigh_l calf_l foot_l clavicle_l upperarm_l lowerarm_l hand_l index_01_l head",
+    "VRM": """
+        J_Bip_C_Hips J_Bip_C_UpperChest J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot J_Bip_L_Shoulder
+        J_Bip_L_UpperArm J_Bip_L_LowerArm J_Bip_L_Hand J_Bip_L_Index1 J_Bip_C_Head
+    """,
+    "Rigify": """
+        pelvis DEF-spine.003 DEF-thigh.L DEF-shin.L DEF-foot.L DEF-shoulder.L DEF-upper_arm.L DEF-forearm.L
+        DEF-hand.L DEF-f_index.01.L head
+    """,
+    "ASF": "root thorax lfemur ltibia lfoot lclavicle lhumerus lradius lhand lfingers head",
+    "collars": """
+        Hips Chest LeftHip LeftKnee LeftAnkle LeftCollar LeftShoulder LeftElbow LeftWrist LeftIndex Head
+    """,
+}  # fmt: skip
+EXPECTED = (
+    ("", "hips"), ("", "spine"), ("left", "upper_leg"), ("left", "lower_leg"), ("left", "foot"),
+    ("left", "clavicle"), ("left", "upper_arm"), ("left", "forearm"), ("left", "hand"), ("left", "index"),
+    ("", "head"),
+)  # fmt: skip
+PARENTS = (-1, 0, 0, 2, 3, 1, 5, 6, 7, 8, 1)
+
+
+@pytest.mark.parametrize("family", RIGS)
+def test_joints_are_known_by_the_names_of_every_family(family):
+    names = RIGS[family].split()
+    parts = find_parts(Skeleton(tuple(names), PARENTS, np.zeros((11, 3))))
+    for joint, part in enumerate(EXPECTED):
+        if family == "ASF" and part[1] == "index":
+            part = ("left", "fingers")
+        assert parts[part] == [joint], names[joint]
+
+
+@pytest.mark.parametrize("name", ["upperarm_twist_01_l", "LeftToe_End", "ik_hand_l", "prop", "__UpLeg_L", ""])
+def test_helpers_are_no_part_of_the_body(name):
+    assert name_part(name) is None
+
+
+def test_the_map_can_be_changed(tmp_path, body):
+    target = body_skeleton(body)
+    source = Skeleton(tuple(RIGS["Unreal"].split()), PARENTS, np.zeros((11, 3)))
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps({"LeftArm": "lowerarm_l", "Head": ""}))
+    found = complete_map(target, source, read_joint_map(path))
+    assert found["LeftArm"] == "lowerarm_l"
+    assert found["LeftForeArm"] == "lowerarm_l"
+    assert "Head" not in found
+    with pytest.raises(MotionError, match="did you mean LeftArm"):
+        complete_map(target, source, {"LeftArn": "hand_l"})
+    with pytest.raises(MotionError, match="the motion has no joint"):
+        complete_map(target, source, {"LeftArm": "tail"})
+    with pytest.raises(MotionError, match="no joint of the motion"):
+        complete_map(target, Skeleton(("a", "b"), (-1, 0), np.zeros((2, 3))))
+    for text in ("", "[1]", '{"a": 1}', "{"):
+        path.write_text(text)
+        with pytest.raises(AssetError, match=r"map\.json"):
+            read_joint_map(path)
+
+
+def test_hips_above_which_there_is_a_root_become_the_first_joint():
+    rest = np.array([[0, 0, 0], [0, 1, 0], [0.1, 0.9, 0], [-0.1, 0.9, 0], [0, 1.3, 0.0]])
+    skeleton = Skeleton(("root", "pelvis", "thigh_l", "thigh_r", "spine_01"), (-1, 0, 1, 1, 1), rest)
+    found, order = hips_first(skeleton)
+    assert found.joint_names[0] == "pelvis"
+    assert found.parents[0] == -1
+    assert all(parent < joint for joint, parent in enumerate(found.parents))
+    np.testing.assert_array_equal(found.rest_positions, rest[order])
+    np.testing.assert_allclose(torso_axes(found, find_parts(found)), np.eye(3), atol=1e-12)
+
+
+def test_a_motion_of_this_rig_is_taken_as_it_is(body):
+    motion = load_motion("cmu_016_32")
+    back = make_motion(skeleton_motion(motion, body), body)
+    np.testing.assert_allclose(back.translations, motion.translations, atol=1e-9)
+    turned, again = (global_rotations(m.rotations, body.parents) for m in (motion, back))
+    np.testing.assert_allclose(again, turned, atol=1e-9)
+    assert back.arm_abduction == 0.0
+
+
+def test_a_source_that_faces_elsewhere_moves_the_body_alike(body):
+    """A rig whose rest pose faces -x: limbs point where its limbs point."""
+    motion = load_motion("cmu_016_32")
+    source = skeleton_motion(motion, body)
+    quarter = Rotation.from_euler("y", -90, degrees=True).as_matrix()
+    skeleton = Skeleton(body.joint_names, body.parents, source.skeleton.rest_positions @ quarter.T)
+    turned = source.rotations @ quarter.T  # since another rest pose
+    moved = SkeletonMotion("a", skeleton, turned, source.positions, source.fps)
+    found = make_motion(moved, body)
+    positions = chain_positions(
+        global_rotations(found.rotations, body.parents), found.translations, body_skeleton(body)
+    )
+    difference = positions - source.positions
+    assert np.ptp(difference, axis=(0, 1)).max() < 1e-6  # but for where it starts
+
+
+def test_a_rest_pose_that_does_not_stand_is_refused(body):
+    source = skeleton_motion(load_motion("cmu_016_32"), body)
+    rest = source.skeleton.rest_positions.copy()
+    names = list(body.joint_names)
+    rest[names.index("LeftFoot")] = rest[names.index("LeftLeg")] + [0, 0.4, 0]
+    broken = SkeletonMotion(
+        "lying", Skeleton(body.joint_names, body.parents, rest), source.rotations, source.positions, 30.0
+    )
+    with pytest.raises(MotionError, match="does not stand"):
+        make_motion(broken, body)
+
+
+@pytest.mark.parametrize("name", PROCEDURAL)
+def test_computed_motions_start_at_rest_and_move(name, body):
+    motion = load_motion(name, body=body)
+    assert len(motion.rotations) == 121
+    assert not motion.rotations[:30].any()
+    speed = np.linalg.norm(np.diff(motion.rotations, axis=0), axis=-1).max(axis=1) * motion.fps
+    lift = np.ptp(motion.translations, axis=0)
+    assert speed.max() > 1.0  # [rad/s]
+    assert speed.max() < 12.0
+    expected = {"turn": (0.0, 0.0), "jump": (0.35, 0.5), "swing": (0.0, 0.0)}[name]
+    assert expected[0] - 1e-9 <= lift[1] <= expected[1] + 1e-9
+    poses = pose_body(body, motion, num_frames=31)
+    assert float(np.asarray(poses.positions)[0, :, 1].min()) == pytest.approx(0.0, abs=1e-5)  # on the floor
+
+
+def test_feet_stay_where_they_are_while_knees_bend(body):
+    motion = make_procedural("jump", body)
+    joints = chain_positions(
+        global_rotations(motion.rotations, body.parents), motion.translations, body_skeleton(body)
+    )
+    foot = joints[:, list(body.joint_names).index("LeftFoot")]
+    on_floor = motion.translations[:, 1] <= motion.translations[0, 1] + 1e-6
+    assert np.linalg.norm((foot - foot[0])[on_floor], axis=1).max() < 0.03  # [m]
+
+
+def test_a_rig_without_the_joints_is_refused(body):
+    strange = body.replace(joint_names=tuple(f"bone{k}" for k in range(len(body.joint_names))))
+    with pytest.raises(MotionError, match="lacks"):
+        make_procedural("swing", strange)
