@@ -1,0 +1,127 @@
+"""A new character with a garment of its own, in one command; and a body that is a mesh in motion."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from formats import write_character
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.assets import load_motion
+from eslr_jax.assets.catalog import find_asset
+from eslr_jax.body.rig import body_skeleton, skeleton_motion
+from eslr_jax.io.garment import read_garment_npz
+from eslr_jax.io.mesh_sequence import obj_text
+from eslr_jax.io.trajectory import read_trajectory
+
+MIXAMO = {"LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2"}
+
+
+def eslr(*arguments):
+    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory, body):
+    """A folder with a character as Mixamo's become in Blender, walking, and its shirt."""
+    folder = tmp_path_factory.mktemp("avatar")
+    motion = skeleton_motion(load_motion(), body)
+    order = np.argsort(-np.asarray(body.skin_weights), axis=1)[:, :4]
+    weights = np.take_along_axis(np.asarray(body.skin_weights, np.float64), order, axis=1)
+    write_character(
+        folder / "avatar.glb",
+        body_skeleton(body),
+        np.asarray(body.rest_positions, np.float64),
+        np.asarray(body.faces),
+        weights / weights.sum(axis=1, keepdims=True),
+        np.take_along_axis(np.asarray(body.skin_indices), order, axis=1),
+        names=[f"mixamorig:{MIXAMO.get(name, name)}" for name in body.joint_names],
+        motion=(motion.rotations[:8], motion.positions[:8]),
+        frames=Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix(),
+        fps=motion.fps,
+    )
+    shirt = read_garment_npz(find_asset("garment", "tshirt_1k"))
+    (folder / "shirt.obj").write_text(obj_text("shirt", shirt.rest_positions, shirt.faces))
+    return folder
+
+
+@pytest.mark.slow
+def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body):
+    out = tmp_path / "out"
+    result = eslr(
+        "simulate", "--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", "--simulator", "physics",
+        "--frames", 4, "--iterations", 20, "--no-pictures", "--json", "--out", out,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["finite"]
+    assert report["motion"].endswith("avatar.glb")  # its own animation
+    run = read_trajectory(out / "trajectory.npz")
+    assert run.positions.shape == (4, 1000, 3)
+    from eslr_jax.body.motion import pose_body
+
+    expected = pose_body(body, load_motion(), arm_abduction=0.0, num_frames=4)
+    np.testing.assert_allclose(run.body_positions, expected.positions, atol=2e-3)  # four influences of seven
+    result = eslr("export", out, "--out", tmp_path / "shirt.pc2")
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.slow
+def test_a_mesh_in_motion_is_a_body(avatar, tmp_path, body, walk):
+    np.savez(tmp_path / "body.npz", positions=walk.positions[:5], faces=body.faces, fps=30)
+    garment = tmp_path / "shirt.npz"  # cut for the first frame: the shirt that the walk starts in
+    from eslr_jax.assets import load_garment
+    from eslr_jax.body.motion import skin_garment
+
+    shirt = load_garment("tshirt")
+    start = np.asarray(skin_garment(shirt, walk.joint_transforms))[0]
+    garment = tmp_path / "shirt.obj"
+    garment.write_text(obj_text("shirt", start, np.asarray(shirt.faces)))
+    out = tmp_path / "out"
+    result = eslr(
+        "simulate", "--body", tmp_path / "body.npz", "--garment", garment, "--simulator", "physics",
+        "--iterations", 20, "--no-pictures", "--json", "--out", out,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    run = read_trajectory(out / "trajectory.npz")
+    np.testing.assert_allclose(run.body_positions, walk.positions[:5], atol=1e-6)
+    assert json.loads(result.stdout)["finite"]
+
+
+def test_what_contradicts_is_refused_in_one_line(avatar, tmp_path, body):
+    np.savez(tmp_path / "body.npz", positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
+    cases = (
+        (("--body", tmp_path / "body.npz", "--motion", "turn"), "follows no other"),
+        (("--body", avatar / "avatar.glb", "--garment", "tshirt"), "made for another body"),
+    )
+    for arguments, word in cases:
+        result = eslr(
+            "simulate", *arguments, "--simulator", "physics", "--frames", 2, "--out", tmp_path / "out"
+        )
+        lines = [line for line in result.stderr.splitlines() if line.startswith("eslr: ")]
+        assert result.returncode == 2, result.stderr
+        assert len(lines) == 1
+        assert word in lines[0]
+    assert not os.listdir(tmp_path / "out")
+
+
+def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
+    result = eslr(
+        "joints",
+        "--body",
+        "anny",
+        "--motion",
+        avatar / "avatar.glb",
+        "--out",
+        tmp_path / "map.json",
+        "--json",
+    )
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert json.loads((tmp_path / "map.json").read_text()) == found
+    assert found["LeftArm"] == "mixamorig:LeftArm"
+    assert found["Spine1"] == "mixamorig:Spine2"
