@@ -763,7 +763,7 @@ def _show_scene(
     config = SimConfig(simulator=simulator, model=architecture, self_contact=self_contact)
     with _stderr.status("measuring"):
         rig = load_body()
-        poses = pose_body(rig, load_motion(motion, body=rig))
+        poses = pose_body(rig, load_motion(motion))
         scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses)
         parts = describe_scene(scene, poses, config)
         costs = time_parts(params, scene, config)
