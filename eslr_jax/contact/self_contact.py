@@ -21,6 +21,7 @@ _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a he
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
 _CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
 CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
+_TIP_CELL_CAPACITY = 512  # likewise around a tip, whose cells are larger
 PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
 
 
@@ -99,7 +100,7 @@ def find_tip_contacts(
     *,
     radius: Float[Array, ""] | float = TIP_RADIUS,
     capacity: int | None = None,
-    cell_capacity: int = CELL_CAPACITY,
+    cell_capacity: int = _TIP_CELL_CAPACITY,
 ) -> FacePairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 

@@ -279,3 +279,19 @@ def test_diagonal_bounds_a_third_of_the_curvature():
     diagonal = repulsion_diagonal(position, contacts, STIFFNESS, THICKNESS)
     curvature = 6 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3
     np.testing.assert_allclose(diagonal, curvature / 3 * np.array([0.09, 0.09, 0.16, 1.0]), rtol=1e-4)
+
+
+def test_a_tip_between_vertices_meets_the_face_over_it():
+    """A mesh of 16 mm, as in the hard case of the needle; the default capacities hold what is looked at."""
+    garment = make_cloth(25, 25, 0.016)
+    face = 400
+    corners = np.asarray(garment.faces)[face]
+    tip = np.asarray(garment.rest_positions)[corners].mean(axis=0) - np.array([0.0, 5e-3, 0.0])
+    body = jnp.asarray(np.stack([tip, tip - np.array([0.0, 0.2, 0.0])]), jnp.float32)
+    x = garment.rest_positions
+    pairs = jax.jit(self_contact.find_tip_contacts)(x, x, body, body, garment)
+    assert int(pairs.status) == Status.OK
+    assert found_pairs(garment, pairs)[0, face] == -1.0  # below a sheet that faces up
+    assert set(np.asarray(pairs.vertices)[np.asarray(pairs.side) != 0]) == {0}, "the other point is far"
+    height, _ = pair_heights(x, pairs, body)
+    np.testing.assert_allclose(height[0], 5e-3, rtol=1e-4)
