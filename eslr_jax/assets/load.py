@@ -23,7 +23,7 @@ from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.validate import validate_body
 from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
+from eslr_jax.io.fbx import fbx_clip_names, read_fbx_body, read_fbx_motion
 from eslr_jax.io.garment import (
     GarmentFile,
     garment_arrays,
@@ -251,7 +251,8 @@ def load_motion(
 def own_motion(body: str) -> str:
     """Return the motion that a body comes with: the animation in its file, or else a bundled walk."""
     file, _ = _split_name(body)
-    if Path(file).suffix.lower() in GLTF_SUFFIXES and gltf_clip_names(file):
+    suffix = Path(file).suffix.lower()
+    if (suffix in GLTF_SUFFIXES and gltf_clip_names(file)) or (suffix == ".fbx" and fbx_clip_names(file)):
         return file
     return DEFAULT_MOTION
 

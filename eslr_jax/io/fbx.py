@@ -26,6 +26,12 @@ from eslr_jax.io.skeleton import (
 TIMEOUT = 60.0  # [s] for the reader's process
 
 
+def fbx_clip_names(path: str | Path) -> tuple[str, ...]:
+    """Return the names of a file's animations."""
+    with parsing(path, "motion") as file:
+        return tuple(str(name) for name in _read(file, "")["clips"])
+
+
 def read_fbx_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
     """Read a skinned character in its bind pose.
 

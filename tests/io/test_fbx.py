@@ -9,7 +9,7 @@ from broken import refuses
 
 import eslr_jax.io.fbx as fbx
 from eslr_jax.errors import MissingExtraError
-from eslr_jax.io.fbx import read_fbx_body, read_fbx_motion
+from eslr_jax.io.fbx import fbx_clip_names, read_fbx_body, read_fbx_motion
 
 pytest.importorskip("ufbx")
 FILE = Path(__file__).parents[1] / "fixtures" / "huesitos.fbx"  # a small skinned mesh of assimp's tests
@@ -26,6 +26,7 @@ def test_a_real_file_is_read(character):
     assert body.skeleton.joint_names[0] == "Bone"
     np.testing.assert_allclose(body.skin_weights.sum(axis=1), 1.0)
     assert motion.name == "Armature|Action"
+    assert fbx_clip_names(FILE) == ("Armature|Action",)
     assert motion.fps == pytest.approx(25.0)
     assert motion.rotations.shape == (40, 11, 3, 3)
     assert np.ptp(motion.positions, axis=0).max() > 0.1  # it moves
