@@ -65,7 +65,9 @@ def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body)
     from eslr_jax.body.motion import pose_body
 
     expected = pose_body(body, load_motion(), arm_abduction=0.0, num_frames=4)
-    np.testing.assert_allclose(run.body_positions, expected.positions, atol=2e-3)  # four influences of seven
+    distance = np.linalg.norm(run.body_positions - np.asarray(expected.positions), axis=-1)
+    assert np.quantile(distance, 0.99) < 2e-3  # [m]: glTF kept four of up to seven influences
+    assert distance.max() < 0.015
     result = eslr("export", out, "--out", tmp_path / "shirt.pc2")
     assert result.returncode == 0, result.stderr
 
@@ -73,7 +75,7 @@ def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body)
 @pytest.mark.slow
 def test_a_mesh_in_motion_is_a_body(avatar, tmp_path, body, walk):
     np.savez(tmp_path / "body.npz", positions=walk.positions[:5], faces=body.faces, fps=30)
-    garment = tmp_path / "shirt.npz"  # cut for the first frame: the shirt that the walk starts in
+    # The shirt that the walk starts in: a garment has to fit the first frame.
     from eslr_jax.assets import load_garment
     from eslr_jax.body.motion import skin_garment
 
