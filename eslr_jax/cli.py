@@ -902,8 +902,8 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
 
         def show(done: int, total: int, metrics: dict[str, float]) -> None:
             terms = ("stretch", "bending", "inertia", "collision", "friction")
-            shares = ", ".join(f"{name} {metrics[name]:.4f}" for name in terms)
-            text = f"{metrics['its']:.1f} it/s, loss {metrics['loss']:.4f} ({shares} J)"
+            shares = "\n".join(f"{name} {metrics[name] * 1e3:.1f} mJ" for name in terms)
+            text = f"{metrics['its']:.1f} it/s\nloss {metrics['loss']:.4f}\n{shares}"
             progress.update(task, completed=done, total=total, text=text)
             if events is not None:
                 for name, value in metrics.items():
