@@ -676,18 +676,14 @@ def assets(
 
 def _list_fabrics(as_json: bool) -> None:
     """Print the table of fabrics."""
-    from eslr_jax.physics.materials import FABRICS, fabric_names
+    from eslr_jax.physics.materials import FABRICS, describe_cotton
 
+    rows = {"cotton": describe_cotton(), **FABRICS}
     if as_json:
-        rows = {name: dataclasses.asdict(fabric) for name, fabric in FABRICS.items()}
-        print(json.dumps({"cotton": {"source": "SNUG (Santesteban et al. 2022)"}} | rows, indent=2))
+        print(json.dumps({name: dataclasses.asdict(fabric) for name, fabric in rows.items()}, indent=2))
         return
     table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
-    table.add_row(
-        "cotton", "0.200", "29", "4.0e-05", "of SNUG, HOOD and the paper", "Santesteban et al. 2022"
-    )
-    for name in fabric_names()[1:]:
-        fabric = FABRICS[name]
+    for name, fabric in rows.items():
         numbers = (
             f"{fabric.density:.3f}",
             f"{fabric.stretch_stiffness:.0f}",

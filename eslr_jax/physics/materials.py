@@ -64,6 +64,18 @@ FABRICS: dict[str, Fabric] = {
 """Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain."""
 
 
+def describe_cotton() -> Fabric:
+    """Return cotton as one of the table's rows.
+
+    Pulled along one axis a sheet has the stiffness E h = 4 mu h (mu + lambda) / (2 mu + lambda).
+    """
+    thickness, mu, lame_lambda = (float(_COTTON[name]) for name in ("thickness", "lame_mu", "lame_lambda"))
+    stretch = 4.0 * thickness * mu * (mu + lame_lambda) / (2.0 * mu + lame_lambda)
+    bending = float(_COTTON["bending_stiffness"])
+    what = "the fabric of SNUG, HOOD and the paper"
+    return Fabric(float(_COTTON["density"]), stretch, bending, what, "Santesteban et al. 2022 (SNUG)")
+
+
 def fabric_names() -> tuple[str, ...]:
     """Return the names that `fabric_material` knows."""
     return ("cotton", *FABRICS)
