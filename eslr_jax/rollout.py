@@ -94,7 +94,7 @@ def rollout_batch(
     parameters: PhysicsParameters | None = None,
     options: SceneOptions | None = None,
     batch_size: int = 1,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> list[Trajectory]:
     """Simulate garment i on motion i for every i; scenes of like size share one compiled rollout.
 
@@ -109,7 +109,7 @@ def rollout_batch(
         parameters: Physical constants of all.
         options: What the scenes leave out or add.
         batch_size: Scenes per step on a device, see `simulate_scenes`.
-        devices: Devices to spread the scenes over; by default the first alone.
+        devices: Of `jax.devices()`, to spread the scenes over; by default the first alone.
 
     Returns:
         Trajectories in the order given, with the vertices of each garment. Their status is not checked: one
