@@ -2,7 +2,7 @@
 
 import pytest
 
-from eslr_jax.cli import _parse_budget, _parse_share
+from eslr_jax.cli.budget import parse_budget, parse_share
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation.calibrate import (
     SOLVER,
@@ -69,21 +69,21 @@ def test_calibrations_survive_a_round_trip_and_damage_is_named(tmp_path):
 
 @pytest.mark.parametrize(("text", "value"), [("20ms", 20.0), ("0.1s", 100.0), (None, None)])
 def test_budgets_are_times(text, value):
-    assert _parse_budget(text) == (None if value is None else pytest.approx(value))
+    assert parse_budget(text) == (None if value is None else pytest.approx(value))
 
 
 @pytest.mark.parametrize("text", ["20", "fast", "-3ms", "nanms", "infs", "ms"])
 def test_other_budgets_are_refused(text):
     with pytest.raises(ConfigError, match="20ms"):
-        _parse_budget(text)
+        parse_budget(text)
 
 
 @pytest.mark.parametrize(("text", "value"), [("1%", 0.01), ("0.02", 0.02), (None, None)])
 def test_tolerances_are_shares(text, value):
-    assert _parse_share(text) == (None if value is None else pytest.approx(value))
+    assert parse_share(text) == (None if value is None else pytest.approx(value))
 
 
 @pytest.mark.parametrize("text", ["0", "100%", "1", "-1%", "nan", "few"])
 def test_other_tolerances_are_refused(text):
     with pytest.raises(ConfigError, match="1%"):
-        _parse_share(text)
+        parse_share(text)

@@ -1,0 +1,148 @@
+"""`eslr assets` and `eslr info`: what is in the box, what a network or a scene consists of."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.errors import AssetError
+
+
+@app.command
+def assets(
+    kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
+    verify: bool = False,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """List what is in the box.
+
+    Args:
+        kind: Only this kind.
+        verify: Compare every file with its checksum.
+        json_: Print as JSON.
+    """
+    from eslr_jax.assets.catalog import is_intact, list_assets
+
+    if kind == "fabric":
+        _list_fabrics(json_)
+        return
+    chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
+    if verify:
+        damaged = [asset.file for asset in chosen if not is_intact(asset)]
+        if damaged:
+            raise AssetError(f"damaged: {', '.join(sorted(set(damaged)))}; install the package again")
+    if json_:
+        print(json.dumps([dataclasses.asdict(asset) for asset in chosen], indent=2))
+        return
+    table = Table("kind", "name", "what", "licence", box=None)
+    for asset in chosen:
+        table.add_row(asset.kind, asset.name, asset.description, asset.licence)
+    Console().print(table, markup=False)
+
+
+def _list_fabrics(as_json: bool) -> None:
+    """Print the table of fabrics."""
+    from eslr_jax.physics.materials import FABRICS, describe_cotton
+
+    rows = {"cotton": describe_cotton(), **FABRICS}
+    if as_json:
+        print(json.dumps({name: dataclasses.asdict(fabric) for name, fabric in rows.items()}, indent=2))
+        return
+    table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
+    for name, fabric in rows.items():
+        numbers = (
+            f"{fabric.density:.3f}",
+            f"{fabric.stretch_stiffness:.0f}",
+            f"{fabric.bending_stiffness:.1e}",
+        )
+        table.add_row(name, *numbers, fabric.what, fabric.source)
+    Console().print(table, markup=False)
+
+
+@app.command
+def info(
+    model: str = "eslr-15",
+    scene: str | None = None,
+    motion: str = "cmu_016_32",
+    vertices: Literal["1k", "4k", "10k"] = "1k",
+    simulator: Literal["network", "physics"] = "physics",
+    self_contact: bool = False,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Show an architecture and its number of parameters; or with --scene, what a scene models at what cost.
+
+    Args:
+        model: Name of an architecture, or of a bundled network, or an exported file.
+        scene: A garment, by name or file, on the bundled body.
+        motion: Motion of the scene.
+        vertices: Resolution of a bundled garment.
+        simulator: Simulator of the scene; the network is the default one.
+        self_contact: Keep layers of cloth apart.
+        json_: Print as JSON.
+    """
+    if scene is not None:
+        _show_scene(scene, motion, vertices, simulator, self_contact, json_)
+        return
+    from eslr_jax.assets import asset_names, load_model
+    from eslr_jax.config import to_dict
+    from eslr_jax.models.registry import MODELS, count_parameters, init_model
+
+    if model in MODELS:
+        config = MODELS[model]
+        params = init_model(config)
+    elif model in asset_names("model") or Path(model).suffix:
+        params, config = load_model(model)
+    else:
+        known = ", ".join([*MODELS, *asset_names("model")])
+        raise AssetError(f"no model named {model!r}: there are {known}; a path to a file works too")
+    values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
+    if json_:
+        print(json.dumps(values, indent=2))
+        return
+    print(f"{model}: {values['parameters']:,} parameters")
+    for name, value in values["config"].items():
+        print(f"  {name} = {value}")
+
+
+def _show_scene(
+    garment: str,
+    motion: str,
+    vertices: Literal["1k", "4k", "10k"],
+    simulator: Literal["network", "physics"],
+    self_contact: bool,
+    as_json: bool,
+) -> None:
+    """Print what a scene models, what it leaves out, and what its parts cost."""
+    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.config import SimConfig
+    from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
+    from eslr_jax.scene import prepare_scene
+
+    use_compile_cache()
+    params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
+    config = SimConfig(simulator=simulator, model=architecture, self_contact=self_contact)
+    with stderr.status("measuring"):
+        rig = load_body()
+        poses = pose_body(rig, load_motion(motion))
+        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses)
+        parts = describe_scene(scene, poses, config)
+        costs = time_parts(params, scene, config)
+    if as_json:
+        print(json.dumps({**dataclasses.asdict(parts), "cost_ms": costs}, indent=2))
+        return
+    for title, entries in (("modelled", parts.modelled), ("left out", parts.left_out)):
+        print(title)
+        for name, size in entries.items():
+            print(f"  {name}: {size}")
+    print("cost on this device")
+    for name, cost in costs.items():
+        print(f"  {name}: {cost:.2f} ms")

@@ -1,0 +1,82 @@
+"""Budgets and tolerances, and `eslr calibrate`, which measures what they are chosen from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from eslr_jax.cli.console import app, stderr, use_compile_cache
+
+
+def parse_budget(text: str | None) -> float | None:
+    """Return a time in milliseconds.
+
+    Raises:
+        ConfigError: It is not a positive time.
+    """
+    from eslr_jax.errors import ConfigError
+
+    if text is None:
+        return None
+    units = {"ms": 1.0, "s": 1e3}
+    unit = "ms" if text.endswith("ms") else "s"
+    try:
+        value = float(text.removesuffix(unit)) * units[unit] if text.endswith(unit) else 0.0
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise ConfigError(f"--budget {text}: write a time per frame, such as 20ms or 0.1s")
+    return value
+
+
+def parse_share(text: str | None) -> float | None:
+    """Return a share, written as 1% or 0.01.
+
+    Raises:
+        ConfigError: It is not between 0 and 1.
+    """
+    from eslr_jax.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1:
+        raise ConfigError(f"--tolerance {text}: write a share of what a frame gains, such as 1% or 0.01")
+    return value
+
+
+@app.command
+def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
+    """Measure what this device can do in how much time, for `eslr simulate --budget` and `--tolerance`.
+
+    Takes a few minutes on an otherwise idle machine. The result is kept with the compiled programs.
+
+    Args:
+        models: Bundled networks to measure beside the solver; the default network if not given.
+        out: File to write to, instead of the one that `eslr simulate` reads.
+    """
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.evaluation.calibrate import cache_path, write_calibration
+    from eslr_jax.evaluation.calibrate import calibrate as run
+
+    use_compile_cache()
+    with stderr.status("measuring"):
+        measured = run(models or (default_model(),))
+    path = out or cache_path()
+    write_calibration(measured, path)
+    table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "excess after 20", box=None)
+    for method in measured.methods:
+        table.add_row(
+            method.name,
+            str(method.vertices),
+            f"{method.fixed_ms:.1f}",
+            f"{method.iteration_ms:.2f}",
+            f"{method.median['20']:.2%}",
+        )
+    Console().print(table, markup=False)
+    print(path)

@@ -1,0 +1,83 @@
+"""`eslr fit`: a garment file made ready for a body."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.errors import AssetError, MissingExtraError
+from eslr_jax.fit.options import FitOptions
+
+
+@app.command
+def fit(
+    garment: tyro.conf.Positional[str],
+    out: Path,
+    body: str = "anny",
+    options: Annotated[FitOptions, tyro.conf.arg(name="")] = FitOptions(),  # noqa: B008 - frozen
+    fabric: tuple[str, ...] = (),
+    picture: bool = True,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Fit a garment of your own to a body once, for `eslr simulate --garment OUT`.
+
+    What is not given is recognised: unit, axes, place, and the pose of the arms. Beside OUT stands a picture,
+    before on the left and after on the right.
+
+    Args:
+        garment: A mesh (obj, ply, stl, glb, npz), or FILE.pkl#NAME of HOOD's garments.
+        out: The garment file to write, such as shirt.npz.
+        body: Name of a bundled body, or a body file.
+        options: What is not left to recognition.
+        fabric: What it is made of, as for `eslr simulate`; kept in the file.
+        picture: Render the picture (extra `render`).
+        json_: Print the report as JSON.
+    """
+    from eslr_jax.assets import load_body, load_garment_file, prepare_stored
+    from eslr_jax.fabric import garment_material
+    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.io.garment import write_garment_npz
+
+    if out.suffix != ".npz":
+        raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
+    use_compile_cache()
+    with stderr.status("fitting"):
+        rig = load_body(body)
+        stored = load_garment_file(garment, body=rig, fit=options)
+        if "fit" not in stored.metadata:
+            raise AssetError(f"{garment} is fitted already; give it to eslr simulate, or fit its mesh again")
+        stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
+        garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
+    write_garment_npz(out, stored)
+    if picture:
+        _write_before_and_after(out.with_suffix(".png"), stored, rig)
+    report = stored.metadata["fit"]
+    if json_:
+        print(json.dumps(report, indent=2))
+    else:
+        print(describe_fit(report))
+        print(out)
+
+
+def _write_before_and_after(path: Path, stored, rig) -> None:
+    """Render the garment as it came and as it was fitted; without the extra `render` say so and go on."""
+    import numpy as np
+
+    from eslr_jax.render import render_frame, side_by_side, write_png
+
+    body = np.asarray(rig.rest_positions), np.asarray(rig.faces)
+    try:
+        with stderr.status("rendering"):
+            pictures = [
+                render_frame(*body, positions, stored.faces, camera=25.0, size=(420, 560))
+                for positions in (stored.sewn_positions, stored.rest_positions)
+            ]
+    except MissingExtraError as error:
+        stderr.print(f"no picture: {error}", markup=False, highlight=False)
+        return
+    write_png(path, side_by_side(pictures, ("before", "after")))

@@ -1,0 +1,288 @@
+"""`eslr simulate`: a garment on a moving body, to files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from eslr_jax.cli.budget import parse_budget, parse_share
+from eslr_jax.cli.console import app, progress, stderr, use_compile_cache
+from eslr_jax.errors import AssetError, MissingExtraError
+
+
+@app.command
+def simulate(
+    garment: str = "tshirt",
+    motion: str | None = None,
+    body: str = "anny",
+    simulator: Literal["network", "physics"] = "network",
+    model: str | None = None,
+    vertices: Literal["1k", "4k", "10k"] = "1k",
+    fabric: tuple[str, ...] = (),
+    frames: int | None = None,
+    iterations: int = 100,
+    corrector_steps: int = 10,
+    budget: str | None = None,
+    tolerance: str | None = None,
+    joint_map: Path | None = None,
+    motion_up: Literal["auto", "y", "z"] = "auto",
+    arm_abduction: float | None = None,
+    body_fps: float | None = None,
+    self_contact: bool = False,
+    out: Path = Path("out"),
+    pictures: bool = True,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
+
+    Args:
+        garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
+            see `eslr fit` where recognition fails.
+        motion: Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO
+            (.pkl), glTF or FBX, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
+            cmu_016_32.
+        body: Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
+            character (glTF, FBX), or a moving mesh (.npz, or a folder of OBJ or PLY files).
+        simulator: The trained network, or the physics solver.
+        model: Name of a bundled network or an exported file; the default network if not given.
+        vertices: Resolution of a bundled garment.
+        fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
+            density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
+        frames: Simulate this many frames, the start included; all if not given.
+        iterations: Solver iterations per frame of the physics simulator.
+        corrector_steps: Solver iterations behind the network; 0 is the network alone.
+        budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it.
+        tolerance: Excess over the optimum relative to what a frame gains, such as 1%: choose the fastest
+            simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.
+        joint_map: JSON file of changes to the map of joints that `eslr joints` shows.
+        motion_up: Axis that points up in a BVH motion.
+        arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
+            another body and 0 for the body's own.
+        body_fps: Frames per second of a body that is a moving mesh.
+        self_contact: Keep layers of cloth apart; the network does so only in its corrector.
+        out: Folder to write to.
+        pictures: Render the contact sheet.
+        json_: Print the report as JSON.
+    """
+    from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+
+    out = ensure_output_dir(out)
+    use_compile_cache()
+    if frames is not None and frames < 2:
+        raise AssetError(f"--frames {frames}: a simulation needs two frames or more")
+
+    import numpy as np
+
+    from eslr_jax.assets import load_garment_file, load_model, prepare_stored
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.config import SimConfig
+    from eslr_jax.evaluation.calibrate import SOLVER, choose, read_calibration
+    from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.fabric import beyond_training, garment_material
+    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.io.garment import write_garment_npz
+    from eslr_jax.rollout import raise_for_status, rollout_in_chunks
+    from eslr_jax.scene import prepare_scene
+
+    budget_ms, share = parse_budget(budget), parse_share(tolerance)
+    with stderr.status("loading garment, body and motion"):
+        rig, poses, motion = _load_actor(
+            body, motion, frames, joint_map=joint_map, up=motion_up, arm_abduction=arm_abduction, fps=body_fps
+        )
+        stored = load_garment_file(garment, vertices=vertices, body=rig)
+        choice = None
+        if budget_ms is not None or share is not None:
+            choice = choose(
+                read_calibration(), len(stored.rest_positions), budget_ms=budget_ms, tolerance=share
+            )
+            simulator = "physics" if choice.method == SOLVER else "network"
+            model = None if choice.method == SOLVER else choice.method
+            iterations = corrector_steps = choice.iterations
+        params, architecture = None, None
+        options: dict[str, Any] = {}
+        if simulator == "network":
+            model = model or default_model()
+            params, architecture = load_model(model)
+            options = {
+                "embedding_size": architecture.embedding_size,
+                "embedding_mode": architecture.embedding_mode,
+            }
+        cloth = prepare_stored(stored, name=Path(garment).name, **options)
+        material = garment_material(fabric, cloth, stored)
+        unseen = beyond_training(material) if simulator == "network" else ()
+        _check_skin(garment, cloth, rig, body)
+        scene = prepare_scene(cloth, poses, material=material)
+    if unseen:
+        text = f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics"
+        stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+    if "fit" in stored.metadata:
+        stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
+    config = SimConfig(
+        simulator=simulator,
+        model=architecture,
+        solver_iterations=iterations,
+        corrector_steps=corrector_steps,
+        tolerance=0.0 if choice is None else choice.tolerance,
+        self_contact=self_contact,
+    )
+    with progress("simulating", scene.num_frames - 1) as advance:
+        trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
+    raise_for_status(trajectory)
+    with stderr.status("measuring"):
+        report = {
+            "garment": garment,
+            "fabric": list(fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
+            "motion": motion,
+            "simulator": simulator,
+            "model": model,
+            **trajectory_report(trajectory, scene),
+            "choice": None if choice is None else dataclasses.asdict(choice),
+            "frame_ms": timing.frame_ms,
+            "compile_s": timing.compile_s,
+            **environment(),
+        }
+    positions = np.asarray(trajectory.positions)
+    with stderr.status("writing files"):
+        _write_motion(out, positions, np.asarray(trajectory.velocities), cloth, rig, poses, report)
+        write_garment_npz(out / "garment.npz", stored)
+    if pictures:
+        _write_sheet(out, positions, cloth, poses)
+    with atomic_write(out / "report.json") as temporary:
+        temporary.write_text(json.dumps(report, indent=2))
+    if json_:
+        print(json.dumps(report, indent=2))
+    else:
+        _print_report(report, out)
+
+
+def _load_actor(
+    body: str,
+    motion: str | None,
+    frames: int | None,
+    *,
+    joint_map: Path | None,
+    up: Literal["auto", "y", "z"],
+    arm_abduction: float | None,
+    fps: float | None,
+) -> tuple[Any, Any, str]:
+    """Load a body and set it in motion; returns both, and the name of the motion."""
+    from eslr_jax.assets import load_body, load_motion
+    from eslr_jax.assets.load import own_motion
+    from eslr_jax.body.joints import read_joint_map
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.body.sequence import pose_sequence
+    from eslr_jax.errors import ConfigError
+    from eslr_jax.io.mesh_sequence import is_mesh_sequence, read_mesh_sequence
+
+    if Path(body).exists() and is_mesh_sequence(body):
+        if motion is not None:
+            raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out --motion")
+        return *pose_sequence(read_mesh_sequence(body, fps=fps), num_frames=frames), body
+    if fps is not None:
+        raise ConfigError(f"--body-fps is for bodies that are moving meshes; {body} is none")
+    rig = load_body(body)
+    motion = motion or own_motion(body)
+    changes = None if joint_map is None else read_joint_map(joint_map)
+    clip = load_motion(motion, body=rig, joint_map=changes, up=up)
+    return rig, pose_body(rig, clip, num_frames=frames, arm_abduction=arm_abduction), motion
+
+
+def _check_skin(garment: str, cloth, rig, body: str) -> None:
+    """Refuse a garment that hangs on the joints of another body."""
+    import numpy as np
+
+    from eslr_jax.assets import asset_names, load_body
+    from eslr_jax.errors import ConfigError
+
+    is_bundled = garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment")
+    is_strange = is_bundled and rig.joint_names != load_body().joint_names
+    if is_strange or int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
+        raise ConfigError(
+            f"garment {garment} was made for another body than {body}; give a mesh that fits it"
+        )
+
+
+def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: dict[str, Any]) -> None:
+    """Write the trajectory and the animated GLB."""
+    import numpy as np
+
+    from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
+    from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR, SkinnedMesh
+    from eslr_jax.io.trajectory import write_trajectory
+
+    faces = np.asarray(cloth.faces)
+    timestep = float(poses.timestep)
+    write_trajectory(
+        out / "trajectory.npz",
+        positions=positions,
+        velocities=velocities,
+        faces=faces,
+        timestep=timestep,
+        body_positions=np.asarray(poses.positions),
+        body_faces=np.asarray(poses.faces),
+        metadata=report,
+    )
+    meshes, skinned = [AnimatedMesh("garment", positions, faces)], None
+    if rig.pose_directions is None and rig.parents.count(-1) == 1:
+        skinned = SkinnedMesh(
+            rest_positions=np.asarray(poses.rest_positions),
+            faces=np.asarray(poses.faces),
+            skin_weights=np.asarray(rig.skin_weights),
+            skin_indices=np.asarray(rig.skin_indices),
+            joint_transforms=np.asarray(poses.joint_transforms),
+            joint_rest_positions=np.asarray(rig.joint_rest_positions),
+            parents=rig.parents,
+            joint_names=rig.joint_names,
+        )
+    else:  # joints alone don't move it as it moved
+        body = AnimatedMesh("body", np.asarray(poses.positions), np.asarray(poses.faces), DEFAULT_BODY_COLOR)
+        meshes.append(body)
+    write_animated_glb(out / "animation.glb", meshes, timestep, skinned_body=skinned)
+
+
+def _write_sheet(out: Path, positions, cloth, poses) -> None:
+    """Render the contact sheet; without the extra `render` say so and go on."""
+    import numpy as np
+
+    from eslr_jax.render import contact_sheet, write_png
+
+    try:
+        with progress("rendering", 8) as advance:
+            sheet = contact_sheet(
+                np.asarray(poses.positions),
+                np.asarray(poses.faces),
+                positions,
+                np.asarray(cloth.faces),
+                on_picture=advance,
+            )
+    except MissingExtraError as error:
+        stderr.print(f"no pictures: {error}", markup=False, highlight=False)
+        return
+    write_png(out / "sheet.png", sheet)
+
+
+def _print_report(report: dict[str, Any], out: Path) -> None:
+    """Print what a person wants to know first."""
+    table = Table(show_header=False, box=None)
+    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items())
+    rows = {
+        "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
+        "time": f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation",
+        "energy": f"{report['total']:.4f} J a frame ({terms})",
+        "stretch": f"{report['max_principal_stretch']:.3f} at most",
+    }
+    if report["penetration_max_mm"] is not None:
+        rows["penetration"] = (
+            f"{report['penetration_p999_mm']:.2f} mm (99.9 %), {report['penetration_max_mm']:.2f} mm at most, "
+            f"{report['penetrating_share'] * 100:.2f} % of vertices"
+        )
+    rows["files"] = ", ".join(str(path) for path in sorted(out.iterdir()) if path.is_file())
+    for label, text in rows.items():
+        table.add_row(label, text)
+    Console().print(table, markup=False, highlight=False)

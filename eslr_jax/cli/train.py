@@ -1,0 +1,155 @@
+"""`eslr train`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from eslr_jax.cli.console import app, stderr, use_compile_cache
+
+
+@app.command
+def train(
+    out: Path,
+    config: Path | None = None,
+    set_: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = (),
+    resume: bool = False,
+    start_from: str | None = None,
+    tensorboard: bool = False,
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> None:
+    """Train a network on the physics loss; Ctrl-C or SIGTERM writes a checkpoint first.
+
+    A batch (`--set batch_size=8`) is spread over all devices of this machine, and with --coordinator over
+    those of several machines: start the same command once on each.
+
+    Args:
+        out: Folder of metrics, checkpoints and the exported model.
+        config: TOML file of a training configuration; not needed with --resume.
+        set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
+        resume: Go on from the newest checkpoint of the folder.
+        start_from: Name of a bundled network or an exported file whose weights to start from.
+        tensorboard: Write event files for TensorBoard too.
+        coordinator: Address of the first process as HOST:PORT, or "auto" under Slurm.
+        num_processes: Number of processes; not needed with "auto".
+        process_id: Number of this process, from 0; not needed with "auto".
+    """
+    from eslr_jax.assets import load_model
+    from eslr_jax.config import parse_override
+    from eslr_jax.errors import ConfigError
+    from eslr_jax.models.registry import check_params
+    from eslr_jax.training.checkpoint import read_run_config
+    from eslr_jax.training.loop import train as run
+    from eslr_jax.training.plot import plot_curves
+    from eslr_jax.training.recipe import load_recipe
+
+    if resume:
+        chosen = read_run_config(out)
+    elif config is None:
+        raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
+    else:
+        chosen = load_recipe(config, dict(parse_override(text) for text in set_))
+    use_compile_cache()
+    initial = None
+    if start_from is not None and not resume:
+        initial, _ = load_model(start_from)
+        check_params(chosen.model, initial)
+    if coordinator is not None:
+        _join_processes(coordinator, num_processes, process_id)
+    with _training_progress(chosen.iterations, out if tensorboard else None) as show:
+        state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
+    if _is_other_process():
+        return
+    plot_curves(out)
+    done = int(state.iteration)
+    if done < chosen.iterations:
+        stderr.print(
+            f"stopped at iteration {done} of {chosen.iterations}; go on with: eslr train --out {out} --resume",
+            markup=False,
+        )
+    else:
+        print(out / "model.npz")
+
+
+def _join_processes(coordinator: str, num_processes: int | None, process_id: int | None) -> None:
+    """Connect with the other processes of a training run.
+
+    Raises:
+        ConfigError: The processes are not all told, or do not answer.
+    """
+    import jax
+
+    from eslr_jax.errors import ConfigError
+
+    is_automatic = coordinator == "auto"
+    if not is_automatic and (num_processes is None or process_id is None):
+        raise ConfigError("--coordinator HOST:PORT needs --num-processes and --process-id too")
+    try:
+        jax.distributed.initialize(None if is_automatic else coordinator, num_processes, process_id)
+    except (RuntimeError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
+
+
+def _is_other_process() -> bool:
+    """Return whether another process of the run does the writing."""
+    import jax
+
+    return jax.process_index() > 0
+
+
+@contextlib.contextmanager
+def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
+    """Show iterations per second, the loss, its terms and the time left.
+
+    Raises:
+        ConfigError: TensorBoard's event files are asked for and its writer is not installed.
+    """
+    events = None
+    if tensorboard is not None:
+        from eslr_jax.errors import ConfigError
+
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise ConfigError(
+                '--tensorboard needs tensorboardX; pip install "eslr-jax[tensorboard]"'
+            ) from error
+        events = SummaryWriter(str(tensorboard / "events"))
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=stderr) as progress:
+        task = progress.add_task("training", total=total, text="compiling")
+
+        def show(done: int, total: int, metrics: dict[str, float]) -> None:
+            terms = ("stretch", "bending", "inertia", "collision", "friction")
+            shares = "\n".join(f"{name} {metrics[name] * 1e3:.1f} mJ" for name in terms)
+            text = f"{metrics['its']:.1f} it/s\nloss {metrics['loss']:.4f}\n{shares}"
+            progress.update(task, completed=done, total=total, text=text)
+            if events is not None:
+                for name, value in metrics.items():
+                    events.add_scalar(name, value, done)
+
+        yield show
+    if events is not None:
+        events.close()
