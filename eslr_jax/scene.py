@@ -14,8 +14,8 @@ from eslr_jax.body.motion import skin_garment
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import MotionError
-from eslr_jax.geometry.padding import choose_bucket, common_bucket, pad_garment
-from eslr_jax.geometry.prepare import to_device
+from eslr_jax.geometry.padding import choose_bucket, common_bucket
+from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
@@ -106,7 +106,7 @@ def prepare_scenes(
     """
     options = options or SceneOptions()
     bucket = common_bucket([choose_bucket(garment) for garment in garments])
-    padded = [to_device(pad_garment(garment, bucket)) for garment in garments]
+    padded = pad_alike(garments, bucket)
     surface = shared_surface(padded, poses[0]) if options.has_body else None
     scenes = [
         prepare_scene(garment, motion, material=material, options=options, surface=surface)

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.fields import FIELDS, Field, run_field
+from eslr_jax.extras import require
 from eslr_jax.io.run import Run
 from eslr_jax.render.colors import color_scale
-from eslr_jax.render.extras import require
 from eslr_jax.render.pictures import BODY_COLOR, GARMENT_COLOR
 
 PLAIN = "fabric"  # colour by nothing
@@ -134,7 +135,7 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
             name, points, trajectory.faces, color=_bytes(GARMENT_COLOR), wireframe=wireframe, side="double"
         )
     else:
-        mesh = require("trimesh", extra="view").Trimesh(
+        mesh = trimesh.Trimesh(
             points, trajectory.faces, vertex_colors=np.round(255 * colors).astype(np.uint8), process=False
         )
         scene.add_mesh_trimesh(name, mesh)

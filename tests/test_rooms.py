@@ -9,9 +9,9 @@ PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 
 # From the top of the house down; a room may import itself and what stands before it.
 ROOMS = [
-    "errors", "types", "config", "numerics", "io", "geometry", "body", "fit", "assets", "contact", "physics",
-    "graph", "models", "fabric", "scene", "simulate", "rollout", "training", "render", "evaluation",
-    "viewer", "cli",
+    "errors", "extras", "types", "config", "numerics", "io", "geometry", "body", "fit", "assets", "contact",
+    "physics", "graph", "models", "fabric", "scene", "simulate", "rollout", "training", "render",
+    "evaluation", "viewer", "cli",
 ]  # fmt: skip
 KERNELS = {"numerics", "contact", "graph", "models", "physics", "simulate"}
 HOST = {"io", "geometry", "fit", "assets", "fabric", "scene", "rollout", "render", "viewer", "cli"}

@@ -24,9 +24,14 @@ MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for
 _CODE = ("geometry", "fit", "io/mesh.py", "io/garment.py", "types.py")  # whose changes make entries worthless
 
 
+def user_cache() -> Path:
+    """Return the folder of everything that is kept between runs on this machine; it need not exist."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax"
+
+
 def cache_folder() -> Path:
-    """Return the folder of the cache; it need not exist."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax" / "garments"
+    """Return the folder of the garments' cache; it need not exist."""
+    return user_cache() / "garments"
 
 
 @cache

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.errors import ConfigError
 
 
 def parse_budget(text: str | None) -> float | None:
@@ -16,8 +17,6 @@ def parse_budget(text: str | None) -> float | None:
     Raises:
         ConfigError: It is not a positive time.
     """
-    from eslr_jax.errors import ConfigError
-
     if text is None:
         return None
     units = {"ms": 1.0, "s": 1e3}
@@ -37,8 +36,6 @@ def parse_share(text: str | None) -> float | None:
     Raises:
         ConfigError: It is not between 0 and 1.
     """
-    from eslr_jax.errors import ConfigError
-
     if text is None:
         return None
     try:

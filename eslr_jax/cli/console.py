@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -26,16 +24,18 @@ stderr = Console(stderr=True)
 def progress(label: str, total: int) -> Iterator[Any]:
     """Show a progress bar on stderr; yields a function of (done, total)."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=stderr, transient=False) as progress:
-        task = progress.add_task(label, total=total)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+    with Progress(*columns, console=stderr, transient=False) as bars:
+        task = bars.add_task(label, total=total)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
 
 
 def use_compile_cache() -> None:
     """Keep compiled programs between runs: the second run of the same command starts at once."""
     import jax
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax" / "compiled"
+    from eslr_jax.assets.cache import user_cache
+
+    cache = user_cache() / "compiled"
     with contextlib.suppress(OSError):
         cache.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(cache))

@@ -18,6 +18,9 @@ from rich.progress import (
 )
 
 from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.errors import ConfigError
+from eslr_jax.extras import require
+from eslr_jax.io.parsing import one_line
 
 
 @app.command
@@ -50,9 +53,9 @@ def train(
     """
     from eslr_jax.assets import load_model
     from eslr_jax.config import parse_override
-    from eslr_jax.errors import ConfigError
     from eslr_jax.models.registry import check_params
     from eslr_jax.training.checkpoint import read_run_config
+    from eslr_jax.training.loop import is_first_process
     from eslr_jax.training.loop import train as run
     from eslr_jax.training.plot import plot_curves
     from eslr_jax.training.recipe import load_recipe
@@ -64,15 +67,15 @@ def train(
     else:
         chosen = load_recipe(config, dict(parse_override(text) for text in set_))
     use_compile_cache()
+    if coordinator is not None:  # before anything is computed, as jax.distributed demands
+        _join_processes(coordinator, num_processes, process_id)
     initial = None
     if start_from is not None and not resume:
         initial, _ = load_model(start_from)
         check_params(chosen.model, initial)
-    if coordinator is not None:
-        _join_processes(coordinator, num_processes, process_id)
     with _training_progress(chosen.iterations, out if tensorboard else None) as show:
         state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
-    if _is_other_process():
+    if not is_first_process():
         return
     plot_curves(out)
     done = int(state.iteration)
@@ -93,23 +96,14 @@ def _join_processes(coordinator: str, num_processes: int | None, process_id: int
     """
     import jax
 
-    from eslr_jax.errors import ConfigError
-
     is_automatic = coordinator == "auto"
     if not is_automatic and (num_processes is None or process_id is None):
         raise ConfigError("--coordinator HOST:PORT needs --num-processes and --process-id too")
     try:
         jax.distributed.initialize(None if is_automatic else coordinator, num_processes, process_id)
     except (RuntimeError, ValueError) as error:
-        text = str(error).splitlines()[0]
+        text = one_line(error)
         raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
-
-
-def _is_other_process() -> bool:
-    """Return whether another process of the run does the writing."""
-    import jax
-
-    return jax.process_index() > 0
 
 
 @contextlib.contextmanager
@@ -117,19 +111,12 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
     """Show iterations per second, the loss, its terms and the time left.
 
     Raises:
-        ConfigError: TensorBoard's event files are asked for and its writer is not installed.
+        MissingExtraError: TensorBoard's event files are asked for and its writer is not installed.
     """
     events = None
     if tensorboard is not None:
-        from eslr_jax.errors import ConfigError
-
-        try:
-            from tensorboardX import SummaryWriter
-        except ImportError as error:
-            raise ConfigError(
-                '--tensorboard needs tensorboardX; pip install "eslr-jax[tensorboard]"'
-            ) from error
-        events = SummaryWriter(str(tensorboard / "events"))
+        writer = require("tensorboardX", extra="tensorboard", purpose="--tensorboard").SummaryWriter
+        events = writer(str(tensorboard / "events"))
     columns = (
         TextColumn("training"),
         BarColumn(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,14 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+from eslr_jax.assets.cache import user_cache
 from eslr_jax.assets.catalog import data_folder
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation.excess import measure_excess
 from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
@@ -149,15 +151,15 @@ def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
         pin_targets=None if scene.pin_targets is None else scene.pin_targets[:frames],
         num_frames=frames,
     )
-    runs = {count: with_iterations(config, count) for count in _TIMED_ITERATIONS}
-    best = dict.fromkeys(runs, np.inf)
-    for turn in range(_TURNS + 1):
-        for count, chosen in runs.items():
-            began = time.perf_counter()
-            jax.block_until_ready(simulate_scene(params, short, PhysicsParameters(), chosen))
-            if turn:  # the first compiles
-                best[count] = min(best[count], time.perf_counter() - began)
-    return {count: seconds * 1e3 / (frames - 1) for count, seconds in best.items()}
+    parts = {
+        count: (
+            partial(simulate_scene, config=with_iterations(config, count)),
+            (params, short, PhysicsParameters()),
+        )
+        for count in _TIMED_ITERATIONS
+    }
+    times = time_in_turns(parts, _TURNS)
+    return {count: min(values) / (frames - 1) for count, values in times.items()}
 
 
 def with_iterations(config: SimConfig, iterations: int, tolerance: float = 0.0) -> SimConfig:
@@ -267,9 +269,8 @@ def device_name() -> str:
 
 def cache_path() -> Path:
     """Return the file in which this device's own calibration is kept."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax"
     name = "".join(letter if letter.isalnum() else "-" for letter in device_name().lower())
-    return cache / f"calibration-{name}.json"
+    return user_cache() / f"calibration-{name}.json"
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:

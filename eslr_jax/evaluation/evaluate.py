@@ -16,8 +16,7 @@ from eslr_jax.errors import ConfigError, MissingExtraError
 from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.referee import Referee
-from eslr_jax.geometry.padding import pad_garment, stacking_bucket
-from eslr_jax.geometry.prepare import to_device
+from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene, shared_surface
 from eslr_jax.simulate.scan import simulate_scene
@@ -107,17 +106,17 @@ def evaluate(
 
 def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> list[Garment]:
     """Load garments padded to one bucket: all scenes then share one compiled rollout."""
-    cloths = [
-        load_garment(
-            name,
-            vertices=vertices,  # type: ignore[arg-type]
-            embedding_size=model.embedding_size,
-            embedding_mode=model.embedding_mode,
-        )
-        for name in names
-    ]
-    bucket = stacking_bucket(cloths)
-    return [to_device(pad_garment(cloth, bucket)) for cloth in cloths]
+    return pad_alike(
+        [
+            load_garment(
+                name,
+                vertices=vertices,  # type: ignore[arg-type]
+                embedding_size=model.embedding_size,
+                embedding_mode=model.embedding_mode,
+            )
+            for name in names
+        ]
+    )
 
 
 def split_clips(split: str) -> tuple[str, ...]:

@@ -6,14 +6,13 @@ Nothing here shares code with the simulator's own contact search.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from eslr_jax.errors import MissingExtraError
+from eslr_jax.extras import require
 
 _CONSERVATIVE = 0.99  # share of the way to the contact at which continuous collision stops
 _DEFAULT_REACH = 0.02  # [m] within which minimum distances are looked for
@@ -51,7 +50,7 @@ class Referee:
         Raises:
             MissingExtraError: The IPC Toolkit is not installed.
         """
-        self._ipctk: ModuleType = _toolkit()
+        self._ipctk: ModuleType = require("ipctk", extra="dev", purpose="the referee")
         self._num_cloth = num_cloth_vertices
         self._num_body = num_body_vertices if body_faces is not None else 0
         faces = np.asarray(cloth_faces, np.int32)
@@ -224,17 +223,3 @@ def _faces_of_edges(edges: np.ndarray, faces: np.ndarray) -> Int[np.ndarray, "ed
     is_shared = (first + 1 < len(keys)) & (keys[order][second] == wanted)
     beside[is_shared, 1] = order[second[is_shared]] % len(faces)
     return beside
-
-
-def _toolkit() -> ModuleType:
-    """Import the IPC Toolkit.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
-    try:
-        return importlib.import_module("ipctk")
-    except ImportError as error:
-        raise MissingExtraError(
-            'the referee needs ipctk, which is not installed: pip install "eslr-jax[dev]"'
-        ) from error

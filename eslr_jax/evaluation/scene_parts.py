@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from eslr_jax.simulate.scan import frame_inputs
 from eslr_jax.simulate.step import frame_problem, solve, step
 from eslr_jax.types import BodyMotion, Scene
 
+Name = TypeVar("Name", str, int)
 _TURNS = 15  # timings of every part, in turns; medians count
 _ITERATIONS = 20  # of the solver's part
 
@@ -130,12 +131,17 @@ def take_turns(parts: dict[str, tuple[Callable, tuple]], turns: int = _TURNS) ->
         parts: Functions with their arguments.
         turns: Calls of each.
     """
+    return {name: float(np.median(values)) for name, values in time_in_turns(parts, turns).items()}
+
+
+def time_in_turns(parts: dict[Name, tuple[Callable, tuple]], turns: int) -> dict[Name, list[float]]:
+    """Return the milliseconds of every call of jitted functions that are called in turns; see `take_turns`."""
     compiled = {name: jax.jit(function) for name, (function, _) in parts.items()}
-    times: dict[str, list[float]] = {name: [] for name in parts}
+    times: dict[Name, list[float]] = {name: [] for name in parts}
     for turn in range(turns + 1):
         for name, (_, arguments) in parts.items():
             began = time.perf_counter()
             jax.block_until_ready(compiled[name](*arguments))
             if turn:  # the first compiles
                 times[name].append((time.perf_counter() - began) * 1e3)
-    return {name: float(np.median(values)) for name, values in times.items()}
+    return times

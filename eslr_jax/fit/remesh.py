@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.errors import ConfigError, MeshError, MissingExtraError
+from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax.extras import require
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.repair import consistent_orientation
 from eslr_jax.geometry.topology import boundary_loops, face_areas, face_cross_products
@@ -39,13 +40,7 @@ def remesh(
             f"edge length {edge_length:g} m gives {count} vertices over {area:.2f} m^2; choose one for "
             f"{_MIN_VERTICES} to {_MAX_VERTICES}"
         )
-    try:
-        import pyacvd  # pyright: ignore[reportMissingImports]
-        import pyvista  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise MissingExtraError(
-            'remeshing needs pyacvd, which is not installed: pip install "eslr-jax[remesh]"'
-        ) from error
+    pyacvd, pyvista = (require(name, extra="remesh", purpose="remeshing") for name in ("pyacvd", "pyvista"))
     source = pyvista.PolyData.from_regular_faces(positions, faces)
     with warnings.catch_warnings():  # pyacvd 0.4 reads an attribute that pyvista 0.49 deprecates
         warnings.simplefilter("ignore")

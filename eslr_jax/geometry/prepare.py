@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
-from eslr_jax.geometry.padding import pad_garment
+from eslr_jax.geometry.padding import Bucket, pad_garment, stacking_bucket
 from eslr_jax.geometry.validate import validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 
@@ -101,6 +102,17 @@ def prepare_garment(
     )
     garment = Garment(**leaves)  # NumPy leaves, until the padding is done
     return to_device(pad_garment(garment) if pad else garment)
+
+
+def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list[Garment]:
+    """Pad garments to one bucket, so that they share compiled functions and can be stacked.
+
+    Args:
+        garments: Unpadded garments.
+        bucket: Sizes to reach; by default the smallest that holds all.
+    """
+    bucket = bucket or stacking_bucket(list(garments))
+    return [to_device(pad_garment(garment, bucket)) for garment in garments]
 
 
 def to_device(garment: Garment) -> Garment:

@@ -18,6 +18,7 @@ from trimesh.exchange.stl import load_stl
 
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.parsing import parsing
 
 POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an archive, first match
 MAX_FILE_BYTES = 1 << 30  # of a mesh; no garment comes near
@@ -59,27 +60,11 @@ def read_mesh_file(path: str | Path) -> MeshFile:
     if suffix not in _READERS:
         known = ", ".join(_READERS)
         raise AssetError(f"mesh file {path} has the unknown suffix {suffix!r}; convert it to one of {known}")
-    if not path.is_file():
-        cause = "is a folder" if path.is_dir() else "doesn't exist"
-        raise AssetError(f"mesh file {path} {cause}; check the path")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise AssetError(
-            f"mesh file {path} is larger than {MAX_FILE_BYTES >> 20} MiB; export less of the scene"
-        )
-    try:
+    with parsing(path, "mesh", max_bytes=MAX_FILE_BYTES):
         mesh = _READERS[suffix](path)
         return dataclasses.replace(
             mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
         )
-    except (AssetError, MeshError):
-        raise
-    except OSError as error:
-        raise AssetError(
-            f"mesh file {path} can't be read: {error.strerror or error}; check the path"
-        ) from error
-    except Exception as error:  # a parser may raise anything on a damaged file
-        reason = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
-        raise AssetError(f"mesh file {path} can't be read ({reason}); export it again") from error
 
 
 def _read_obj(path: Path) -> MeshFile:

@@ -17,6 +17,7 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.parsing import one_line
 
 # What the standard library and NumPy raise from the bytes of a damaged archive.
 _DAMAGE = (
@@ -93,7 +94,7 @@ def _readable(path: str | Path, content: str) -> Iterator[None]:
         reason = (error.strerror or str(error)).lower()
         raise AssetError(f"{content} file {path} can't be read: {reason}; check the path") from error
     except _DAMAGE as error:
-        raise AssetError(f"{content} file {path} is damaged ({_one_line(error)}); write it again") from error
+        raise AssetError(f"{content} file {path} is damaged ({one_line(error)}); write it again") from error
 
 
 def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
@@ -116,8 +117,3 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     else:
         shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
     return shape, dtype
-
-
-def _one_line(error: BaseException) -> str:
-    """The first line of an error's text, or its type when it has none."""
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -12,13 +12,22 @@ MAX_FILE_BYTES = 2 << 30  # larger files are refused before they are read
 
 
 @contextlib.contextmanager
-def parsing(path: str | Path, content: str, *, max_bytes: int = MAX_FILE_BYTES) -> Iterator[Path]:
+def parsing(
+    path: str | Path,
+    content: str,
+    *,
+    max_bytes: int = MAX_FILE_BYTES,
+    form: str = "",
+    remedy: str = "export it again",
+) -> Iterator[Path]:
     """Check that a file is there, and turn whatever its parser raises into one named error.
 
     Args:
         path: The file.
         content: What the file should be, for messages, e.g. "motion".
         max_bytes: Largest file accepted [bytes].
+        form: What it can't be read as, where its suffix does not say so, e.g. " as a pickle".
+        remedy: What to do about a damaged file.
 
     Yields:
         The path.
@@ -41,7 +50,7 @@ def parsing(path: str | Path, content: str, *, max_bytes: int = MAX_FILE_BYTES) 
         raise AssetError(f"{content} file {file} can't be read: {reason}; check the path") from error
     except Exception as error:  # a parser may raise anything on a damaged file
         raise AssetError(
-            f"{content} file {file} can't be read ({one_line(error)}); export it again"
+            f"{content} file {file} can't be read{form} ({one_line(error)}); {remedy}"
         ) from error
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from eslr_jax.errors import AssetError
+from eslr_jax.io.parsing import parsing
 
 _DTYPE_KINDS = "biufcSUO"
 _PLAIN = (str, bytes, int, float, complex, bool, type(None))
@@ -167,23 +167,10 @@ def read_pickle(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> 
     Raises:
         AssetError: The file is missing, damaged, too large, or holds anything else.
     """
-    path = Path(path)
-    if not path.is_file():
-        cause = "is a folder" if path.is_dir() else "doesn't exist"
-        raise AssetError(f"{content} file {path} {cause}; check the path")
-    if path.stat().st_size > max_bytes:
-        raise AssetError(f"{content} file {path} is larger than {max_bytes} bytes; check the file")
-    try:
-        data = path.read_bytes()
+    with parsing(path, content, max_bytes=max_bytes, form=" as a pickle", remedy="write it again") as file:
+        data = file.read_bytes()
         _check_memo(data)
         return _Resolver().resolve(_Unpickler(io.BytesIO(data), encoding="latin1").load())
-    except OSError as error:
-        raise AssetError(f"{content} file {path} can't be read: {error.strerror}; check the path") from error
-    except Exception as error:  # a damaged pickle may raise anything
-        reason = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
-        raise AssetError(
-            f"{content} file {path} can't be read as a pickle ({reason}); write it again"
-        ) from error
 
 
 def _check_memo(data: bytes) -> None:

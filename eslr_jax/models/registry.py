@@ -209,7 +209,7 @@ def check_params(config: ModelConfig, params: Params) -> None:
     Raises:
         CheckpointError: A weight is missing, unknown, or of another shape.
     """
-    expected = _shapes(init_model(config))
+    expected = _shapes(jax.eval_shape(lambda: init_model(config)))  # nothing is compiled or computed
     given = _shapes(params)
     for name in sorted(expected.keys() | given.keys()):
         if expected.get(name) != given.get(name):
@@ -222,7 +222,7 @@ def check_params(config: ModelConfig, params: Params) -> None:
 def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
     """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(params)
-    return {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
+    return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
 
 
 def _variables(params: Params) -> Params:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError
+from eslr_jax.extras import require
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.render.extras import require
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
+from eslr_jax.extras import require
 from eslr_jax.render.camera import Camera, parse_angle, place_camera
-from eslr_jax.render.extras import require
 from eslr_jax.render.scene import Surface, trace_picture
 
 GARMENT_COLOR = (0.30, 0.50, 0.70)  # sRGB

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from eslr_jax.extras import require
 from eslr_jax.io.color import linear_to_srgb, srgb_to_linear
 from eslr_jax.render.camera import Camera
 from eslr_jax.render.denoise import smooth_grain
-from eslr_jax.render.extras import require
 
 _VARIANT = "scalar_rgb"
 # Direct light only: at equal time a third of the noise of a path tracer, and folds keep their contrast.

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
-from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.inputs import GraphInputs, next_pass
 from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
 from eslr_jax.numerics import safe_norm
@@ -90,7 +89,7 @@ def correction_passes(
         guess=guess, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
     )
     encoded = encode_frame(config, params, graph, garment)
-    longest = mean_edge_length(garment)
+    longest = graph.globals["edge_length"]
 
     def one_pass(carry: GraphInputs, _):
         gradient = jax.grad(potential)(carry.guess, problem, garment, material)

@@ -12,6 +12,7 @@ import orbax.checkpoint as ocp
 from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.parsing import one_line
 from eslr_jax.training.step import TrainState
 
 FORMAT = 1
@@ -44,7 +45,7 @@ class Checkpoints:
         try:
             self._manager.wait_until_finished()
         except (OSError, ValueError) as error:
-            text = str(error).splitlines()[0]
+            text = one_line(error)
             raise CheckpointError(
                 f"a checkpoint could not be written: {text}; free some space and resume"
             ) from error
@@ -69,7 +70,7 @@ class Checkpoints:
         try:
             plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
         except (ValueError, KeyError, TypeError) as error:
-            text = str(error).splitlines()[0]
+            text = one_line(error)
             raise CheckpointError(
                 f"checkpoint {step} is for another run: {text}; choose another --out"
             ) from error

@@ -14,8 +14,7 @@ from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.geometry.padding import pad_garment, stacking_bucket
-from eslr_jax.geometry.prepare import to_device
+from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene import shared_surface
 from eslr_jax.types import BodySurface, Garment
 
@@ -80,10 +79,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     body = load_body()
     options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    bucket = stacking_bucket(garments)
-    stacked = jax.tree.map(
-        lambda *leaves: jnp.stack(leaves), *[to_device(pad_garment(garment, bucket)) for garment in garments]
-    )
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
     surface = shared_surface(garments, body)
     motions = [load_motion(clip) for clip in clips_of(config.split)]
     rotations, translations, frames_left = _join_clips(motions)

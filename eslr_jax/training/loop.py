@@ -61,7 +61,7 @@ def train(
     steps = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.iteration)
-    metrics_file = out / "metrics.jsonl" if _is_first_process() else Path(os.devnull)
+    metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
     with metrics_file.open("a") as log, _stop_requested() as is_stopping:
         for iteration in range(first, config.iterations):
             resolution = iteration % len(steps)
@@ -84,7 +84,7 @@ def train(
                     checkpoints.save(state)
                 break
     checkpoints.close()
-    if int(state.iteration) >= config.iterations and _is_first_process():
+    if int(state.iteration) >= config.iterations and is_first_process():
         export(state, config, out)
     return state
 
@@ -103,16 +103,16 @@ def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
         before = read_run_config(out)
         if before != config:
             raise CheckpointError(f"{out} holds a run with another configuration; resume it with its own")
-    elif _is_first_process() and (out / "config.json").exists():
+    elif is_first_process() and (out / "config.json").exists():
         raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
-    if _is_first_process() and not resume:
+    if is_first_process() and not resume:
         write_run_config(out, config)
     return Checkpoints(out)
 
 
 def _forget_after(metrics: Path, iteration: int) -> None:
     """Drop the records of iterations that a killed run did after its last checkpoint: they come again."""
-    if not _is_first_process() or not metrics.exists():
+    if not is_first_process() or not metrics.exists():
         return
     lines = metrics.read_text().splitlines()
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["iteration"] <= iteration]
@@ -120,7 +120,7 @@ def _forget_after(metrics: Path, iteration: int) -> None:
         temporary.write_text("".join(line + "\n" for line in kept))
 
 
-def _is_first_process() -> bool:
+def is_first_process() -> bool:
     """Return whether this process writes what all processes share."""
     return jax.process_index() == 0
 

@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-from eslr_jax.body.motion import pose_body, skin_garment
+from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
-from eslr_jax.geometry.padding import pad_garment, stacking_bucket
-from eslr_jax.geometry.prepare import to_device
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.hood import HoodParameters, hood_metrics
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scene, shared_surface
+from eslr_jax.scene import prepare_scenes
 from eslr_jax.simulate.scan import simulate_scene
 from eslr_jax.types import Scene, Trajectory
 
@@ -82,15 +80,12 @@ def table(
         params, config, options = simulator(model)
         cloths = [load_garment(name, vertices=vertices, **(options | garment_options)) for name in garments]  # type: ignore[arg-type]
         # One size and one body surface for all: one compilation per model.
-        bucket = stacking_bucket(cloths)
-        cloths = [to_device(pad_garment(cloth, bucket)) for cloth in cloths]
-        surface = shared_surface(cloths, body)
+        scenes = iter(prepare_scenes([cloth for cloth in cloths for _ in motions], motions * len(cloths)))
         measured[model] = {}
-        for garment, cloth in zip(garments, cloths, strict=True):
+        for garment in garments:
             rows = []
             for poses in motions:
-                scene = prepare_scene(cloth, poses, surface=surface)
-                scene = scene.replace(pin_targets=skin_garment(cloth, poses.joint_transforms))
+                scene = next(scenes)
                 trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
                 root = poses.joint_transforms[0, 0] @ np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
                 rows.append(measure(trajectory, scene, float(root[1])))

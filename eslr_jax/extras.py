@@ -8,12 +8,13 @@ from types import ModuleType
 from eslr_jax.errors import MissingExtraError
 
 
-def require(module: str, *, extra: str = "render") -> ModuleType:
+def require(module: str, *, extra: str = "render", purpose: str = "this") -> ModuleType:
     """Import an optional package.
 
     Args:
         module: Module name, e.g. "mitsuba".
         extra: The extra of this project that installs it.
+        purpose: What it is for, as the message begins.
 
     Returns:
         The module.
@@ -26,5 +27,5 @@ def require(module: str, *, extra: str = "render") -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         raise MissingExtraError(
-            f'this needs {package}, which is not installed: pip install "eslr-jax[{extra}]"'
+            f'{purpose} needs {package}, which is not installed: pip install "eslr-jax[{extra}]"'
         ) from error
