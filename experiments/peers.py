@@ -1,0 +1,384 @@
+"""Other simulators beside ours, same scenes, same run: Newton's VBD, Style3D and XPBD (extra `peers`).
+
+    python experiments/peers.py                          # T-shirt at 1k and 4k, 60 frames
+    python experiments/peers.py --scenes ball_1k tshirt_4k --frames 46
+    python experiments/peers.py --smoke --out DIR
+
+All methods step the same frame one after the other, then all the next one, so that whatever disturbs the machine
+disturbs all; times are medians over frames, kernels compiled and first frames run before. `frame_cpu_ms` counts
+processor time: Newton uses one core, ours all that it gets, so give the process one core to compare them
+(`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The excess is
+teacher-forced: one frame from states of our near-optimal rollout, potential of our definition minus its minimum,
+over the frame's drop. A method with substeps solves a finer problem than that; the row of our own solver with
+substeps shows what this alone costs.
+
+Without Newton only our rows are there. Writes peers.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.metadata
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from newton_cloth import NewtonCloth, Setting
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.errors import MissingExtraError
+from eslr_jax.evaluation.calibrate import device_name, example_scene
+from eslr_jax.evaluation.excess import measure_excess, trajectory_states
+from eslr_jax.evaluation.hard_cases.body import drop_scene
+from eslr_jax.evaluation.hard_cases.simulators import split_frames
+from eslr_jax.evaluation.referee import Referee
+from eslr_jax.evaluation.report import environment
+from eslr_jax.extras import require
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.simulate.scan import frame_inputs, simulate_scene
+from eslr_jax.simulate.step import frame_problem, step
+from eslr_jax.types import ClothState, Scene, Trajectory
+
+RESULTS = Path(__file__).parent / "results"
+CLIP = "cmu_016_32"  # of the test split
+SETTINGS = (
+    Setting("vbd", 1, 20),
+    Setting("vbd", 5, 5),
+    Setting("vbd", 5, 10),
+    Setting("vbd", 5, 20),
+    Setting("style3d", 1, 20),
+    Setting("style3d", 2, 5),
+    Setting("style3d", 2, 10),
+    Setting("style3d", 2, 20),
+    Setting("xpbd", None, 1),
+)
+SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
+OURS = ((1, 10), (1, 20), (1, 50), (1, 100), (5, 50))  # substeps, iterations of L-BFGS
+EVERY = 6  # frames between those whose excess is measured
+TIMED_FRAMES = 20  # of `peer_points`
+
+Step = Callable[[ClothState, int], ClothState]  # from a state at a frame to the next
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A way to step one scene."""
+
+    name: str
+    substeps: int
+    iterations: int  # per substep
+    step: Step
+
+    @property
+    def effort(self) -> str:
+        """Substeps times iterations, as tables show them."""
+        return f"{self.substeps}x{self.iterations}"
+
+
+def our_method(scene: Scene, substeps: int, iterations: int) -> Method:
+    """Return our solver on a scene."""
+    config = SimConfig(simulator="physics", solver_iterations=iterations)
+    fine = split_frames(scene, substeps)
+    inputs, constant = frame_inputs(fine), dataclasses.replace(fine, body_positions=None, pin_targets=None)
+
+    @jax.jit
+    def advance(scene: Scene, state: ClothState, inputs) -> ClothState:
+        def one(state, frame):
+            problem = frame_problem(
+                scene.garment, state, frame, scene.surface, scene.timestep, PhysicsParameters()
+            )
+            return step(None, scene.garment, scene.material, problem, state, config)[0], None
+
+        return jax.lax.scan(one, state, inputs)[0]
+
+    def run(state: ClothState, frame: int) -> ClothState:
+        rows = slice(frame * substeps, (frame + 1) * substeps)
+        return advance(constant, state, jax.tree.map(lambda leaf: leaf[rows], inputs))
+
+    return Method("ours", substeps, iterations, run)
+
+
+def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
+    """Return Newton's solvers on a scene; none, and a line that says what to install, without Newton."""
+    try:
+        require("newton", extra="peers", purpose="the comparison with other simulators")
+    except MissingExtraError as error:
+        print(f"peers left out: {error}", file=sys.stderr)
+        return []
+    cloths = [(setting, NewtonCloth(scene, setting)) for setting in settings]
+    return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
+
+
+def make_scene(name: str, num_frames: int) -> Scene:
+    """Return a scene by name: a garment on the clip, or the sheet dropped on a ball, and its resolution."""
+    what, size = name.split("_")
+    if what == "ball":
+        return drop_scene({}, columns={"1k": 33, "4k": 65}[size], seconds=(num_frames - 1) / 30).scene
+    return example_scene(what, size, CLIP, num_frames)
+
+
+def take_turns(
+    methods: list[Method], scene: Scene, num_frames: int
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Roll all methods out, frame by frame in turns.
+
+    Args:
+        methods: On the scene.
+        scene: The scene.
+        num_frames: The start included.
+
+    Returns:
+        Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
+    """
+    for method in methods:  # compiles
+        jax.block_until_ready(method.step(scene.start, 0))
+    states = [scene.start] * len(methods)
+    positions = [[np.asarray(scene.start.position)] for _ in methods]
+    wall, processor = [[] for _ in methods], [[] for _ in methods]
+    for frame in range(num_frames - 1):
+        for k, method in enumerate(methods):
+            began, began_processor = time.perf_counter(), time.process_time()
+            states[k] = jax.block_until_ready(method.step(states[k], frame))
+            wall[k].append(1e3 * (time.perf_counter() - began))
+            processor[k].append(1e3 * (time.process_time() - began_processor))
+            positions[k].append(np.asarray(states[k].position))
+    return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
+
+
+@jax.jit
+def _potentials(answers, states, inputs, scene: Scene):
+    """Return the potential [J] of every answer to the frame that starts in the state beside it."""
+
+    def measure(frame):
+        answer, state, inputs = frame
+        problem = frame_problem(
+            scene.garment, state, inputs, scene.surface, scene.timestep, PhysicsParameters()
+        )
+        return potential(answer, problem, scene.garment, scene.material)
+
+    return jax.lax.map(measure, (answers, states, inputs))
+
+
+def teach(
+    methods: list[Method], scene: Scene, truth: Trajectory, every: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the excess [J] of one frame of every method from some states of a rollout, and the frames' drops.
+
+    Args:
+        methods: On the scene.
+        scene: The scene.
+        truth: Its near-optimal rollout.
+        every: Frames between the states.
+    """
+    parameters = PhysicsParameters()
+    config = SimConfig(simulator="physics")
+    ends = jax.device_get(
+        measure_excess(None, truth, scene, parameters, config, every=every, iterations=(), corrector_steps=())
+    )
+    states, inputs = trajectory_states(truth, scene, parameters)
+    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
+    frames = range(1, scene.num_frames - 1, every)
+    excess = []
+    for method in methods:
+        answers = [
+            method.step(jax.tree.map(lambda leaf, f=frame: leaf[f], states), frame).position
+            for frame in frames
+        ]
+        excess.append(np.asarray(_potentials(jnp.stack(answers), *taken, scene)) - ends.optimum)
+    return excess, np.maximum(ends.start - ends.optimum, 1e-9)
+
+
+@jax.jit
+def _shapes(positions, scene: Scene):
+    """Return largest principal stretches of every frame and face, and distances [m] of every frame and vertex."""
+
+    def measure(frame):
+        position, body = frame
+        stretch = principal_stretches(position, scene.garment)[0]
+        if body is None:
+            return stretch, None
+        return stretch, find_contacts(position, body, body, scene.surface).distances
+
+    return jax.lax.map(measure, (positions, scene.body_positions))
+
+
+def count_intersections(position: np.ndarray, scene: Scene) -> dict[str, int | None]:
+    """Return the pairs of triangles that intersect in the last frame; None without the referee's package."""
+    names = ("intersections_cloth", "intersections_body")
+    is_face = np.asarray(scene.garment.rest_areas) > 0
+    faces, body, body_faces = np.asarray(scene.garment.faces)[is_face], None, None
+    if scene.surface is not None:
+        body, body_faces = np.asarray(scene.body_positions)[-1], np.asarray(scene.surface.faces)
+    try:
+        referee = Referee(faces, len(position), body_faces, 0 if body is None else len(body))
+    except MissingExtraError:
+        return dict.fromkeys(names)
+    verdict = referee.judge(position, body)
+    return dict(zip(names, (verdict.cloth_cloth, verdict.cloth_body), strict=True))
+
+
+def describe_rollout(positions: np.ndarray, scene: Scene) -> dict[str, Any]:
+    """Return the measures of a free rollout; None where it did not stay finite."""
+    is_finite = bool(np.isfinite(positions).all())
+    row: dict[str, Any] = {"finite": is_finite, "stretch_p99": None, "penetration_p999_mm": None}
+    if not is_finite:
+        return row
+    stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
+    is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
+    row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))
+    if distances is not None:
+        row["penetration_p999_mm"] = float(max(np.quantile(-distances[1:, is_vertex], 0.999), 0.0) * 1e3)
+    return row | count_intersections(positions[-1], scene)
+
+
+def measure_scene(scene: Scene, settings: tuple[Setting, ...], every: int) -> list[dict[str, Any]]:
+    """Return a row of plain values per method."""
+    methods = [our_method(scene, *effort) for effort in OURS] + newton_methods(scene, settings)
+    truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
+    positions, wall, processor = take_turns(methods, scene, scene.num_frames)
+    excess, drop = teach(methods, scene, truth, every)
+    return [
+        {
+            "method": method.name,
+            "effort": method.effort,
+            "frame_ms": float(np.median(wall[k])),
+            "frame_cpu_ms": float(np.median(processor[k])),
+            **describe_rollout(positions[k], scene),
+            **summarize_excess(excess[k], drop),
+        }
+        for k, method in enumerate(methods)
+    ]
+
+
+def summarize_excess(excess: np.ndarray, drop: np.ndarray) -> dict[str, float | None]:
+    """Return medians and largest values; None where an answer was not finite."""
+    excess = np.maximum(excess, 0.0)
+    values = {
+        "excess_relative_median": np.median(excess / drop),
+        "excess_relative_max": np.max(excess / drop),
+        "excess_j_median": np.median(excess),
+    }
+    return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+
+
+def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str, list[dict[str, Any]]]:
+    """Return what every peer takes and leaves, in the form of `speed_vs_error`; empty without Newton.
+
+    Args:
+        scenes: Of one size; the first is timed.
+        settings: Of Newton's solvers.
+    """
+    methods, relative = [newton_methods(scenes[0], settings)], []
+    if not methods[0]:
+        return {}
+    methods += [newton_methods(scene, settings) for scene in scenes[1:]]
+    _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
+    for scene, of_scene in zip(scenes, methods, strict=True):
+        truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
+        excess, drop = teach(of_scene, scene, truth, EVERY)
+        relative.append([np.maximum(values, 0.0) / drop for values in excess])
+    points: dict[str, list[dict[str, Any]]] = {}
+    for k, method in enumerate(methods[0]):
+        shares = np.concatenate([values[k] for values in relative])
+        if np.isfinite(shares).all():
+            points.setdefault(method.name, []).append(
+                {
+                    "iterations": method.effort,
+                    "frame_ms": float(np.median(wall[k])),
+                    "excess_relative_median": float(np.median(shares)),
+                    "excess_relative_p99": float(np.quantile(shares, 0.99)),
+                }
+            )
+    return points
+
+
+COLUMNS = {
+    "method": "method",
+    "effort": "substeps x iterations",
+    "frame_ms": "ms a frame",
+    "frame_cpu_ms": "CPU ms",
+    "excess_relative_median": "excess, median [%]",
+    "stretch_p99": "stretch, 99 %",
+    "penetration_p999_mm": "penetration, 99.9 % [mm]",
+    "intersections_body": "pairs with the body",
+    "intersections_cloth": "pairs of cloth",
+}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return rows as a Markdown table."""
+
+    def cell(name: str, value: Any) -> str:
+        if value is None:
+            return "-"
+        if not isinstance(value, float):
+            return str(value)
+        scaled = 100 * value if name == "excess_relative_median" else value
+        return f"{scaled:.3g}" if abs(scaled) < 1e3 else f"{scaled:.0f}"
+
+    lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]
+    lines += [[cell(name, row.get(name)) for name in COLUMNS] for row in rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def peer_versions() -> dict[str, str]:
+    """Return the versions of the peers' packages that are installed."""
+    versions = {}
+    for package in ("newton", "warp-lang", "ipctk"):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k"])
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
+    arguments = parser.parse_args()
+    settings = SETTINGS
+    if arguments.smoke:
+        arguments.scenes, arguments.frames = ["tshirt_1k"], 8
+        settings = SMOKE_SETTINGS
+    result: dict[str, Any] = {"scenes": {}}
+    for name in arguments.scenes:
+        rows = measure_scene(make_scene(name, arguments.frames), settings, EVERY)
+        result["scenes"][name] = rows
+        print(f"\n{name}\n\n{table(rows)}", flush=True)
+        jax.clear_caches()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    result |= {
+        "clip": CLIP,
+        "frames": arguments.frames,
+        "processor": device_name(),
+        "cores": cores,
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "date": time.strftime("%Y-%m-%d"),
+        **environment(),
+    }
+    result["versions"] |= peer_versions()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(arguments.out / "peers.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
