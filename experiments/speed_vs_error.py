@@ -1,11 +1,13 @@
 """Speed against error: excess over the optimum against time per frame, for the solver, networks and both.
 
     python experiments/speed_vs_error.py                 # 1k and 4k, about twenty minutes on two cores
+    python experiments/speed_vs_error.py --peers         # with Newton's solvers, which the extra `peers` installs
     python experiments/speed_vs_error.py --smoke --out DIR
 
 Every method starts from the same states, those of the near-optimal rollout on a test clip, so errors are
 teacher-forced. A method's time is a fixed part (contacts, network) and a part per L-BFGS iteration, measured in
-turns. Free rollouts follow for a few settings. Writes speed_vs_error.json and .png.
+turns. Free rollouts follow for a few settings. What the peers are and how they are measured: `peers.py`.
+Writes speed_vs_error.json and .png.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from peers import SETTINGS, SMOKE_SETTINGS, peer_points, peer_versions
 
 from eslr_jax.assets import asset_names, load_model
 from eslr_jax.config import SimConfig
@@ -69,9 +72,8 @@ def free_rollouts(model: str | None, garment: str, size: str, num_frames: int) -
     return reports
 
 
-def who_wins(methods: list[Method]) -> list[dict]:
-    """Return, for a range of budgets, the best excess of the solver and of the best network with corrector."""
-    by_name = {method.name: points(method) for method in methods}
+def who_wins(by_name: dict[str, list[dict]]) -> list[dict]:
+    """Return, for a range of budgets, the best excess of every method's points."""
     least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
     most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
     rows = []
@@ -94,12 +96,12 @@ def draw(result: dict, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    sizes = list(result["sizes"])
+    sizes, peers = list(result["sizes"]), result["peers"]
     figure, axes = plt.subplots(1, len(sizes), figsize=(5.2 * len(sizes), 4.2), sharey=True, squeeze=False)
     for axis, size in zip(axes[0], sizes, strict=True):
         for name, entries in result["sizes"][size]["methods"].items():
             shown = [entry for entry in entries if entry["excess_relative_median"] > 1e-6]
-            label = "L-BFGS" if name == SOLVER else f"{name} + L-BFGS"
+            label = "L-BFGS" if name == SOLVER else name if name in peers else f"{name} + L-BFGS"
             times, errors = (
                 [entry[key] for entry in shown] for key in ("frame_ms", "excess_relative_median")
             )
@@ -130,13 +132,14 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
     parser.add_argument("--models", nargs="*", default=list(asset_names("model")))
     parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
     arguments = parser.parse_args()
-    garments, frames, rollout_frames = GARMENTS, 60, 100
+    garments, frames, rollout_frames, settings = GARMENTS, 60, 100, SETTINGS
     if arguments.smoke:
-        garments, frames, rollout_frames = GARMENTS[:1], 8, 6
+        garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 6, SMOKE_SETTINGS
         arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
-    result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "sizes": {}}
+    result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}
     for size in arguments.sizes:
         scenes = [example_scene(garment, size, CLIP, frames) for garment in garments]
         methods = measure_methods((None, *arguments.models), scenes)
@@ -146,8 +149,13 @@ def main() -> None:
             ]
             for name in (None, *arguments.models[:1])
         }
+        measured = {method.name: points(method) for method in methods}
+        if arguments.peers:
+            peers = peer_points(scenes, settings)
+            result["peers"] = list(peers)
+            measured |= peers
         result["sizes"][size] = {
-            "methods": {method.name: points(method) for method in methods},
+            "methods": measured,
             "costs": [
                 {
                     key: value
@@ -156,11 +164,13 @@ def main() -> None:
                 }
                 for method in methods
             ],
-            "budgets": who_wins(methods),
+            "budgets": who_wins(measured),
             "rollouts": rollouts,
         }
         jax.clear_caches()
     result["environment"] = environment()
+    if result["peers"]:
+        result["environment"]["versions"] |= peer_versions()
     arguments.out.mkdir(parents=True, exist_ok=True)
     draw(result, arguments.out / "speed_vs_error.png")
     with atomic_write(arguments.out / "speed_vs_error.json") as temporary:
