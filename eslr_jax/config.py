@@ -37,8 +37,9 @@ class ModelConfig:
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
     features: Literal["hood", "gradient"] = "hood"  # HOOD's inputs, or those plus the potential's gradient
     # An acceleration of the state; a correction of the inertial guess; or a correction with a share of the
-    # preconditioned gradient step and of the last correction, gated per vertex ("descent").
-    output: Literal["acceleration", "correction", "descent"] = "acceleration"
+    # preconditioned gradient step and of the last correction, gated per vertex ("descent"); or the best
+    # combination of these three, which never climbs the potential ("subspace").
+    output: Literal["acceleration", "correction", "descent", "subspace"] = "acceleration"
     output_scale: float = 1.0  # metres per unit of output, for corrections
     passes: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
@@ -69,10 +70,10 @@ class ModelConfig:
             raise ValueError('passes > 1 needs features = "gradient": others are the same in every pass')
         if self.passes > 1 and self.output == "acceleration":
             raise ValueError(
-                'passes > 1 needs output "correction" or "descent": an acceleration has one pass'
+                'passes > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
             )
-        if self.output == "descent" and self.features != "gradient":
-            raise ValueError('output = "descent" needs features = "gradient", which hold the step')
+        if self.output in ("descent", "subspace") and self.features != "gradient":
+            raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +135,8 @@ class TrainConfig:
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
-    pass_weights: Literal["equal", "last"] = "equal"  # energies of which passes count
+    # Energies of which passes count: all, the last one's, or each by the share of its excess that it leaves.
+    pass_weights: Literal["equal", "last", "contraction"] = "equal"
     max_skipped: int = 100  # non-finite updates skipped before training stops
     log_every: int = 100
     checkpoint_every: int = 1000

@@ -36,7 +36,7 @@ from eslr_jax.models.mlp import MLP
 from eslr_jax.types import Garment
 
 CORRECTION_GAIN = 0.02  # a new network then hardly changes the guess that it corrects
-OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5}  # a vector, and two gates
+OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5, "subspace": 5}  # a vector, and two gates
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 Statistics = dict[str, Normalizer]

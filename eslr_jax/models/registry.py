@@ -36,9 +36,9 @@ SMALL = ModelConfig(
     attention_norm=True,
     attention_feedforward=True,
     features="gradient",
-    output="descent",
+    output="subspace",
     output_scale=0.005,
-    passes=6,
+    passes=12,
     remat="none",
 )
 

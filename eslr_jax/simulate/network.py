@@ -17,6 +17,7 @@ from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
 from eslr_jax.physics.problem import FrameProblem, pin, start_guess
+from eslr_jax.physics.subspace import combine_directions
 from eslr_jax.types import ClothState, Garment, Material
 
 
@@ -79,7 +80,7 @@ def correction_passes(
         material: Fabric.
         problem: The frame's problem.
         inputs: Of `graph_inputs`.
-        config: With `output` "correction" or "descent"; static.
+        config: With any `output` but "acceleration"; static.
         detach: Stop gradients between passes, so that each is trained to do its best from where it starts.
     """
     graph = build_frame_graph(garment, material, inputs, config)
@@ -91,13 +92,22 @@ def correction_passes(
     encoded = encode_frame(config, params, graph, garment)
     longest = graph.globals["edge_length"]
 
+    def energy(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
+        return potential(position, problem, garment, material)
+
     def one_pass(carry: GraphInputs, _):
-        gradient = jax.grad(potential)(carry.guess, problem, garment, material)
+        value, gradient = jax.value_and_grad(energy)(carry.guess)
         step = descent_step(problem, garment, material, carry.guess, gradient, longest)
         inputs = carry.replace(gradient=gradient, step=step)
         changing = build_pass_graph(garment, material, inputs, graph)
         output = apply_pass(config, params, encoded, changing, garment)
-        answer = pin(problem, garment, inputs.guess + correct(config, params, output, inputs))
+        move = correct(config, params, output, inputs)
+        if config.output == "subspace":
+            directions = jnp.stack([move, step, inputs.correction])
+            if problem.pin_targets is not None:
+                directions = jnp.where(garment.is_pinned[:, None], 0.0, directions)
+            move = combine_directions(energy, inputs.guess, value, gradient, directions)
+        answer = pin(problem, garment, inputs.guess + move)
         onward = jax.lax.stop_gradient(answer) if detach else answer
         return next_pass(inputs, onward, gradient), answer
 
@@ -128,11 +138,12 @@ def correct(
 ) -> Float[Array, "vertices 3"]:
     """Return the way from the guess to the answer of a pass [m].
 
-    For "descent" the network adds to a preconditioned gradient method with momentum: one gate per vertex
-    scales the step (1 + gate), another the last correction. A new network is plain preconditioned descent.
+    For "descent" and "subspace" the network adds to a preconditioned gradient method with momentum: one gate
+    per vertex scales the step (1 + gate), another the last correction. A new network is plain preconditioned
+    descent.
     """
     correction = scale_output(config, params, output[:, :3])
-    if config.output != "descent":
+    if config.output == "correction":
         return correction
     return correction + (1.0 + output[:, 3:4]) * inputs.step + output[:, 4:5] * inputs.correction
 

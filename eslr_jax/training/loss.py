@@ -17,6 +17,7 @@ from eslr_jax.simulate.network import correction_passes, graph_inputs, predict_a
 from eslr_jax.types import ClothState, Garment, Material
 
 _FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by this
+_MIN_EXCESS = 1e-2  # of a pass, as a share of the first one's: the optimum itself is not known better
 
 
 EnergyTerms = Callable[[Array, FrameProblem, Garment, Material], PotentialTerms]
@@ -59,8 +60,25 @@ def physics_loss(
         answers, _ = correction_passes(params, garment, material, problem, inputs, model, detach=True)
     terms = jax.vmap(terms_of, in_axes=(0, None, None, None))(answers, problem, garment, material)
     energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
-    energy = energies[-1] if config.pass_weights == "last" else jnp.mean(energies)
     scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
     start = sum(terms_of(start_guess(problem, garment), problem, garment, material))
+    if config.pass_weights == "last":
+        loss = energies[-1] / scale
+    elif config.pass_weights == "equal":
+        loss = jnp.mean(energies) / scale
+    else:
+        loss = _mean_contraction(jnp.concatenate([jnp.reshape(start, 1), energies]))
     last = PotentialTerms(*(jnp.broadcast_to(term, answers.shape[:1])[-1] for term in terms))
-    return energy / scale, LossReport(answers[-1], last, start)  # type: ignore[arg-type]
+    return loss, LossReport(answers[-1], last, start)  # type: ignore[arg-type]
+
+
+def _mean_contraction(energies: Float[Array, " passes+1"]) -> Float[Array, ""]:
+    """Return the mean share of a pass's excess that is left after it; the last answer stands for the optimum.
+
+    Early passes move energies of joules, late ones of microjoules: their mean trains the early ones alone.
+    """
+    fixed = jax.lax.stop_gradient(energies)
+    excess = fixed[:-1] - fixed[-1]
+    floor = _MIN_EXCESS * jnp.maximum(excess[0], 0.0)
+    reference = jnp.where(floor > 0, jnp.maximum(excess, floor), 1.0)
+    return jnp.mean((energies[1:] - fixed[-1]) / reference)

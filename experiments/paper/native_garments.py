@@ -2,7 +2,7 @@
 
     python experiments/paper/native_garments.py [--smoke]
 
-All networks were trained with the same recipe, data and number of steps (experiments/configs/eslr-small.toml).
+All networks were trained with the same recipe, data and number of steps (experiments/configs/ablation.toml).
 """
 
 from __future__ import annotations
