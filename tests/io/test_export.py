@@ -11,9 +11,13 @@ import pytest
 import trimesh
 from broken import refuses
 
+from eslr_jax.assets import load_motion
+from eslr_jax.body.motion import pose_body
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
+from eslr_jax.io.gltf_skin import SkinnedMesh
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
 from eslr_jax.io.point_cache import read_mdd, read_pc2, write_mdd, write_pc2
 from eslr_jax.io.trajectory import TrajectoryFile
@@ -157,20 +161,69 @@ def test_npz_comes_back_as_a_mesh_sequence(tmp_path, run):
     assert back.fps == pytest.approx(30.0)
 
 
+BLENDER = os.environ.get("BLENDER_PYTHON")  # of an environment with `bpy`, see CONTRIBUTING.md
+needs_blender = pytest.mark.skipif(BLENDER is None, reason="BLENDER_PYTHON names no Python with bpy")
+Z_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Blender's axes
+
+
+def shown_in_blender(path, frames, vertices=0):
+    """Return the positions and faces of every mesh that Blender shows."""
+    out = path.with_suffix(".seen.npz")
+    worker = Path(__file__).with_name("blender_worker.py")
+    command = [str(BLENDER), str(worker), str(path), str(out), str(frames), str(vertices)]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with np.load(out) as seen:
+        return dict(seen)
+
+
+@needs_blender
 @pytest.mark.slow
-def test_blender_opens_what_is_written(tmp_path, run, garment):
-    bpy = pytest.importorskip("bpy")
-    for name in ("run.usdc", "run.glb"):
-        export_trajectory(run, tmp_path / name, garment=garment, content="garment")
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.usd_import(filepath=str(tmp_path / "run.usdc"))
-    cloth = next(entry for entry in bpy.data.objects if entry.type == "MESH")
+@pytest.mark.parametrize(("suffix", "name"), [("usdc", "My_shirt"), ("glb", "My shirt")])
+def test_blender_shows_every_frame(tmp_path, run, garment, suffix, name):
+    path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
+    seen = shown_in_blender(path, FRAMES)
+    for mesh, positions, faces in (
+        (name, run.positions, run.faces),
+        ("body", run.body_positions, run.body_faces),
+    ):
+        points, corners = seen[f"{mesh}/positions"], seen[f"{mesh}/faces"]
+        for frame in range(FRAMES):
+            expected = corner_points(positions[frame], faces) @ Z_UP
+            np.testing.assert_allclose(corner_points(points[frame], corners), expected, atol=1e-5)
+
+
+@needs_blender
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["pc2", "mdd"])
+def test_blender_lays_point_caches_on_the_mesh(tmp_path, run, garment, suffix):
+    path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
+    seen = shown_in_blender(path, FRAMES, len(garment.vertex_map))
+    np.testing.assert_allclose(seen["cache/positions"], run.positions[:, garment.vertex_map], atol=1e-6)
+
+
+@needs_blender
+@pytest.mark.slow
+def test_blender_bends_the_skinned_body(tmp_path, run, body):
+    poses = pose_body(body, load_motion("jump"), num_frames=FRAMES)
+    skinned = SkinnedMesh(
+        rest_positions=np.asarray(poses.rest_positions),
+        faces=np.asarray(poses.faces),
+        skin_weights=np.asarray(body.skin_weights),
+        skin_indices=np.asarray(body.skin_indices),
+        joint_transforms=np.asarray(poses.joint_transforms),
+        joint_rest_positions=np.asarray(body.joint_rest_positions),
+        parents=body.parents,
+        joint_names=body.joint_names,
+    )
+    cloth = AnimatedMesh("garment", run.positions, run.faces)
+    write_animated_glb(tmp_path / "run.glb", [cloth], STEP, skinned_body=skinned)
+    seen = shown_in_blender(tmp_path / "run.glb", FRAMES)
+    points, corners = seen["body/positions"], seen["body/faces"]
     for frame in range(FRAMES):
-        bpy.context.scene.frame_set(frame)
-        shown = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get())
-        points = np.array([shown.matrix_world @ vertex.co for vertex in shown.data.vertices])
-        expected = run.positions[frame][garment.vertex_map] @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # Z up
-        np.testing.assert_allclose(points, expected, atol=1e-5)
+        expected = corner_points(poses.positions[frame], poses.faces) @ Z_UP
+        np.testing.assert_allclose(corner_points(points[frame], corners), expected, atol=1e-4)
 
 
 def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):
