@@ -25,6 +25,7 @@ _FEET, _SLID = 1.1, 1.25  # origin on the floor between the feet; origin anywher
 _TURNED = 1.3  # facing elsewhere than its up axis makes usual
 _RAISED = 1.05  # arms at another angle than the body's
 _INCHES = 1.1
+_SMALL, _SMALL_SHARE = 1.5, 0.35  # bounding box less than this share of the body's height: a shirt on a head
 _GOOD = (
     1.5  # mean cost of a known place beyond which the garment is moved along the body to look for a better
 )
@@ -87,14 +88,12 @@ def find_placement(
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits.
     """
-    factors = _factors(positions, units, name)
+    factors = _factors(positions, postures[0], units, name)
     sample = _sample(positions, faces)
     tried = []
     for factor, (rotation, axes, is_usual) in itertools.product(factors, _rotations(up, front)):
         turned = factor * sample @ rotation.T
-        base = (1.0 if is_usual else _TURNED) * (
-            _INCHES if factor == UNITS["in"] and units == "auto" else 1.0
-        )
+        base = factors[factor] * (1.0 if is_usual else _TURNED)
         for k, posture in enumerate(postures):
             weight = base * (1.0 if k == 0 else _RAISED)
             for offset, extra in _known_places(posture, keep_place):
@@ -103,7 +102,7 @@ def find_placement(
     best = min(tried, key=lambda item: item[0])[1]
     deep = float(np.mean(postures[best.posture].heights(best.apply(sample)) < -_INSIDE))
     if not keep_place and (best.cost > _GOOD or deep > _LIMBS_INSIDE):
-        best = min([best, *_slide(sample, tried, postures)], key=lambda placement: placement.cost)
+        best = min([best, *_slide(sample, tried, factors, postures)], key=lambda placement: placement.cost)
     misfit = _cost(postures[best.posture].heights(best.apply(sample)))
     if misfit > _MISFIT:
         raise MeshError(
@@ -122,7 +121,10 @@ def _known_places(posture: Posture, keep_place: bool) -> list[tuple[np.ndarray, 
 
 
 def _slide(
-    sample: np.ndarray, tried: list[tuple[float, Placement]], postures: list[Posture]
+    sample: np.ndarray,
+    tried: list[tuple[float, Placement]],
+    factors: dict[float, float],
+    postures: list[Posture],
 ) -> list[Placement]:
     """Move the garment along the body, for each orientation in the two extreme postures; refine the best."""
     orientations = {(p.factor, p.up, p.front): p for _, p in tried}
@@ -131,25 +133,29 @@ def _slide(
     for start in orientations.values():
         turned = start.factor * sample @ start.rotation.T
         low, high = turned.min(axis=0), turned.max(axis=0)
-        usual = _USUAL_FRONT[start.up] == start.front
+        weight = _SLID * factors[start.factor] * _turned(start)
         for k in {0, int(np.argmin(angles))}:
             posture = postures[k]
             floor, top = posture.positions[:, 1].min(), posture.positions[:, 1].max()
             for height in np.arange(floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
                 offset = np.array([-0.5 * (low[0] + high[0]), height, -0.5 * (low[2] + high[2])])
                 offset[2] += _depth_at(posture, low[1] + height, high[1] + height)
-                cost = _SLID * (1.0 if usual else _TURNED) * _cost(posture.heights(turned + offset))
+                cost = weight * _cost(posture.heights(turned + offset))
                 found.append(dataclasses.replace(start, translation=offset, posture=k, cost=cost))
     refined = []
     for start in sorted(found, key=lambda placement: placement.cost)[:3]:
         turned = start.factor * sample @ start.rotation.T
-        usual = _USUAL_FRONT[start.up] == start.front
+        weight = _SLID * factors[start.factor] * _turned(start)
         for k, posture in enumerate(postures):
             offset = _settle(turned, start.translation, posture)
-            weight = _SLID * (1.0 if usual else _TURNED) * (1.0 if k == 0 else _RAISED)
-            cost = weight * _cost(posture.heights(turned + offset))
+            cost = weight * (1.0 if k == 0 else _RAISED) * _cost(posture.heights(turned + offset))
             refined.append(dataclasses.replace(start, translation=offset, posture=k, cost=cost))
     return refined
+
+
+def _turned(placement: Placement) -> float:
+    """Return what facing an unusual way costs."""
+    return 1.0 if _USUAL_FRONT[placement.up] == placement.front else _TURNED
 
 
 def _depth_at(posture: Posture, low: float, high: float) -> float:
@@ -190,21 +196,25 @@ def _sample(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return positions[np.unique(np.concatenate([np.minimum(picked, len(positions) - 1), extremes]))]
 
 
-def _factors(positions: np.ndarray, units: Unit | float, name: str) -> list[float]:
-    """Return the metres per unit to try."""
+def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: str) -> dict[float, float]:
+    """Return the metres per unit to try, each with the factor on its costs."""
     diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
     if units != "auto":
         factor = UNITS[units] if isinstance(units, str) else float(units)
         if not factor > 0 or not np.isfinite(factor):
             raise MeshError(f"{name}: {units} metres per unit; give a positive number")
-        return [factor]
+        return {factor: 1.0}
     factors = [factor for factor in UNITS.values() if _MIN_DIAGONAL <= diagonal * factor <= _MAX_DIAGONAL]
     if not factors:
         raise MeshError(
             f"{name}: bounding-box diagonal {diagonal:.4g} is no garment's in {', '.join(UNITS)}; scale it, or "
             "give the metres per unit"
         )
-    return factors
+    small = _SMALL_SHARE * float(np.ptp(body.positions[:, 1]))
+    return {
+        factor: (_INCHES if factor == UNITS["in"] else 1.0) * (_SMALL if diagonal * factor < small else 1.0)
+        for factor in factors
+    }
 
 
 def _rotations(up: Axis, front: Axis) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
