@@ -6,6 +6,12 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
+from eslr_jax.assets import load_motion
+from eslr_jax.assets.catalog import find_asset
+from eslr_jax.body.rig import body_skeleton, skeleton_motion
+from eslr_jax.io.garment import read_garment_npz
+from eslr_jax.io.mesh_sequence import obj_text
+
 SMPL_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
     "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head",
@@ -317,3 +323,24 @@ def write_bvh(path, motion, *, names=None, unit=1.0, axes=None, order="ZXY"):
     lines += ["MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / motion.fps:.8f}"]
     lines += [" ".join(f"{x:.8f}" for x in row) for row in table]
     path.write_text("\n".join(lines) + "\n")
+
+
+def write_walker(character, shirt, body):
+    """Write the bundled body as a character of Mixamo becomes in Blender, walking, and its T-shirt as OBJ."""
+    motion = skeleton_motion(load_motion(), body)
+    order = np.argsort(-np.asarray(body.skin_weights), axis=1)[:, :4]
+    weights = np.take_along_axis(np.asarray(body.skin_weights, np.float64), order, axis=1)
+    write_character(
+        character,
+        body_skeleton(body),
+        np.asarray(body.rest_positions, np.float64),
+        np.asarray(body.faces),
+        weights / weights.sum(axis=1, keepdims=True),
+        np.take_along_axis(np.asarray(body.skin_indices), order, axis=1),
+        names=[f"mixamorig:{MIXAMO_FROM_CMU.get(name, name)}" for name in body.joint_names],
+        motion=(motion.rotations[:8], motion.positions[:8]),
+        frames=Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix(),
+        fps=motion.fps,
+    )
+    garment = read_garment_npz(find_asset("garment", "tshirt_1k"))
+    shirt.write_text(obj_text("shirt", garment.rest_positions, garment.faces))

@@ -7,17 +7,11 @@ import sys
 
 import numpy as np
 import pytest
-from formats import write_character
-from scipy.spatial.transform import Rotation
+from formats import write_walker
 
 from eslr_jax.assets import load_motion
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.body.rig import body_skeleton, skeleton_motion
-from eslr_jax.io.garment import read_garment_npz
 from eslr_jax.io.mesh_sequence import obj_text
 from eslr_jax.io.trajectory import read_trajectory
-
-MIXAMO = {"LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2"}
 
 
 def eslr(*arguments):
@@ -29,23 +23,7 @@ def eslr(*arguments):
 def avatar(tmp_path_factory, body):
     """A folder with a character as Mixamo's become in Blender, walking, and its shirt."""
     folder = tmp_path_factory.mktemp("avatar")
-    motion = skeleton_motion(load_motion(), body)
-    order = np.argsort(-np.asarray(body.skin_weights), axis=1)[:, :4]
-    weights = np.take_along_axis(np.asarray(body.skin_weights, np.float64), order, axis=1)
-    write_character(
-        folder / "avatar.glb",
-        body_skeleton(body),
-        np.asarray(body.rest_positions, np.float64),
-        np.asarray(body.faces),
-        weights / weights.sum(axis=1, keepdims=True),
-        np.take_along_axis(np.asarray(body.skin_indices), order, axis=1),
-        names=[f"mixamorig:{MIXAMO.get(name, name)}" for name in body.joint_names],
-        motion=(motion.rotations[:8], motion.positions[:8]),
-        frames=Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix(),
-        fps=motion.fps,
-    )
-    shirt = read_garment_npz(find_asset("garment", "tshirt_1k"))
-    (folder / "shirt.obj").write_text(obj_text("shirt", shirt.rest_positions, shirt.faces))
+    write_walker(folder / "avatar.glb", folder / "shirt.obj", body)
     return folder
 
 

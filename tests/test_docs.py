@@ -5,11 +5,14 @@ import io
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
+from formats import write_walker
 from garment_files import scanned_tshirt
 
 ROOT = Path(__file__).parents[1]
@@ -20,7 +23,8 @@ SHORTER = {
     "evaluate": ["--excess-frames", "2", "--every", "1", "--rollout-frames", "4", "--garments", "tshirt"],
     "simulate": ["--frames", "3"],
 }
-# ```console blocks need what a test has not (a browser's user, an hour, a licence): their options are checked.
+# ```console blocks need what a test has not (a network, minutes of an idle machine, several machines): their
+# options are checked, and `eslr view` is opened and closed.
 
 
 def blocks(page, language):
@@ -38,6 +42,7 @@ def commands(page, *languages):
 
 EVERY = [(page, words) for page in PAGES for words in commands(page, "bash", "console")]
 RUN = [(page, words) for page in PAGES for words in commands(page, "bash")]
+VIEWS = [(page, words) for page in PAGES for words in commands(page, "console") if words[1] == "view"]
 
 
 def name(value):
@@ -91,10 +96,12 @@ def test_links_between_pages_lead_somewhere():
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory, body):
-    """A folder with what the guides presuppose: a user's shirt, and the recipes."""
+    """A folder with what the guides presuppose: a user's shirt, clip, character with a garment, and recipes."""
     folder = tmp_path_factory.mktemp("docs")
     scanned_tshirt(folder / "shirt.obj", body)
     shutil.copy(ROOT / "tests" / "fixtures" / "cmu_01_01.bvh", folder / "walk.bvh")
+    write_walker(folder / "character.glb", folder / "jacket.obj", body)
+    shutil.copy(ROOT / "experiments" / "configs" / "eslr-small.toml", folder / "recipe.toml")
     (folder / "experiments").symlink_to(ROOT / "experiments")
     return folder
 
@@ -107,6 +114,29 @@ def test_documented_commands_run(workplace, page, words):
     command = [sys.executable, "-m", "eslr_jax.cli", *words[1:], *added]
     result = subprocess.run(command, cwd=workplace, capture_output=True, text=True, timeout=900, check=False)
     assert result.returncode == 0, f"{page.name}: {' '.join(words)}\n{result.stderr}"
+
+
+@pytest.mark.slow
+@pytest.mark.example
+@pytest.mark.parametrize(("page", "words"), VIEWS, ids=name)
+def test_documented_views_serve_a_page(workplace, page, words):
+    pytest.importorskip("viser")
+    for run in words[2:]:  # whatever was simulated before this test
+        if not (workplace / run).exists():
+            simulate = [sys.executable, "-m", "eslr_jax.cli", "simulate", "--frames", "3", "--no-pictures"]
+            subprocess.run(
+                [*simulate, "--out", run], cwd=workplace, capture_output=True, timeout=900, check=True
+            )
+    command = [sys.executable, "-m", "eslr_jax.cli", *words[1:]]
+    with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        address = server.stdout.readline().strip()
+        try:
+            with urllib.request.urlopen(address, timeout=60) as answer:
+                assert answer.status == 200
+        finally:
+            server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=60) in (0, 130), f"{page.name}: {' '.join(words)}"
 
 
 @pytest.mark.slow
