@@ -131,6 +131,7 @@ class TrainConfig:
     horizon: int = 60  # longest trajectory [frames]
     horizon_growth: int = 60  # iterations per frame of horizon
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
+    girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
     reset_stretch: float = 2.5  # a trajectory that stretches further starts anew
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
@@ -162,6 +163,11 @@ class TrainConfig:
         for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("noise", "girth"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not 0 <= self.material_probability <= 1:
+            raise ValueError(f"material_probability must be between 0 and 1, got {self.material_probability}")
         pool = len(self.garments) * self.slots_per_garment
         if self.batch_size > pool:
             raise ValueError(f"batch_size = {self.batch_size} is more than the pool of {pool} trajectories")

@@ -65,7 +65,7 @@ def simulate(
         arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
             another body and 0 for the body's own.
         body_fps: Frames per second of a body that is a moving mesh.
-        self_contact: Keep layers of cloth apart; the network does so only in its corrector.
+        self_contact: Keep layers of cloth apart.
         out: Folder to write to.
         pictures: Render the contact sheet.
         json_: Print the report as JSON.
@@ -141,7 +141,7 @@ def simulate(
             "motion": motion,
             "simulator": simulator,
             "model": model,
-            **trajectory_report(trajectory, scene),
+            **trajectory_report(trajectory, scene, config=config),
             "choice": None if choice is None else dataclasses.asdict(choice),
             "frame_ms": timing.frame_ms,
             "compile_s": timing.compile_s,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import PotentialTerms, next_friction_load, potential_terms
@@ -26,19 +28,27 @@ class FrameMeasures(NamedTuple):
     speed: Float[Array, " frames"]  # root mean square vertex speed [m/s]
 
 
-@jax.jit
-def measure_frames(trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters) -> FrameMeasures:
+@partial(jax.jit, static_argnames="config")
+def measure_frames(
+    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters, config: SimConfig | None = None
+) -> FrameMeasures:
     """Measure every simulated frame of a trajectory.
 
     The energies of frame t are those of the minimisation problem that starts from the trajectory's own state
     at t - 1, gravity counted from there.
+
+    Args:
+        trajectory: What to measure.
+        scene: The scene it is of.
+        parameters: Constants of the scene.
+        config: Says whether layers and tips collide, see `frame_problem`; static.
     """
     garment = scene.garment
 
     def measure(load, frame):
         position, velocity, answer, inputs = frame
         state = scene.start.replace(position=position, velocity=velocity, friction_load=load)
-        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
+        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters, config)
         terms = potential_terms(answer, problem, garment, scene.material)
         terms = PotentialTerms(*(jnp.asarray(term, answer.dtype) for term in terms))
         stretch = jnp.max(principal_stretches(answer, garment)[0])

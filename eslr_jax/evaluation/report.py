@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.metrics import FrameMeasures, measure_frames
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.problem import PhysicsParameters
@@ -18,16 +19,25 @@ _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
 
 
 def trajectory_report(
-    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters | None = None
+    trajectory: Trajectory,
+    scene: Scene,
+    parameters: PhysicsParameters | None = None,
+    config: SimConfig | None = None,
 ) -> dict[str, Any]:
     """Measure a trajectory.
+
+    Args:
+        trajectory: What to measure.
+        scene: The scene it is of.
+        parameters: Constants of the scene.
+        config: How it was simulated: where layers or tips collide, their energy counts.
 
     Returns:
         Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
         vertices that penetrate; without a body the penetration values are None.
     """
     measures: FrameMeasures = jax.device_get(
-        measure_frames(trajectory, scene, parameters or PhysicsParameters())
+        measure_frames(trajectory, scene, parameters or PhysicsParameters(), config)
     )
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]

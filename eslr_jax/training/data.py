@@ -15,6 +15,7 @@ from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.prepare import pad_alike
+from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene import shared_surface
 from eslr_jax.types import BodySurface, Garment
 
@@ -28,6 +29,7 @@ class TrainingData:
     garments: Garment
     surface: BodySurface  # body faces that any of the garments can touch
     surface_rest: Float[Array, "surface_vertices 3"]  # [m]
+    surface_normals: Float[Array, "surface_vertices 3"]  # outward unit normals at rest
     surface_skin_weights: Float[Array, "surface_vertices influences"]
     surface_skin_indices: Int[Array, "surface_vertices influences"]
     joint_transforms: Float[Array, "frames joints 3 4"]  # all clips, end to end
@@ -50,9 +52,12 @@ class TrainingData:
         turn = jnp.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
         return turn @ self.joint_transforms[frame]
 
-    def body(self, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "surface_vertices 3"]:
-        """Return the posed body surface [m]."""
-        return lbs.skin(self.surface_rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
+    def body(
+        self, transforms: Float[Array, "joints 3 4"], girth: Float[Array, ""]
+    ) -> Float[Array, "surface_vertices 3"]:
+        """Return the posed surface of a body that is thicker than the bundled one by `girth` [m]."""
+        rest = self.surface_rest + girth * self.surface_normals
+        return lbs.skin(rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
 
 
 def clips_of(split: str) -> list[str]:
@@ -81,12 +86,14 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
     surface = shared_surface(garments, body)
+    surface_rest = jnp.asarray(body.rest_positions[surface.vertex_ids])
     motions = [load_motion(clip) for clip in clips_of(config.split)]
     rotations, translations, frames_left = _join_clips(motions)
     return TrainingData(
         garments=stacked,
         surface=surface,
-        surface_rest=body.rest_positions[surface.vertex_ids],
+        surface_rest=surface_rest,
+        surface_normals=vertex_normals(surface_rest, surface.faces, surface.face_incidence),
         surface_skin_weights=body.skin_weights[surface.vertex_ids],
         surface_skin_indices=body.skin_indices[surface.vertex_ids],
         joint_transforms=joint_transforms(rotations, translations, body.joint_rest_positions, body.parents),

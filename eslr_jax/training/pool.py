@@ -27,6 +27,7 @@ class Slot:
     state: ClothState
     frame: Int[Array, ""]  # index into the joined clips
     yaw: Float[Array, ""]  # turn of the whole scene [rad]
+    girth: Float[Array, ""]  # by which the body is thicker than the bundled one [m]
     age: Int[Array, ""]  # frames since the start
     material: Material
     is_done: Bool[Array, ""]  # start anew before the next use
@@ -48,6 +49,7 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
         ),
         frame=jnp.zeros(count, jnp.int32),
         yaw=jnp.zeros(count),
+        girth=jnp.zeros(count),
         age=jnp.zeros(count, jnp.int32),
         material=jax.tree.map(lambda leaf: jnp.full(count, leaf, jnp.float32), COTTON),
         is_done=jnp.ones(count, bool),
@@ -55,15 +57,15 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
 
 
 def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: TrainConfig) -> Slot:
-    """Start at a random frame of a random clip: skinned, noisy, pushed out of the body.
+    """Start at a random frame of a random clip on a body of random girth: skinned, noisy, pushed out of it.
 
     Args:
         key: Random key.
         data: Clips and body.
         garment: Whose trajectory it is.
-        config: Noise and materials; static.
+        config: Noise, girth and materials; static.
     """
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 5)
     frame = data.start_frames[jax.random.randint(keys[0], (), 0, data.start_frames.shape[0])]
     yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
     transforms, later = data.transforms(frame, yaw), data.transforms(frame + 1, yaw)
@@ -71,7 +73,8 @@ def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: T
     velocity = (skin(garment, later) - skinned) * 30.0
     noise = config.noise * jax.random.normal(keys[2], skinned.shape)
     position = skinned + jnp.where(garment.is_pinned[:, None], 0.0, noise)
-    body = data.body(transforms)
+    girth = jax.random.uniform(keys[4], minval=-config.girth, maxval=config.girth)
+    body = data.body(transforms, girth)
 
     def project(_, position):
         contacts = find_contacts(position, body, body, data.surface)
@@ -89,7 +92,7 @@ def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: T
         first_bad_frame=jnp.int32(-1),
     )
     material = sample_material(keys[3], config.material_probability)
-    return Slot(state, frame.astype(jnp.int32), yaw, jnp.int32(0), material, jnp.zeros((), bool))
+    return Slot(state, frame.astype(jnp.int32), yaw, girth, jnp.int32(0), material, jnp.zeros((), bool))
 
 
 def skin(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:

@@ -224,7 +224,7 @@ def _sample_gradient(
 def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig):
     """Pose the body at both ends of the frame and state the frame's problem."""
     transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
-    frame = FrameInput(data.body(transforms), data.body(later), skin(garment, later))
+    frame = FrameInput(data.body(transforms, slot.girth), data.body(later, slot.girth), skin(garment, later))
     parameters = PhysicsParameters(collision_stiffness=config.collision_stiffness)
     scene = SimConfig(self_contact=config.self_contact)
     problem = frame_problem(
@@ -239,7 +239,7 @@ def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> 
     last = jnp.maximum(slot.frame - 1, 0)
     before = jnp.where(data.frames_left[last] > data.frames_left[slot.frame], last, slot.frame)
     frames = (before, slot.frame, slot.frame + 1)
-    bodies = BodyFrames(*(data.body(data.transforms(frame, slot.yaw)) for frame in frames))
+    bodies = BodyFrames(*(data.body(data.transforms(frame, slot.yaw), slot.girth) for frame in frames))
     parameters = HoodParameters(collision_weight=collision_weight(num_samples))
     state = slot.state
 

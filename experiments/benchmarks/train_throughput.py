@@ -46,7 +46,7 @@ def main() -> None:
     garment = data.garment(jnp.int32(0))
     slot = jax.jit(partial(start_trajectory, data=data, garment=garment, config=config))(jax.random.key(0))
     before, after = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
-    frame = FrameInput(data.body(before), data.body(after), skin(garment, after))
+    frame = FrameInput(data.body(before, slot.girth), data.body(after, slot.girth), skin(garment, after))
     problem = frame_problem(
         garment, slot.state, frame, data.surface, jnp.float32(1 / 30), PhysicsParameters()
     )

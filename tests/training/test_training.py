@@ -2,17 +2,22 @@ import dataclasses
 import json
 import os
 import signal
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from eslr_jax.assets import load_model
 from eslr_jax.config import TrainConfig
+from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.models.registry import MODELS
 from eslr_jax.training import data, loop
 from eslr_jax.training.loop import train
+from eslr_jax.training.loss import _mean_contraction
+from eslr_jax.training.pool import start_trajectory
 
 MODEL = dataclasses.replace(MODELS["mgn-small"], passes=1, latent_size=16)
 CONFIG = TrainConfig(
@@ -151,3 +156,32 @@ def test_overrides_may_name_another_model(tmp_path):
     recipe.write_text('model = "eslr-small"')
     config = load_recipe(recipe, {"model": "mgn-small", "model.passes": 4})
     assert config.model == dataclasses.replace(MODELS["mgn-small"], passes=4)
+
+
+def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them():
+    config = dataclasses.replace(CONFIG, girth=0.01, noise=0.0)
+    loaded = data.load_training_data(config, "1k")
+    garment = loaded.garment(0)
+    start = jax.jit(partial(start_trajectory, data=loaded, garment=garment, config=config))
+    slots = [start(jax.random.key(seed)) for seed in range(4)]
+    girths = np.array([slot.girth for slot in slots])
+    assert np.ptp(girths) > 2e-3
+    assert np.all(np.abs(girths) <= 0.01)
+    for slot in slots:
+        transforms = loaded.transforms(slot.frame, slot.yaw)
+        thin, own = loaded.body(transforms, jnp.float32(0.0)), loaded.body(transforms, slot.girth)
+        np.testing.assert_allclose(np.linalg.norm(own - thin, axis=-1), abs(slot.girth), rtol=0.1)
+        contacts = find_contacts(slot.state.position, own, own, loaded.surface)
+        inside = np.asarray(contacts.distances)[np.asarray(garment.vertex_mask)] < -1e-3
+        assert inside.mean() < 0.02
+
+
+def test_contraction_weighs_each_pass_by_what_it_leaves():
+    """Passes from 10 J to 1 J to 0.1 J to 0 leave a tenth each; the last one's excess is known to 1 % of 10 J."""
+    energies = jnp.array([10.0, 1.0, 0.1, 0.0])
+    np.testing.assert_allclose(_mean_contraction(energies), (0.1 + 0.1 + 0.0) / 3, rtol=1e-6)
+    np.testing.assert_allclose(
+        jax.grad(_mean_contraction)(energies), [0.0, 1 / 30, 1 / 3, 1 / 3 / 0.1], rtol=1e-6
+    )
+    flat = jnp.ones(4)
+    assert np.isfinite(jax.grad(_mean_contraction)(flat)).all()

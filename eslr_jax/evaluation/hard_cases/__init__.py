@@ -12,9 +12,6 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.hard_cases.body import (
     DROP,
     FAST_LIMB,
-    NEEDLE,
-    PINCH,
-    SLOPE,
     START_INSIDE,
     STEPS_AND_FABRICS,
     TURNED,
@@ -23,6 +20,7 @@ from eslr_jax.evaluation.hard_cases.case import HardCase, Outcome, play
 from eslr_jax.evaluation.hard_cases.cloth import BAD_MESH, BAD_START, FREE_FALL, HANG, PULL, TWIST
 from eslr_jax.evaluation.hard_cases.layers import LAYERS
 from eslr_jax.evaluation.hard_cases.measures import Measure
+from eslr_jax.evaluation.hard_cases.obstacles import NEEDLE, PINCH, SLOPE
 from eslr_jax.evaluation.hard_cases.simulators import (
     Run,
     Simulator,

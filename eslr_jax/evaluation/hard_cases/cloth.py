@@ -353,5 +353,3 @@ BAD_MESH = HardCase(
     picture="slivers of aspect 50",
     may_refuse=True,
 )
-
-CLOTH_CASES: tuple[HardCase, ...] = (FREE_FALL, HANG, BAD_START, PULL, TWIST, BAD_MESH)

@@ -155,5 +155,3 @@ LAYERS = HardCase(
     "pairs of triangles after 2 s; the folded sheet and the skirt stay clean. Without the edges' sagitta in the "
     "thickness it was the other way round: 0 pairs, and 4 at the hem of the skirt",
 )
-
-LAYER_CASES: tuple[HardCase, ...] = (LAYERS,)

@@ -151,7 +151,7 @@ def network_simulator(
         model: Architecture.
         name: What tables call it.
         corrector_steps: Solver iterations behind it.
-        self_contact: Let the corrector keep layers apart in scenes that ask for it.
+        self_contact: Keep layers apart in scenes that ask for it.
     """
 
     def run(stress: StressScene) -> Trajectory:
