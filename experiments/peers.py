@@ -358,26 +358,26 @@ def main() -> None:
     if arguments.smoke:
         arguments.scenes, arguments.frames = ["tshirt_1k"], 8
         settings = SMOKE_SETTINGS
-    result: dict[str, Any] = {"scenes": {}}
-    for name in arguments.scenes:
-        rows = measure_scene(make_scene(name, arguments.frames), settings, EVERY)
-        result["scenes"][name] = rows
-        print(f"\n{name}\n\n{table(rows)}", flush=True)
-        jax.clear_caches()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    result |= {
+    result: dict[str, Any] = {
         "clip": CLIP,
         "frames": arguments.frames,
         "processor": device_name(),
         "cores": cores,
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "date": time.strftime("%Y-%m-%d"),
         **environment(),
+        "scenes": {},
     }
     result["versions"] |= peer_versions()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / "peers.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    for name in arguments.scenes:
+        rows = measure_scene(make_scene(name, arguments.frames), settings, EVERY)
+        result["scenes"][name] = rows
+        result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
+        with atomic_write(arguments.out / "peers.json") as temporary:  # after every scene: they take minutes
+            temporary.write_text(json.dumps(result, indent=1) + "\n")
+        print(f"\n{name}\n\n{table(rows)}", flush=True)
+        jax.clear_caches()
 
 
 if __name__ == "__main__":
