@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.evaluation.fields import FIELDS, Field, run_field
 from eslr_jax.extras import require
 from eslr_jax.io.run import Run
@@ -83,8 +83,9 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
 def show(view: View) -> None:
     """Bring the scene in line with the controls."""
     color = view.controls["color"].value
+    with view.lock:
+        fields, message = _fields(view, color)
     with view.lock, view.server.atomic():
-        fields = [_field(view, k, color) for k in range(len(view.runs))] if color != PLAIN else []
         low = min((field.low for field in fields), default=0.0)
         high = max((field.high for field in fields), default=1.0)
         for k, run in enumerate(view.runs):
@@ -93,7 +94,7 @@ def show(view: View) -> None:
             if fields:
                 colors = color_scale(fields[k].values[frame], low, high)
             _show_run(view, k, run, frame, colors)
-        legend = f"dark {low:.3g} to yellow {high:.3g} {fields[0].unit}" if fields else ""
+        legend = f"dark {low:.3g} to yellow {high:.3g} {fields[0].unit}" if fields else message
         view.controls["legend"].content = legend
 
 
@@ -149,11 +150,18 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
         )
 
 
-def _field(view: View, k: int, name: str) -> Field:
-    """Return a run's field, computed once."""
-    if (k, name) not in view.fields:
-        view.fields[k, name] = run_field(view.runs[k], name)
-    return view.fields[k, name]
+def _fields(view: View, name: str) -> tuple[list[Field], str]:
+    """Return a field of every run, computed once; or none, and why."""
+    if name == PLAIN:
+        return [], ""
+    try:
+        for k, run in enumerate(view.runs):
+            if (k, name) not in view.fields:
+                view.controls["legend"].content = f"computing {name} of {run.name}"
+                view.fields[k, name] = run_field(run, name)
+    except EslrError as error:
+        return [], str(error)
+    return [view.fields[k, name] for k in range(len(view.runs))], ""
 
 
 def _save_picture(client: Any) -> None:

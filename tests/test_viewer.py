@@ -1,31 +1,47 @@
 """Runs in the browser: the scene over the server's own interface, and in headless Chromium."""
 
+import dataclasses
+import json
 import os
 import shutil
 import threading
 import time
+import typing
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from eslr_jax.assets import load_garment_file
+from eslr_jax.cli.runs import render
+from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.fields import FIELDS, run_field
+from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, excess_shares, run_field
+from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
 from eslr_jax.io.garment import write_garment_npz
 from eslr_jax.io.run import read_run
 from eslr_jax.io.trajectory import write_trajectory
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
+from eslr_jax.physics.problem import PhysicsParameters, start_guess
 from eslr_jax.render.colors import color_scale
+from eslr_jax.scene import initial_state
+from eslr_jax.simulate.step import FrameInput, frame_problem, solve
 
 
 def make_run(folder, body, name, scale=1.0):
-    """Write a run of four frames: a tank top at rest, stretched, raised by 2 cm, at rest."""
+    """Write a run of six frames: a tank top at rest, stretched, raised, at rest, shrunk, and lowered."""
     folder = folder / name
     folder.mkdir()
     garment = load_garment_file("tank")
     rest = garment.rest_positions + np.array([0, 0.82, 0])
-    frames = np.stack([rest, rest * [1.1 * scale, 1, 1], rest + np.array([0, 0.02, 0]), rest])
+    shrunk = rest * [0.9, 1, 0.9]  # into the body
+    moved = [rest + np.array([0, 0.02, 0]), rest, shrunk, shrunk - np.array([0, 1e-3, 0])]
+    frames = np.stack([rest, rest * [1.1 * scale, 1, 1], *moved])
     body_positions = np.repeat(
-        np.asarray(body.rest_positions)[None] + np.array([[0, 0.82, 0]], np.float32), 4, 0
+        np.asarray(body.rest_positions)[None] + np.array([[0, 0.82, 0]], np.float32), len(frames), 0
     )
     write_trajectory(
         folder / "trajectory.npz",
@@ -35,7 +51,10 @@ def make_run(folder, body, name, scale=1.0):
         timestep=1 / 30,
         body_positions=body_positions,
         body_faces=np.asarray(body.faces),
+        body_rest_positions=np.asarray(body.rest_positions),
+        contact_faces=np.asarray(body.faces)[np.asarray(body.is_obstacle)],
     )
+    (folder / "report.json").write_text(json.dumps({"self_contact": True}))
     write_garment_npz(folder / "garment.npz", garment)
     return folder
 
@@ -54,38 +73,94 @@ def test_stretch_of_uniform_stretch(runs):
     np.testing.assert_allclose(field.values[2], field.values[0], atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["stretch-energy", "bending-energy", "inertia-energy", "gravity-energy"])
-def test_energy_shares_add_up_to_the_energy(runs, name):
-    import jax.numpy as jnp
+@pytest.fixture(scope="module")
+def last_problem(runs):
+    """The last frame of a run as its simulation stated it, with garment and fabric."""
+    garment, material = _prepared(runs[0])
+    scene = _scene(runs[0], garment, material, has_contact=True)
+    parameters = PhysicsParameters()
+    state, inputs = jax.tree.map(
+        lambda leaf: leaf[-1], trajectory_states(runs[0].trajectory, scene, parameters)
+    )
+    config = SimConfig(simulator="physics", self_contact=True)
+    problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters, config)
+    return problem, garment, material
 
-    from eslr_jax.evaluation.fields import _prepared
-    from eslr_jax.physics.bending import bending_energy
-    from eslr_jax.physics.gravity import gravity_energy
-    from eslr_jax.physics.inertia import inertia_energy, vertex_masses
-    from eslr_jax.physics.membrane import stretch_energy
 
-    run = runs[0]
-    garment, material = _prepared(run)
-    trajectory = run.trajectory
-    before, now = (jnp.asarray(trajectory.positions[frame]) for frame in (0, 1))
-    masses = vertex_masses(garment, material)
-    guess = before + trajectory.timestep * trajectory.velocities[0]
-    whole = {
-        "stretch-energy": stretch_energy(now, garment, material),
-        "bending-energy": bending_energy(now, garment, material),
-        "inertia-energy": inertia_energy(now, guess, masses, jnp.float32(trajectory.timestep)),
-        "gravity-energy": gravity_energy(now, before, masses, 9.81),
-    }[name]
-    shares = run_field(run, name).values[1] * np.asarray(garment.vertex_areas)
-    assert shares.sum() == pytest.approx(float(whole), rel=1e-3, abs=1e-6)
+@pytest.mark.parametrize("term", PotentialTerms._fields)
+def test_energy_shares_add_up_to_the_energy(runs, last_problem, term):
+    problem, garment, material = last_problem
+    answer = jnp.asarray(runs[0].trajectory.positions[-1])
+    whole = float(getattr(potential_terms(answer, problem, garment, material), term))
+    shares = run_field(runs[0], f"{term}-energy").values[-1] * np.asarray(garment.vertex_areas)
+    assert shares.sum() == pytest.approx(whole, rel=1e-3, abs=1e-6)
+    assert whole != 0 or term == "repulsion"  # no two layers meet
+
+
+def test_excess_shares_add_up_to_what_the_answer_is_above_the_optimum(runs, last_problem):
+    problem, garment, material = last_problem
+    answer = start_guess(problem, garment)
+    minimum = solve(problem, garment, material, answer, iterations=500, memory=8, tolerance=1e-3)
+    excess = float(potential(answer, problem, garment, material) - minimum.value)
+    shares = np.asarray(excess_shares(answer, problem, garment, material))
+    assert excess > 1e-3
+    assert shares.sum() == pytest.approx(excess, rel=0.01)  # contacts have kinks
+    assert -shares[shares < 0].sum() < 0.5 * excess
+    at_optimum = excess_shares(minimum.position, problem, garment, material)
+    assert abs(float(at_optimum.sum())) < 0.01 * excess
+
+
+def test_repulsion_counts_where_layers_meet():
+    """Two sheets 1 mm apart: the pairs' energy goes to both layers."""
+    lower = sheet(6, 6, (0.1, 0.1))
+    upper = lower[0] + np.array([0.003, 1e-3, 0.002]), lower[1]
+    garment = make_cloth(join_meshes(lower, upper), {}, allow_components=True)
+    still = jnp.asarray(garment.rest_positions)
+    state = initial_state(still, jnp.zeros_like(still))
+    problem = frame_problem(
+        garment,
+        state,
+        FrameInput(None, None, None),
+        None,
+        jnp.float32(1 / 30),
+        PhysicsParameters(),
+        SimConfig(simulator="physics", self_contact=True),
+    )
+    whole = float(potential_terms(still, problem, garment, COTTON).repulsion)
+    shares = np.asarray(energy_shares("repulsion", still, problem, garment, COTTON))
+    assert whole > 0
+    assert shares.sum() == pytest.approx(whole, rel=1e-4)
+    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole
+
+
+@pytest.mark.parametrize(("name", "change", "message"), [
+    ("excess", {"contact_faces": None, "body_rest_positions": None}, "rest pose, which contacts need"),
+    ("friction-energy", {"body_positions": None, "body_faces": None}, "has no body, and so no friction-energy"),
+    ("distance", {"body_positions": None, "body_faces": None}, "has no body"),
+])  # fmt: skip
+def test_what_a_run_lacks_for_a_field_is_said(runs, name, change, message):
+    run = dataclasses.replace(runs[0], trajectory=dataclasses.replace(runs[0].trajectory, **change))
+    with pytest.raises(AssetError, match=message) as caught:
+        run_field(run, name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_without_self_contact_has_no_repulsion(runs):
+    with pytest.raises(AssetError, match="without --self-contact"):
+        run_field(dataclasses.replace(runs[0], report={}), "repulsion-energy")
+
+
+def test_render_knows_every_field():
+    colors = typing.get_type_hints(render)["color"]
+    assert set(typing.get_args(colors)) == {"fabric", *FIELDS}
 
 
 def test_distance_grows_by_what_the_cloth_is_moved(runs):
     field = run_field(runs[0], "distance")
     assert np.all(field.values[0] > 0)
     np.testing.assert_allclose(field.values[0], field.values[3])
-    with pytest.raises(AssetError, match="no field 'excess'"):
-        run_field(runs[0], "excess")
+    with pytest.raises(AssetError, match="no field 'warmth'"):
+        run_field(runs[0], "warmth")
 
 
 def test_color_scale_ends_and_order():
@@ -156,6 +231,12 @@ def test_controls_change_the_scene(view, runs):
         view.controls["color"].value = name
         show(view)
         assert "dark" in view.controls["legend"].content
+    view.fields.clear()
+    view.runs[0].report["self_contact"] = False
+    view.controls["color"].value = "repulsion-energy"
+    show(view)
+    view.runs[0].report["self_contact"] = True
+    assert "without --self-contact" in view.controls["legend"].content
     view.controls["frame"].value = 0
     view.controls["playing"].value = True
     end = threading.Event()
@@ -177,6 +258,8 @@ def test_page_in_headless_chromium(view, tmp_path):
     sync_api = pytest.importorskip("playwright.sync_api")
     from PIL import Image
 
+    from eslr_jax.viewer import show
+
     with sync_api.sync_playwright() as playwright:
         arguments = [
             "--no-sandbox",
@@ -189,15 +272,25 @@ def test_page_in_headless_chromium(view, tmp_path):
         page.goto(view.url)
         picture = tmp_path / "page.png"
 
-        def blue_pixels():
-            page.screenshot(path=picture, timeout=180_000)  # WebGL in software, on a busy machine
-            pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
-            return int(((pixels[..., 2] > pixels[..., 0] + 40) & (pixels[..., 2] > 90)).sum())
+        def until(is_color, count):
+            deadline, found = time.monotonic() + 240, 0
+            while found <= count and time.monotonic() < deadline:
+                page.screenshot(path=picture, timeout=180_000)  # WebGL in software, on a busy machine
+                red, green, blue = np.moveaxis(
+                    np.asarray(Image.open(picture).convert("RGB")).astype(int), -1, 0
+                )
+                found = int(is_color(red, green, blue).sum())
+                time.sleep(1.0)
+            assert found > count
 
-        deadline = time.monotonic() + 240
-        while blue_pixels() < 1500 and time.monotonic() < deadline:
-            time.sleep(1.0)
-        assert blue_pixels() > 1500  # two blue garments
+        until(lambda red, green, blue: (blue > red + 40) & (blue > 90), 1500)  # two blue garments
+        view.controls["frame"].value = 1
+        view.controls["color"].value = "excess"
+        show(view)
+        until(
+            lambda red, green, blue: (np.minimum(red, green) > blue + 60) & (green > 0.8 * red), 30
+        )  # yellow
+        page.get_by_text("J/m2").wait_for(timeout=60_000)
         assert page.get_by_text("colour by").count() > 0
         with page.expect_download(timeout=240_000) as saved:
             page.get_by_role("button", name="save picture").click()

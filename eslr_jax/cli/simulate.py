@@ -141,6 +141,7 @@ def simulate(
             "motion": motion,
             "simulator": simulator,
             "model": model,
+            "self_contact": self_contact,
             **trajectory_report(trajectory, scene, config=config),
             "choice": None if choice is None else dataclasses.asdict(choice),
             "frame_ms": timing.frame_ms,
@@ -149,7 +150,7 @@ def simulate(
         }
     positions = np.asarray(trajectory.positions)
     with stderr.status("writing files"):
-        _write_motion(out, positions, np.asarray(trajectory.velocities), cloth, rig, poses, report)
+        _write_motion(out, positions, np.asarray(trajectory.velocities), scene, rig, poses, report)
         write_garment_npz(out / "garment.npz", stored)
     if pictures:
         _write_sheet(out, positions, cloth, poses)
@@ -208,7 +209,7 @@ def _check_skin(garment: str, cloth, rig, body: str) -> None:
         )
 
 
-def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: dict[str, Any]) -> None:
+def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: dict[str, Any]) -> None:
     """Write the trajectory and the animated GLB."""
     import numpy as np
 
@@ -216,8 +217,11 @@ def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: d
     from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR, SkinnedMesh
     from eslr_jax.io.trajectory import write_trajectory
 
-    faces = np.asarray(cloth.faces)
+    faces = np.asarray(scene.garment.faces)
     timestep = float(poses.timestep)
+    contact_faces, surface = np.empty((0, 3), np.int32), scene.surface
+    if surface is not None:
+        contact_faces = np.asarray(surface.vertex_ids)[np.asarray(surface.faces)]
     write_trajectory(
         out / "trajectory.npz",
         positions=positions,
@@ -226,6 +230,8 @@ def _write_motion(out: Path, positions, velocities, cloth, rig, poses, report: d
         timestep=timestep,
         body_positions=np.asarray(poses.positions),
         body_faces=np.asarray(poses.faces),
+        body_rest_positions=np.asarray(poses.rest_positions),
+        contact_faces=contact_faces,
         metadata=report,
     )
     meshes, skinned = [AnimatedMesh("garment", positions, faces)], None

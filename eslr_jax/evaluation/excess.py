@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.config import SimConfig
+from eslr_jax.io.trajectory import TrajectoryFile
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
 from eslr_jax.simulate.network import network_step
@@ -32,7 +33,7 @@ class Excess(NamedTuple):
 
 
 def trajectory_states(
-    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters
+    trajectory: Trajectory | TrajectoryFile, scene: Scene, parameters: PhysicsParameters
 ) -> tuple[ClothState, FrameInput]:
     """Return the state before every frame of a trajectory, with its friction load, and the frame's input."""
     inputs = frame_inputs(scene)

@@ -1,7 +1,8 @@
-"""Values over a garment to colour it by: stretch, energies, distance to the body."""
+"""Values over a garment to colour it by: stretch, energies, excess over the optimum, distance to the body."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -11,20 +12,28 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from eslr_jax.assets import prepare_stored
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import AssetError
+from eslr_jax.evaluation.excess import trajectory_states
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
-from eslr_jax.physics.bending import bending_energy
-from eslr_jax.physics.gravity import gravity_energy
-from eslr_jax.physics.inertia import inertia_energy, vertex_masses
-from eslr_jax.physics.membrane import principal_stretches, stretch_energy
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.types import Garment, Material
+from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters
+from eslr_jax.scene import initial_state
+from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from eslr_jax.types import ClothState, Garment, Material, Scene
 
-FIELDS = ("stretch", "stretch-energy", "bending-energy", "inertia-energy", "gravity-energy", "distance")
+FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "excess", "distance")
+_BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
+_CONTACT_FIELDS = ("collision-energy", "friction-energy", "excess")
+_PARAMETERS = PhysicsParameters()
+_ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
+_QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
 
 
 class Field(NamedTuple):
@@ -39,30 +48,35 @@ class Field(NamedTuple):
 def run_field(run: Run, name: str) -> Field:
     """Return a field of a run.
 
-    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies are those of the
-    frame's minimisation problem, per area; `distance` is to the tangent plane of the nearest body vertex.
+    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies and `excess`
+    are those of the frame's minimisation problem, per area, see `energy_shares` and `excess_shares`; `distance`
+    is to the tangent plane of the nearest body vertex.
 
     Args:
         run: Of `read_run`.
         name: One of `FIELDS`.
 
     Raises:
-        AssetError: The field is unknown, or the run has no body.
+        AssetError: The field is unknown, or the run lacks what it needs.
     """
     if name not in FIELDS:
         raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
+    if name in _BODY_FIELDS and run.trajectory.body_positions is None:
+        raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
+    if name == "repulsion-energy" and not run.report.get("self_contact"):
+        raise AssetError(f"{run.name} has no {name}: it was simulated without --self-contact")
     if name == "distance":
         return _distances(run)
     garment, material = _prepared(run)
-    positions = jnp.asarray(run.trajectory.positions)
     if name == "stretch":
-        values = np.asarray(_stretches(positions, garment))
+        values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    timestep = jnp.float32(run.trajectory.timestep)
-    velocities = jnp.asarray(run.trajectory.velocities)
-    energies = _vertex_energies(name, positions, velocities, timestep, garment, material)
-    values = np.asarray(energies) / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
-    low, high = np.quantile(values, [0.001, 0.999])
+    values = _problem_values(run, name, garment, material)
+    values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
+    # A few vertices in hard contact hold a hundred times what others do, and shares of excess may be negative.
+    low, high = (
+        (0.0, np.quantile(values, 0.99)) if name in _CONTACT_FIELDS else np.quantile(values, [0.001, 0.999])
+    )
     return Field(values, min(float(low), 0.0), max(float(high), 1e-6), "J/m2")
 
 
@@ -92,56 +106,140 @@ def _stretches(
     return jax.lax.map(frame, positions)
 
 
-def _vertex_energies(
+def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool) -> Scene:
+    """Return the scene of a run as its folder tells it: with the faces it searched, and pins as they moved."""
+    trajectory = run.trajectory
+    positions, velocities = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)
+    surface = body = None
+    if has_contact and trajectory.body_positions is not None:
+        if trajectory.body_rest_positions is None or trajectory.contact_faces is None:
+            raise AssetError(f"{run.name} lacks its body's rest pose, which contacts need; simulate it again")
+        if len(trajectory.contact_faces):
+            surface = prepare_surface(trajectory.body_rest_positions, trajectory.contact_faces)
+            body = jnp.asarray(trajectory.body_positions)[:, surface.vertex_ids]
+    return Scene(
+        garment=garment,
+        material=material,
+        start=initial_state(positions[0], velocities[0]),
+        timestep=jnp.float32(trajectory.timestep),
+        surface=surface,
+        body_positions=body,
+        pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
+        num_frames=trajectory.num_frames,
+    )
+
+
+def _problem_values(
+    run: Run, name: str, garment: Garment, material: Material
+) -> Float[np.ndarray, "frames vertices"]:
+    """Return a value [J] of the frames' minimisation problems; the first frame has none."""
+    scene = _scene(run, garment, material, has_contact=name in _CONTACT_FIELDS)
+    config = SimConfig(simulator="physics", self_contact=bool(run.report.get("self_contact", False)))
+    states, inputs = trajectory_states(run.trajectory, scene, _PARAMETERS)
+    answers = jnp.asarray(run.trajectory.positions[1:])
+    values = np.asarray(_every_frame(name, answers, states, inputs, scene, config))
+    return np.concatenate([np.zeros_like(values[:1]), values])
+
+
+@partial(jax.jit, static_argnames=("name", "config"))
+def _every_frame(
     name: str,
-    positions: Float[Array, "frames vertices 3"],
-    velocities: Float[Array, "frames vertices 3"],
-    timestep: Float[Array, ""],
+    answers: Float[Array, "answers vertices 3"],
+    states: ClothState,
+    inputs: FrameInput,
+    scene: Scene,
+    config: SimConfig,
+) -> Float[Array, "answers vertices"]:
+    """State the problem of every frame and return a value of its answer [J]."""
+    garment, material = scene.garment, scene.material
+
+    def frame(arguments):
+        answer, state, inputs = arguments
+        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, _PARAMETERS, config)
+        if name == "excess":
+            return excess_shares(answer, problem, garment, material)
+        return energy_shares(name.removesuffix("-energy"), answer, problem, garment, material)
+
+    return jax.lax.map(frame, (answers, states, inputs))
+
+
+def energy_shares(
+    term: str,
+    position: Float[Array, "vertices 3"],
+    problem: FrameProblem,
     garment: Garment,
     material: Material,
-) -> Float[Array, "frames vertices"]:
-    """Share an energy out over the vertices [J]; the shares of a frame add up to it, the first frame has none.
+) -> Float[Array, " vertices"]:
+    """Share one term of the potential out over the vertices [J]; the shares add up to it.
 
-    An energy is linear in a factor on every face's thickness, hinge's stiffness or vertex' density, so its
-    gradient by the factors is what each element holds.
+    Every term is a sum over faces, hinges, vertices or pairs. It is linear in a factor on each of them, here the
+    mean of factors at its vertices: the gradient by these is what each vertex holds.
+
+    Args:
+        term: Of `PotentialTerms`.
+        position: Positions at t + 1 [m].
+        problem: The frame's problem.
+        garment: Rest mesh.
+        material: Fabric.
     """
-    gravity = jnp.float32(PhysicsParameters().gravity)  # type: ignore[arg-type]
 
-    def total(factors: Float[Array, " elements"], now, before, velocity) -> Float[Array, ""]:
-        if name == "stretch-energy":
-            return stretch_energy(now, garment, material.replace(thickness=material.thickness * factors))
-        if name == "bending-energy":
-            stiffness = material.bending_stiffness * factors
-            return bending_energy(now, garment, material.replace(bending_stiffness=stiffness))
-        masses = vertex_masses(garment, material.replace(density=material.density * factors))
-        if name == "inertia-energy":
-            return inertia_energy(now, before + timestep * velocity, masses, timestep)
-        return gravity_energy(now, before, masses, gravity)
+    def total(factors: Float[Array, " vertices"]) -> Float[Array, ""]:
+        on_faces, on_hinges = (factors[rows].mean(axis=1) for rows in (garment.faces, garment.hinges))
+        scaled = garment.replace(
+            vertex_areas=garment.vertex_areas * factors, rest_areas=garment.rest_areas * on_faces
+        )
+        load, pairs = problem.friction_load, problem.self_contacts
+        if load is not None:
+            load = load * factors
+        if pairs is not None:
+            on_pairs = 0.25 * (factors[pairs.vertices] + factors[pairs.corners].sum(axis=1))
+            pairs = pairs.replace(areas=pairs.areas * on_pairs)
+        terms = potential_terms(
+            position,
+            problem.replace(friction_load=load, self_contacts=pairs),
+            scaled,
+            material.replace(bending_stiffness=material.bending_stiffness * on_hinges),
+        )
+        return jnp.asarray(getattr(terms, term))
 
-    sizes = {"stretch-energy": garment.faces.shape[0], "bending-energy": garment.hinges.shape[0]}
-    ones = jnp.ones(sizes.get(name, garment.vertex_areas.shape[0]))
+    return jax.grad(total)(jnp.ones_like(garment.vertex_areas))
 
-    @jax.jit
-    def every_frame(positions, velocities):
-        def frame(inputs):
-            return jax.grad(total)(ones, *inputs)
 
-        return jax.lax.map(frame, (positions[1:], positions[:-1], velocities[:-1]))
+def excess_shares(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> Float[Array, " vertices"]:
+    """Share the excess over the optimum out over the vertices [J]; the shares add up to it.
 
-    shares = every_frame(positions, velocities)
-    if name in sizes:
-        corners = 3 if name == "stretch-energy" else 4
-        table = garment.face_incidence if corners == 3 else garment.hinge_incidence
-        spread = jnp.repeat(shares[:, :, None] / corners, corners, axis=2)
-        shares = jax.lax.map(lambda values: scatter_corners(values, table), spread)
-    return jnp.concatenate([jnp.zeros_like(shares[:1]), shares])
+    A vertex' share is the work that the forces left at it do on its straight way x* + s (x - x*) to the optimum,
+    the integral of grad P . (x - x*) over s. The difference of the energies that a vertex holds here and there
+    would add up as well, but the terms trade energy at first order of x - x* while the excess is of the second:
+    it would show the trade.
+
+    Args:
+        position: Any stepper's answer at t + 1 [m].
+        problem: The frame's problem.
+        garment: Rest mesh.
+        material: Fabric.
+    """
+    minimum = solve(
+        problem, garment, material, position, iterations=_ITERATIONS, memory=8, tolerance=_TOLERANCE
+    )
+    way = position - minimum.position
+    places, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
+
+    def work(place: Float[Array, ""]) -> Float[Array, " vertices"]:
+        gradient = jax.grad(potential)(minimum.position + place * way, problem, garment, material)
+        return jnp.sum(gradient * way, axis=-1)
+
+    works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
+    return jnp.asarray(0.5 * weights, position.dtype) @ works
 
 
 def _distances(run: Run) -> Field:
     """Return the height of every vertex over the tangent plane of the nearest body vertex [m]."""
     trajectory = run.trajectory
-    if trajectory.body_positions is None or trajectory.body_faces is None:
-        raise AssetError(f"{run.name} has no body to measure the distance to; colour by something else")
+    assert trajectory.body_positions is not None
+    assert trajectory.body_faces is not None
     values = np.empty(trajectory.positions.shape[:2], np.float32)
     faces = trajectory.body_faces
     for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body_positions, strict=True)):

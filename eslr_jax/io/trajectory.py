@@ -2,7 +2,8 @@
 
 Layout: `positions`, `velocities` [frames, vertices, 3], `faces` [faces, 3], `timestep`, `metadata` (JSON
 text) and `format`; with a body also `body_positions` [frames, body_vertices, 3] and `body_faces`
-[body_faces, 3]. SI units, Y up, float32.
+[body_faces, 3], and what finding its contacts again takes: `body_rest_positions` [body_vertices, 3] and
+`contact_faces` [contact_faces, 3], those of the body that were searched. SI units, Y up, float32.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class TrajectoryFile:
     body_faces: np.ndarray | None  # [body_faces, 3]
     timestep: float  # seconds between frames
     metadata: dict[str, Any]  # JSON-compatible: garment, motion, versions, ...
+    body_rest_positions: np.ndarray | None = None  # [body_vertices, 3], [m]; None in files of older versions
+    contact_faces: np.ndarray | None = None  # [contact_faces, 3], body faces in the cloth's reach; likewise
 
     @property
     def num_frames(self) -> int:
@@ -49,6 +52,8 @@ def write_trajectory(
     timestep: float,
     body_positions: np.ndarray | None = None,
     body_faces: np.ndarray | None = None,
+    body_rest_positions: np.ndarray | None = None,
+    contact_faces: np.ndarray | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a trajectory, atomically.
@@ -61,6 +66,8 @@ def write_trajectory(
         timestep: Time between frames [s].
         body_positions: Body vertex positions [m], shape [frames, body_vertices, 3]; None without a body.
         body_faces: Body triangles, shape [body_faces, 3].
+        body_rest_positions: Body vertex positions at rest [m], shape [body_vertices, 3].
+        contact_faces: Body triangles that the simulation searched for contacts, shape [contact_faces, 3].
         metadata: Anything JSON can hold.
 
     Raises:
@@ -84,6 +91,10 @@ def write_trajectory(
         arrays["body_positions"] = np.asarray(body_positions, np.float32)
     if body_faces is not None:
         arrays["body_faces"] = np.asarray(body_faces, np.int32)
+    if body_rest_positions is not None:
+        arrays["body_rest_positions"] = np.asarray(body_rest_positions, np.float32)
+    if contact_faces is not None:
+        arrays["contact_faces"] = np.asarray(contact_faces, np.int32)
     _check(arrays, path)
     write_arrays(path, arrays)
 
@@ -116,6 +127,8 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         body_faces=arrays.get("body_faces"),
         timestep=float(arrays["timestep"]),
         metadata=metadata,
+        body_rest_positions=arrays.get("body_rest_positions"),
+        contact_faces=arrays.get("contact_faces"),
     )
 
 
@@ -153,6 +166,19 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
                 f"trajectory {path} has {len(arrays['positions'])} garment frames and "
                 f"{len(arrays['body_positions'])} body frames; they must agree"
             )
+    if ("body_rest_positions" in arrays) != ("contact_faces" in arrays):
+        raise AssetError(
+            f"trajectory {path} has only one of body_rest_positions and contact_faces; give both or neither"
+        )
+    if "contact_faces" in arrays:
+        rest = arrays["body_rest_positions"]
+        if "body_positions" not in arrays or rest.shape != arrays["body_positions"].shape[1:]:
+            raise AssetError(
+                f"trajectory {path} has body_rest_positions of shape {rest.shape}; they must be those of its body"
+            )
+        _check_mesh(
+            {**arrays, "body_rest_positions": rest[None]}, "body_rest_positions", "contact_faces", path
+        )
 
 
 def _check_mesh(arrays: Mapping[str, np.ndarray], positions: str, faces: str, path: str | Path) -> None:
