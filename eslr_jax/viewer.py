@@ -172,7 +172,7 @@ def _save_picture(client: Any) -> None:
     picture = client.get_render(height=height, width=width, transport_format="png")
     stream = io.BytesIO()
     require("PIL.Image", extra="view").fromarray(picture).save(stream, format="PNG")
-    client.send_file_download("garment.png", stream.getvalue())
+    client.send_file_download("garment.png", stream.getvalue(), save_immediately=True)  # else a link
 
 
 def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:
