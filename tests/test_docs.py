@@ -5,7 +5,6 @@ import io
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import urllib.request
@@ -135,8 +134,7 @@ def test_documented_views_serve_a_page(workplace, page, words):
             with urllib.request.urlopen(address, timeout=60) as answer:
                 assert answer.status == 200
         finally:
-            server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=60) in (0, 130), f"{page.name}: {' '.join(words)}"
+            server.terminate()
 
 
 @pytest.mark.slow
