@@ -129,8 +129,8 @@ def test_documented_views_serve_a_page(workplace, page, words):
     command = [sys.executable, "-m", "eslr_jax.cli", *words[1:]]
     with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        address = server.stdout.readline().strip()
         try:
+            address = next(line.strip() for line in server.stdout if line.startswith("http"))  # under viser's own
             with urllib.request.urlopen(address, timeout=60) as answer:
                 assert answer.status == 200
         finally:
