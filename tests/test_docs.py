@@ -130,7 +130,9 @@ def test_documented_views_serve_a_page(workplace, page, words):
     with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:
-            address = next(line.strip() for line in server.stdout if line.startswith("http"))  # under viser's own
+            address = next(
+                line.strip() for line in server.stdout if line.startswith("http")
+            )  # under viser's own
             with urllib.request.urlopen(address, timeout=60) as answer:
                 assert answer.status == 200
         finally:
