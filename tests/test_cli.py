@@ -156,3 +156,9 @@ def test_broken_motion_is_refused(tmp_path):
     refused(
         eslr("simulate", "--motion", path, "--simulator", "physics", "--out", tmp_path / "out"), "no motion"
     )
+
+
+def test_a_resumed_training_takes_no_other_configuration(tmp_path):
+    result = eslr("train", "--out", tmp_path / "run", "--resume", "--set", "iterations=3")
+    refused(result, "--resume", "--set")
+    assert not (tmp_path / "run").exists()

@@ -61,6 +61,11 @@ def train(
     from eslr_jax.training.recipe import load_recipe
 
     if resume:
+        if config is not None or set_ or start_from is not None:
+            raise ConfigError(
+                "--resume goes on with the run's own configuration; leave out --config, --set and --start-from, "
+                "or start a new run in another folder"
+            )
         chosen = read_run_config(out)
     elif config is None:
         raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
@@ -70,7 +75,7 @@ def train(
     if coordinator is not None:  # before anything is computed, as jax.distributed demands
         _join_processes(coordinator, num_processes, process_id)
     initial = None
-    if start_from is not None and not resume:
+    if start_from is not None:
         initial, _ = load_model(start_from)
         check_params(chosen.model, initial)
     with _training_progress(chosen.iterations, out if tensorboard else None) as show:
