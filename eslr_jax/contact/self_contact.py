@@ -1,4 +1,4 @@
-"""Where points come close to faces of cloth, and its edges to each other: pairs of fixed capacity."""
+"""Where points come close to faces of cloth: pairs of fixed capacity, found in sorted cells."""
 
 from __future__ import annotations
 
@@ -23,30 +23,22 @@ _CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
 CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
 _TIP_CELL_CAPACITY = 512  # likewise around a tip, whose cells are larger
 PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
-_EDGE_DUPLICATES = 4  # rows that find the same two edges, as a mean
-_EDGES_PER_VERTEX = 3  # of a triangle mesh: edges share the area that vertices stand for
-_MIN_SQUARED_SINE = 0.01  # between edges; nearly parallel ones have no common normal to speak of
 PAIRS_PER_TIP = 8  # likewise for tips, over the vertices of both; cloth bunched around a needle took 4.7
 
 
 @struct.dataclass
-class ClosePairs:
-    """Pairs of places that are close at t: a point and a face of the cloth, or two of its edges.
+class FacePairs:
+    """Pairs of a point and a face of the cloth that are close at t.
 
-    The offset between the places is share x_p - sum_k w_k x_k, of the point p and three corners k. Of a face
-    pair the share is one and the weights are barycentric; the points are the cloth's own vertices, or vertices
-    of the body. Of an edge pair the point and the first corner are the ends of one edge, with the share 1 - s
-    and the weight -s, and the others those of the other one, with 1 - t and t. A row that is not used has
-    `side` zero, and names the last point and the last vertex.
+    The points are the cloth's own vertices, or vertices of the body. A row that is not used has `side` zero,
+    and names the last point and the last vertex.
     """
 
     vertices: Int[Array, " pairs"]  # the points' rows
-    corners: Int[Array, "pairs 3"]  # vertices of the face, or the other three ends
-    share: Float[Array, " pairs"]  # of the point in its place
-    weights: Float[Array, "pairs 3"]  # of the corners, for the places that are nearest at t
-    is_edge: Bool[Array, " pairs"]
-    side: Float[Array, " pairs"]  # 1 where the offset is along the pair's normal at t, -1 against it
-    areas: Float[Array, " pairs"]  # of cloth that the pair stands for [m^2]
+    corners: Int[Array, "pairs 3"]  # vertices of the face
+    weights: Float[Array, "pairs 3"]  # barycentric, of the place on the face nearest to the point at t
+    side: Float[Array, " pairs"]  # 1 where the point is on the side of the face's normal at t, -1 behind
+    areas: Float[Array, " pairs"]  # of cloth that the point stands for [m^2]
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
     listed: Int[Array, ""]  # the cell capacity that would have held all faces looked at
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
@@ -69,21 +61,20 @@ def find_self_contacts(
     radius: Float[Array, ""] | float = SEARCH_RADIUS,
     capacity: int | None = None,
     cell_capacity: int = CELL_CAPACITY,
-) -> ClosePairs:
-    """Pair every vertex with the faces, and every edge with the edges, that it could touch during the frame.
+) -> FacePairs:
+    """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
     A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
     must stand over the face rather than beside it. Which side it is on is decided at t, where layers are
     taken to be in order. Faces around the vertex are no pairs: those that hold it, and those within two edges
-    of it that are also within 2 cm in the rest mesh. Edges are looked at where an end of one is paired with a
-    face of the other.
+    of it that are also within 2 cm in the rest mesh.
 
     Args:
         position: Vertices at t [m].
         predicted: A guess of the vertices at t + 1 [m], such as the inertial one.
         garment: Rest mesh.
         radius: Of the search [m].
-        capacity: Rows for face pairs, and as many for edge pairs; eight per vertex by default. Static.
+        capacity: Rows for pairs; eight per vertex by default. Static.
         cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
             centroid is close; static.
     """
@@ -98,128 +89,7 @@ def find_self_contacts(
         cell_capacity=cell_capacity,
     )
     is_around = _is_around(pairs.vertices, pairs.corners, garment)
-    pairs = dataclasses.replace(pairs, side=jnp.where(is_around, 0.0, pairs.side))
-    return _join(pairs, _find_edge_pairs(pairs, position, predicted, garment, radius=radius))
-
-
-def _join(a: ClosePairs, b: ClosePairs) -> ClosePairs:
-    """Return the pairs of both; counts are the larger ones, as both have the same capacity."""
-    rows = ("vertices", "corners", "share", "weights", "is_edge", "side", "areas")
-    return ClosePairs(
-        **{name: jnp.concatenate([getattr(a, name), getattr(b, name)]) for name in rows},
-        count=jnp.maximum(a.count, b.count),
-        listed=jnp.maximum(a.listed, b.listed),
-        status=a.status | b.status,
-    )
-
-
-def _find_edge_pairs(
-    found: ClosePairs,
-    position: Float[Array, "vertices 3"],
-    predicted: Float[Array, "vertices 3"],
-    garment: Garment,
-    *,
-    radius: Float[Array, ""] | float,
-) -> ClosePairs:
-    """Return pairs of edges, one that leaves the vertex of a face pair and one around its face."""
-    capacity, num_vertices = found.vertices.shape[0], position.shape[0]
-    degree = garment.neighbors.shape[1]
-    shape = (capacity, degree, 3)
-    start = jnp.broadcast_to(found.vertices[:, None, None], shape).ravel()
-    end = jnp.broadcast_to(garment.neighbors[found.vertices][:, :, None], shape).ravel()
-    around = [jnp.broadcast_to(found.corners[:, None, k], shape).ravel() for k in ([0, 1, 2], [1, 2, 0])]
-    ends = _canonical(start, end, *around)
-    is_candidate = jnp.broadcast_to((found.side != 0)[:, None, None], shape).ravel() & (start != end)
-    is_pair, s, t, side = _is_edge_pair(ends, position, predicted, radius)
-    # The same two edges are met from both sides and both ends; equal rows are neighbours once sorted.
-    limit = _EDGE_DUPLICATES * capacity
-    rows, num_close = _compact(is_candidate & is_pair, limit)
-    rows = jnp.minimum(rows, start.shape[0] - 1)
-    is_real = jnp.arange(limit) < num_close
-    keys = [jnp.where(is_real, end[rows], num_vertices) for end in ends]
-    order = jnp.lexsort(keys[::-1])
-    keys = [key[order] for key in keys]
-    is_repeated = jnp.ones(limit, bool).at[0].set(False)
-    for key in keys:
-        is_repeated = is_repeated & (key == jnp.roll(key, 1))
-    p, a, b, c = (jnp.minimum(key, num_vertices - 1) for key in keys)
-    is_around = _is_around(p, jnp.stack([b, c, c], 1), garment) | _is_around(
-        a, jnp.stack([b, c, c], 1), garment
-    )
-    kept, count = _compact((keys[0] < num_vertices) & ~is_repeated & ~is_around, capacity)
-    is_used = jnp.arange(capacity) < count
-    kept = jnp.minimum(kept, limit - 1)
-    source = rows[order][kept]
-    s, t = s[source], t[source]
-    areas = (garment.vertex_areas[p] + garment.vertex_areas[a])[kept] / 2 / _EDGES_PER_VERTEX
-    is_full = (count > capacity) | (num_close > limit)
-    last = num_vertices - 1
-    return ClosePairs(
-        vertices=jnp.where(is_used, p[kept], last),
-        corners=jnp.where(is_used[:, None], jnp.stack([a, b, c], axis=1)[kept], last),
-        share=1.0 - s,
-        weights=jnp.stack([-s, 1.0 - t, t], axis=1),
-        is_edge=jnp.ones(capacity, bool),
-        side=jnp.where(is_used, side[source], 0.0),
-        areas=jnp.where(is_used, areas, 0.0),
-        count=jnp.maximum(count, -(-num_close // _EDGE_DUPLICATES)),
-        listed=jnp.int32(0),
-        status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
-    )
-
-
-def _canonical(*ends: Int[Array, " rows"]) -> tuple[Int[Array, " rows"], ...]:
-    """Order the ends of both edges, then the edges, so that every two edges are written in one way."""
-    a0, a1 = jnp.minimum(ends[0], ends[1]), jnp.maximum(ends[0], ends[1])
-    b0, b1 = jnp.minimum(ends[2], ends[3]), jnp.maximum(ends[2], ends[3])
-    is_second = (b0 < a0) | ((b0 == a0) & (b1 < a1))
-    return (
-        jnp.where(is_second, b0, a0),
-        jnp.where(is_second, b1, a1),
-        jnp.where(is_second, a0, b0),
-        jnp.where(is_second, a1, b1),
-    )
-
-
-def _is_edge_pair(
-    ends: tuple[Int[Array, " rows"], ...],
-    position: Float[Array, "vertices 3"],
-    predicted: Float[Array, "vertices 3"],
-    radius: Float[Array, ""] | float,
-) -> tuple[Bool[Array, " rows"], Float[Array, " rows"], Float[Array, " rows"], Float[Array, " rows"]]:
-    """Return which rows are pairs, where along both edges they are nearest, and the side of the first one.
-
-    Edges cross within both; beside an end there is a vertex and a face.
-    """
-    offset, u, v = _edge_vectors(ends, position)
-    uu, vv, uv, uo, vo = dot3(u, u), dot3(v, v), dot3(u, v), dot3(u, offset), dot3(v, offset)
-    determinant = uu * vv - uv * uv
-    is_crossing = determinant > _MIN_SQUARED_SINE * uu * vv
-    divisor = jnp.where(is_crossing, determinant, 1.0)
-    s, t = (uv * vo - vv * uo) / divisor, (uu * vo - uv * uo) / divisor
-    is_within = is_crossing & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    height = _edge_height(offset, u, v, s, t)
-    predicted_height = _edge_height(*_edge_vectors(ends, predicted), s, t)
-    side = jnp.where(height < 0, -1.0, 1.0).astype(position.dtype)
-    is_reached = (jnp.abs(height) < _NEAR) | (side * predicted_height < _NEAR)
-    is_apart = (ends[0] != ends[2]) & (ends[0] != ends[3]) & (ends[1] != ends[2]) & (ends[1] != ends[3])
-    return is_within & is_apart & is_reached & (jnp.abs(height) < radius), s, t, side
-
-
-def _edge_vectors(
-    ends: tuple[Int[Array, " rows"], ...], position: Float[Array, "vertices 3"]
-) -> tuple[Vector3, Vector3, Vector3]:
-    """Return the way from the second edge's start to the first one's, and both edges [m]."""
-    a0, a1, b0, b1 = (_gather(position, end) for end in ends)
-    return sub3(a0, b0), sub3(a1, a0), sub3(b1, b0)
-
-
-def _edge_height(offset: Vector3, u: Vector3, v: Vector3, s: Array, t: Array) -> Array:
-    """Return the distance of two places on edges along their common normal u x v [m]."""
-    normal = cross3(u, v)
-    size = safe_norm(jnp.stack(normal, axis=-1))
-    between = tuple(o + s * a - t * b for o, a, b in zip(offset, u, v, strict=True))
-    return dot3(between, normal) / jnp.where(size > 0, size, 1.0)  # type: ignore[arg-type]
+    return dataclasses.replace(pairs, side=jnp.where(is_around, 0.0, pairs.side))
 
 
 def find_tip_contacts(
@@ -232,7 +102,7 @@ def find_tip_contacts(
     radius: Float[Array, ""] | float = TIP_RADIUS,
     capacity: int | None = None,
     cell_capacity: int = _TIP_CELL_CAPACITY,
-) -> ClosePairs:
+) -> FacePairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 
     The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh; its own
@@ -282,7 +152,7 @@ def _find_pairs(
     radius: Float[Array, ""] | float,
     capacity: int,
     cell_capacity: int,
-) -> ClosePairs:
+) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
     num_points, num_vertices = points.position.shape[0], position.shape[0]
     corners = [_gather(position, garment.faces[:, k]) for k in range(3)]
@@ -306,12 +176,10 @@ def _find_pairs(
     point = jnp.where(is_used, point[rows], num_points - 1)
     listed = jnp.maximum(most, -(-num_close // num_points))
     is_full = (listed > cell_capacity) | (count > capacity)
-    return ClosePairs(
+    return FacePairs(
         vertices=point,
         corners=jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1),
-        share=jnp.ones(capacity, position.dtype),
         weights=weights[rows],
-        is_edge=jnp.zeros(capacity, bool),
         side=jnp.where(is_used, side[rows], 0.0),
         areas=jnp.where(is_used, points.areas[point], 0.0),
         count=count,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.contact.self_contact import ClosePairs
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.types import Contacts, Garment, Material
 
@@ -160,7 +160,7 @@ def _friction_blocks(
     return (load / length)[:, None, None] * curvature
 
 
-def pair_table(pairs: ClosePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
+def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
     """Return the vertices of every pair in use: of the point, where it is of the cloth, and of the face."""
     if pairs is None:
         return np.zeros((0, 3 + is_cloth), np.int64)
@@ -171,7 +171,7 @@ def pair_table(pairs: ClosePairs | None, *, is_cloth: bool = True) -> Int[np.nda
 
 def pair_blocks(
     position: Float[np.ndarray, "vertices 3"],
-    pairs: ClosePairs | None,
+    pairs: FacePairs | None,
     stiffness: float,
     thickness: float,
     next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
@@ -195,32 +195,21 @@ def pair_blocks(
         np.asarray(pairs.vertices)
     ]
     point, weights, side = points[is_used], np.asarray(pairs.weights, np.float64)[is_used], side[is_used]
-    share, is_edge = np.asarray(pairs.share, np.float64)[is_used], np.asarray(pairs.is_edge)[is_used, None]
     corners = position[np.asarray(pairs.corners)[is_used]]
-    first = np.where(is_edge, corners[:, 0] - point, corners[:, 1] - corners[:, 0])
-    second = corners[:, 2] - np.where(is_edge, corners[:, 1], corners[:, 0])
-    normal = np.cross(first, second)
+    edges = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
     size = np.linalg.norm(normal, axis=1)[:, None]
     size = np.where(size > 0, size, 1.0)
     normal = normal * (side[:, None] / size)
-    offset = share[:, None] * point - np.einsum("pk,pka->pa", weights, corners)
+    offset = point - np.einsum("pk,pka->pa", weights, corners)
     height = np.sum(offset * normal, axis=1)
-    # The normal turns with its corners; that moves the height by what of the offset lies across it.
+    # The plane turns with its corners; that moves the height by what of the offset lies within the plane.
     tangential = (offset - height[:, None] * normal) * (side[:, None] / size)
-    by_first, by_second = np.cross(second, tangential), np.cross(tangential, first)
-    turn_point = np.where(is_edge, -by_first, 0.0)
-    turn = np.stack(
-        [
-            np.where(is_edge, by_first, -by_first - by_second),
-            np.where(is_edge, -by_second, by_first),
-            by_second,
-        ],
-        axis=1,
-    )
+    turn = np.stack([np.cross(edges[:, 1], tangential), np.cross(tangential, edges[:, 0])], axis=1)
+    turn = np.concatenate([-turn.sum(axis=1, keepdims=True), turn], axis=1)
     gradient = turn - weights[:, :, None] * normal[:, None]
     if is_cloth:
-        at_point = share[:, None] * normal + turn_point
-        gradient = np.concatenate([at_point[:, None], gradient], axis=1)
+        gradient = np.concatenate([normal[:, None], gradient], axis=1)
     gradient = gradient.reshape(len(side), -1)
     curvature = 6.0 * stiffness * np.asarray(pairs.areas, np.float64)[is_used]
     curvature = curvature * np.maximum(thickness - height, 0.0)

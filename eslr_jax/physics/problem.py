@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from eslr_jax.contact.self_contact import ClosePairs
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.repulsion import push_apart
 from eslr_jax.types import ClothState, Contacts, Garment
 
@@ -41,9 +41,9 @@ class FrameProblem:
     collision_thickness: Float[Array, ""] | None  # of `contact_thickness` [m]
     parameters: PhysicsParameters
     across: Contacts | None = None  # with the body part on the other side of the cloth; None without a body
-    self_contacts: ClosePairs | None = None  # None: layers of cloth pass through each other
+    self_contacts: FacePairs | None = None  # None: layers of cloth pass through each other
     repulsion_thickness: Float[Array, ""] | None = None  # between layers, likewise [m]
-    tips: ClosePairs | None = None  # of body vertices with the cloth; None: a tip may pass between vertices
+    tips: FacePairs | None = None  # of body vertices with the cloth; None: a tip may pass between vertices
     next_body: Float[Array, "surface_vertices 3"] | None = None  # at t + 1 [m], where there are tips
 
 
@@ -65,9 +65,9 @@ def make_problem(
     pin_targets: Float[Array, "vertices 3"] | None,
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
-    self_contacts: ClosePairs | None = None,
+    self_contacts: FacePairs | None = None,
     across: Contacts | None = None,
-    tips: ClosePairs | None = None,
+    tips: FacePairs | None = None,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> FrameProblem:
     """Collect what one frame's potential depends on.

@@ -1,4 +1,4 @@
-"""Repulsion: a one-sided cubic barrier between a point and the plane of a face of cloth, or between two edges.
+"""Repulsion: a one-sided cubic barrier between a point and the plane of a face of cloth.
 
 The points are vertices of the same cloth (self-contact), or of the body (`next_body`, which does not give way).
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.contact.self_contact import ClosePairs
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3
 
 _SWEEPS = 4  # of `push_apart`
@@ -16,36 +16,28 @@ _SWEEPS = 4  # of `push_apart`
 
 def pair_heights(
     position: Float[Array, "vertices 3"],
-    pairs: ClosePairs,
+    pairs: FacePairs,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> tuple[Float[Array, " pairs"], Vector3]:
-    """Return the height of every pair's places over each other, on the side it is kept on [m], and its direction.
+    """Return every point's height over its face's plane, on the side it is kept on [m], and that direction.
 
-    d = side (share x_p - sum_k w_k x_k) . n, with the unit normal n at `position`, of the face or common to
-    both edges; so the energy of d turns with the cloth, and its four forces have no resultant and no moment.
-    Unused rows give zero.
+    d = side (x_p - sum_k w_k x_k) . n, with the face's unit normal n at `position`; so the energy of d turns
+    with the cloth, and its four forces have no resultant and no moment. Unused rows give zero.
     """
     x = components(position)
     point = tuple(c[pairs.vertices] for c in (x if next_body is None else components(next_body)))
     corners = [tuple(c[pairs.corners[:, k]] for c in x) for k in range(3)]
     weights = [pairs.weights[:, k] for k in range(3)]
     foot = tuple(sum(weights[k] * corners[k][axis] for k in range(3)) for axis in range(3))
-    place = tuple(pairs.share * c for c in point)
-    # A face's normal is (c1 - c0) x (c2 - c0), that of two edges (c0 - p) x (c2 - c1).
-    origins = [
-        tuple(jnp.where(pairs.is_edge, edge, face) for edge, face in zip(*ends, strict=True))
-        for ends in ((point, corners[0]), (corners[1], corners[0]))
-    ]
-    tip = tuple(jnp.where(pairs.is_edge, e, f) for e, f in zip(corners[0], corners[1], strict=True))
-    normal = cross3(sub3(tip, origins[0]), sub3(corners[2], origins[1]))  # type: ignore[arg-type]
+    normal = cross3(sub3(corners[1], corners[0]), sub3(corners[2], corners[0]))  # type: ignore[arg-type]
     unit = safe_normalize(jnp.stack(normal, axis=0), axis=0)
     direction = (pairs.side * unit[0], pairs.side * unit[1], pairs.side * unit[2])
-    return dot3(sub3(place, foot), direction), direction  # type: ignore[arg-type]
+    return dot3(sub3(point, foot), direction), direction  # type: ignore[arg-type]
 
 
 def overlaps(
     position: Float[Array, "vertices 3"],
-    pairs: ClosePairs,
+    pairs: FacePairs,
     thickness: Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " pairs"]:
@@ -56,7 +48,7 @@ def overlaps(
 
 def repulsion_energy(
     position: Float[Array, "vertices 3"],
-    pairs: ClosePairs,
+    pairs: FacePairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
@@ -79,7 +71,7 @@ def repulsion_energy(
 
 def repulsion_diagonal(
     position: Float[Array, "vertices 3"],
-    pairs: ClosePairs,
+    pairs: FacePairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
@@ -87,13 +79,13 @@ def repulsion_diagonal(
     """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal."""
     depth = overlaps(position, pairs, thickness, next_body)
     curvature = 2.0 * stiffness * pairs.areas * depth
-    at_point = pairs.share**2 * curvature if next_body is None else None
+    at_point = curvature if next_body is None else None
     return _scatter(pairs, at_point, pairs.weights**2 * curvature[:, None], position.shape[0])
 
 
 def push_apart(
     position: Float[Array, "vertices 3"],
-    pairs: ClosePairs,
+    pairs: FacePairs,
     thickness: Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, "vertices 3"]:
@@ -103,32 +95,26 @@ def push_apart(
     of several pairs moves by the mean of what they ask for.
     """
     num_vertices = position.shape[0]
-    half = 0.5 if next_body is None else 1.0
-    # Moving the vertices of a place by w_k / |w|^2 moves the place by one. Of two edges the point and the first
-    # corner are one place, of a face all corners are.
-    squares = pairs.weights**2
-    is_edge = pairs.is_edge
-    first = jnp.where(is_edge, pairs.share**2 + squares[:, 0], pairs.share**2)
-    second = jnp.sum(squares, axis=1) - jnp.where(is_edge, squares[:, 0], 0.0)
-    scale = half * pairs.weights / jnp.stack([jnp.where(is_edge, first, second), second, second], axis=1)
-    point_scale = half * pairs.share / first
+    share = 0.5 if next_body is None else 1.0
     for _ in range(_SWEEPS):
         height, direction = pair_heights(position, pairs, next_body)
         depth = jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
         is_deep = (depth > 0).astype(position.dtype)
-        touched = is_deep[:, None] * (pairs.weights != 0)
+        # Moving corner k by w_k / |w|^2 moves the foot by one.
+        scale = share * pairs.weights / jnp.sum(pairs.weights**2, axis=1, keepdims=True)
+        touched = is_deep[:, None] * (pairs.weights > 0)
         asked = _scatter(pairs, is_deep if next_body is None else None, touched, num_vertices)
         moves = []
         for axis in direction:
             lift = depth * axis
-            at_point = point_scale * lift if next_body is None else None
+            at_point = share * lift if next_body is None else None
             moves.append(_scatter(pairs, at_point, -lift[:, None] * scale, num_vertices))
         position = position + jnp.stack(moves, axis=-1) / jnp.maximum(asked, 1.0)[:, None]
     return position
 
 
 def _scatter(
-    pairs: ClosePairs,
+    pairs: FacePairs,
     at_point: Float[Array, " pairs"] | None,
     at_corners: Float[Array, "pairs 3"],
     num_vertices: int,

@@ -12,7 +12,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach, find_both_sides
 from eslr_jax.contact.self_contact import (
     CELL_CAPACITY,
-    ClosePairs,
+    FacePairs,
     find_self_contacts,
     find_tip_contacts,
 )
@@ -170,7 +170,7 @@ def step(
     return next_state(position, problem, garment, state, status), report
 
 
-def _needed_capacity(pairs: ClosePairs | None) -> Int[Array, " capacities"] | None:
+def _needed_capacity(pairs: FacePairs | None) -> Int[Array, " capacities"] | None:
     """Return the capacities that self-contact needed, for pairs and for faces in a search column."""
     return None if pairs is None else jnp.stack([pairs.count, pairs.listed])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eslr_jax.contact import self_contact
-from eslr_jax.contact.self_contact import ClosePairs
+from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import prepare_garment, to_device
@@ -127,7 +127,7 @@ def brute_force(garment, position, predicted):
 def found_pairs(garment, contacts):
     """Vertex, face -> side, from the rows in use."""
     table = {tuple(sorted(face)): f for f, face in enumerate(np.asarray(garment.faces).tolist())}
-    used = (np.asarray(contacts.side) != 0) & ~np.asarray(contacts.is_edge)
+    used = np.asarray(contacts.side) != 0
     rows = zip(
         np.asarray(contacts.vertices)[used].tolist(),
         np.asarray(contacts.corners)[used].tolist(),
@@ -165,15 +165,11 @@ def test_too_small_a_capacity_sets_the_bit_and_says_what_is_needed(cloth, option
     position = jnp.asarray(roll_up(cloth), jnp.float32)
     contacts = find_self_contacts(position, position, cloth, **options)
     assert int(contacts.status) == Status.SELF_CONTACT_OVERFLOW
-    for _ in range(2):  # what edges need shows only where all faces have found room
-        needed = {"capacity": int(contacts.count), "cell_capacity": int(contacts.listed)}
-        for name, value in options.items():
-            assert needed[name] > value
-        options = {name: needed[name] for name in options}
-        contacts = find_self_contacts(position, position, cloth, **options)
-        if int(contacts.status) == Status.OK:
-            break
-    assert int(contacts.status) == Status.OK
+    needed = {"capacity": int(contacts.count), "cell_capacity": int(contacts.listed)}
+    for name, value in options.items():
+        assert needed[name] > value
+    enough = find_self_contacts(position, position, cloth, **{name: needed[name] for name in options})
+    assert int(enough.status) == Status.OK
 
 
 def test_padding_changes_no_pair(cloth):
@@ -194,12 +190,10 @@ def pair_of(height, side=1.0, dtype=jnp.float32):
     """One vertex over one triangle, in a garment of four vertices."""
     garment = make_cloth(2, 2, 0.1)
     position = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, -0.1], [0.03, height, -0.04]])
-    contacts = ClosePairs(
+    contacts = FacePairs(
         vertices=jnp.array([3]),
         corners=jnp.array([[0, 1, 2]]),
-        share=jnp.ones(1, dtype),
         weights=jnp.array([[0.3, 0.3, 0.4]], dtype),
-        is_edge=jnp.zeros(1, bool),
         side=jnp.array([side], dtype),
         areas=jnp.asarray(garment.vertex_areas[3:], dtype),
         count=jnp.int32(1),
@@ -207,23 +201,6 @@ def pair_of(height, side=1.0, dtype=jnp.float32):
         status=jnp.int32(0),
     )
     return garment, jnp.asarray(position, dtype), contacts
-
-
-def edges_of(height, side=1.0, dtype=jnp.float32):
-    """Two edges of 10 cm that cross at right angles, at 30 % of the first and 60 % of the second."""
-    garment, _, contacts = pair_of(0.0, side, dtype)
-    position = jnp.array([[0.0, height, 0], [0.1, height, 0], [0.03, 0, 0.06], [0.03, 0, -0.04]], dtype)
-    return (
-        garment,
-        position,
-        contacts.replace(
-            vertices=jnp.array([0]),
-            corners=jnp.array([[1, 2, 3]]),
-            share=jnp.array([0.7], dtype),
-            weights=jnp.array([[-0.3, 0.4, 0.6]], dtype),
-            is_edge=jnp.ones(1, bool),
-        ),
-    )
 
 
 def test_energy_of_one_pair_is_the_formula():
@@ -242,10 +219,9 @@ def test_energy_of_one_pair_is_the_formula():
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("make", [pair_of, edges_of])
-def test_gradient_equals_central_differences_and_closed_form(make):
+def test_gradient_equals_central_differences_and_closed_form():
     with jax.enable_x64(True):
-        garment, position, contacts = make(0.001, dtype=jnp.float64)
+        garment, position, contacts = pair_of(0.001, dtype=jnp.float64)
 
         def energy(x):
             return repulsion_energy(x, contacts, STIFFNESS, THICKNESS)
@@ -257,17 +233,15 @@ def test_gradient_equals_central_differences_and_closed_form(make):
         difference = energies(position[None] + offsets) - energies(position[None] - offsets)
         np.testing.assert_allclose(gradient.ravel(), difference / (2 * step), rtol=1e-5, atol=1e-9)
         force = 3 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3**2
-        point, share = int(contacts.vertices[0]), float(contacts.share[0])
-        np.testing.assert_allclose(gradient[point], [0, -share * force, 0], rtol=1e-6, atol=1e-9 * force)
+        np.testing.assert_allclose(gradient[3], [0, -force, 0], rtol=1e-6, atol=1e-9 * force)
 
 
 @pytest.mark.numerics
 def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
     with jax.enable_x64(True):
         contacts = tree_cast(spiral_contacts, jnp.float64)
-        assert np.any(contacts.is_edge & (contacts.side != 0))
         u, v = contacts.weights[:, 1], contacts.weights[:, 2]
-        contacts = contacts.replace(weights=jnp.stack([contacts.share - u - v, u, v], axis=-1))
+        contacts = contacts.replace(weights=jnp.stack([1 - u - v, u, v], axis=-1))
         x = jnp.asarray(roll_up(cloth, seed=3), jnp.float64)
         forces = -np.asarray(jax.grad(repulsion_energy)(x, contacts, STIFFNESS, 0.01))
         size = np.abs(forces).sum()
@@ -287,9 +261,8 @@ def test_energy_is_finite_on_degenerate_faces_and_coincident_vertices(cloth, spi
         assert np.isfinite(pairs.weights).all()
 
 
-@pytest.mark.parametrize("make", [pair_of, edges_of])
-def test_push_apart_ends_the_overlap(make):
-    _, position, contacts = make(-0.004)
+def test_push_apart_ends_the_overlap():
+    _, position, contacts = pair_of(-0.004)
     apart = push_apart(position, contacts, THICKNESS)
     height, _ = pair_heights(apart, contacts)
     assert float(height[0]) == pytest.approx(THICKNESS, abs=1e-4)
@@ -301,63 +274,11 @@ def test_push_apart_leaves_separate_layers_alone(cloth):
     np.testing.assert_array_equal(push_apart(position, contacts, THICKNESS), position)
 
 
-@pytest.mark.parametrize(
-    ("make", "squares"), [(pair_of, [0.09, 0.09, 0.16, 1.0]), (edges_of, [0.49, 0.09, 0.16, 0.36])]
-)
-def test_diagonal_bounds_a_third_of_the_curvature(make, squares):
-    garment, position, contacts = make(0.001)
+def test_diagonal_bounds_a_third_of_the_curvature():
+    garment, position, contacts = pair_of(0.001)
     diagonal = repulsion_diagonal(position, contacts, STIFFNESS, THICKNESS)
     curvature = 6 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3
-    np.testing.assert_allclose(diagonal, curvature / 3 * np.array(squares), rtol=1e-4)
-
-
-def crossings(garment, position):
-    """Pairs of edges by definition: both ends of both, ordered -> height of the first over the second."""
-    rest, faces = np.asarray(garment.rest_positions, np.float64), np.asarray(garment.faces)
-    edges = np.unique(
-        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0
-    )
-    rings = [{v} for v in range(len(rest))]
-    for a, b in edges:
-        rings[a].add(b)
-        rings[b].add(a)
-    second = [set().union(*(rings[n] for n in ring)) for ring in rings]
-    a, u = position[edges[:, 0]], position[edges[:, 1]] - position[edges[:, 0]]
-    found = {}
-    for k, (start, way) in enumerate(zip(a, u, strict=True)):
-        rows = np.arange(k + 1, len(edges))
-        system = np.stack([np.broadcast_to(way, u[rows].shape), -u[rows], np.cross(way, u[rows])], axis=2)
-        size = np.linalg.norm(system[:, :, 2], axis=1)
-        lengths = np.linalg.norm(way) * np.linalg.norm(u[rows], axis=1)
-        rows, system, size = (part[size > 0.1001 * lengths] for part in (rows, system, size))
-        solved = np.linalg.solve(system, (a[rows] - start)[:, :, None])[:, :, 0]
-        heights = -solved[:, 2] * size
-        inside = np.all((solved[:, :2] > 1e-6) & (solved[:, :2] < 1 - 1e-6), axis=1)
-        for row, height in zip(rows[inside], heights[inside], strict=True):
-            first, other = edges[k].tolist(), edges[row].tolist()
-            is_around = any(
-                second[v] & set(other) and np.linalg.norm(rest[other] - rest[v], axis=1).min() < 0.02
-                for v in first
-            )
-            if abs(height) < NEAR and not is_around and not set(first) & set(other):
-                found[(*first, *other)] = height
-    return found
-
-
-def test_edges_that_cross_nearby_are_pairs(cloth):
-    position = roll_up(cloth, 0.006)
-    contacts = find_self_contacts(*2 * [jnp.asarray(position, jnp.float32)], cloth)
-    used = (np.asarray(contacts.side) != 0) & np.asarray(contacts.is_edge)
-    ends = np.column_stack([contacts.vertices, contacts.corners])[used].tolist()
-    found = dict(zip(map(tuple, ends), np.asarray(contacts.side)[used].tolist(), strict=True))
-    assert len(found) == len(ends), "no pair may count twice"
-    expected = crossings(cloth, position)
-    near = {ends: height for ends, height in expected.items() if abs(height) < 0.9 * NEAR}
-    assert len(near) > 100
-    assert len(set(near) - set(found)) < 0.02 * len(near)
-    both = [ends for ends in found if ends in expected and abs(expected[ends]) > 1e-5]
-    assert len(both) > 0.95 * len(found)
-    assert all(found[ends] == np.sign(expected[ends]) for ends in both)
+    np.testing.assert_allclose(diagonal, curvature / 3 * np.array([0.09, 0.09, 0.16, 1.0]), rtol=1e-4)
 
 
 def test_a_tip_between_vertices_meets_the_face_over_it():
