@@ -153,6 +153,6 @@ LAYERS = HardCase(
     picture="skirt over trousers",
     limit="vertices meet faces, edges do not meet edges: two free sheets that crumple over a ball cross in 17 "
     "pairs of triangles after 2 s; the folded sheet and the skirt stay clean. Without the edges' sagitta in the "
-    "thickness it was the other way round: 0 pairs, and 4 at the hem of the skirt. Pairs of edges, tried with the "
-    "same barrier, made it worse: 35 and 3, without sagitta 57 and 0",
+    "thickness it was the other way round: 0 pairs, and 4 at the hem of the skirt. Pairs of edges, tried with "
+    "the same barrier, made it worse: 35 and 3, without sagitta 57 and 0",
 )
