@@ -1,4 +1,4 @@
-"""Where the solver starts a frame."""
+"""Where the solver and the network start a frame."""
 
 from __future__ import annotations
 

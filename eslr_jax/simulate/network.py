@@ -16,7 +16,8 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
-from eslr_jax.physics.problem import FrameProblem, pin, start_guess
+from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.physics.start import solver_start
 from eslr_jax.physics.subspace import combine_directions
 from eslr_jax.types import ClothState, Garment, Material
 
@@ -69,7 +70,7 @@ def correction_passes(
     *,
     detach: bool = False,
 ) -> tuple[Float[Array, "passes vertices 3"], Int[Array, ""]]:
-    """Correct the pushed-out inertial guess, pass by pass, and return every answer and status bits.
+    """Correct the guess that the solver starts from too, pass by pass, and return every answer and status bits.
 
     Before each pass the potential's gradient, and the preconditioned step down it, are taken at the last
     answer.
@@ -84,7 +85,7 @@ def correction_passes(
         detach: Stop gradients between passes, so that each is trained to do its best from where it starts.
     """
     graph = build_frame_graph(garment, material, inputs, config)
-    guess = start_guess(problem, garment)
+    guess = solver_start(problem, garment, material)
     zeros = jnp.zeros_like(guess)
     inputs = inputs.replace(
         guess=guess, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
