@@ -109,7 +109,7 @@ def workplace(tmp_path_factory, body):
 @pytest.mark.example
 @pytest.mark.parametrize(("page", "words"), RUN, ids=name)
 def test_documented_commands_run(workplace, page, words):
-    added = [] if "--help" in words else SHORTER.get(words[1], [])
+    added = [] if {"--help", "--resume"} & set(words) else SHORTER.get(words[1], [])
     command = [sys.executable, "-m", "eslr_jax.cli", *words[1:], *added]
     result = subprocess.run(command, cwd=workplace, capture_output=True, text=True, timeout=900, check=False)
     assert result.returncode == 0, f"{page.name}: {' '.join(words)}\n{result.stderr}"
