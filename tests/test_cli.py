@@ -162,3 +162,8 @@ def test_a_resumed_training_takes_no_other_configuration(tmp_path):
     result = eslr("train", "--out", tmp_path / "run", "--resume", "--set", "iterations=3")
     refused(result, "--resume", "--set")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["excess-frames", "every", "rollout-frames"])
+def test_an_evaluation_of_nothing_is_refused(option):
+    refused(eslr("evaluate", "--model", "eslr-small", f"--{option}", 0), option.replace("-", "_"), "or more")

@@ -41,6 +41,18 @@ class EvaluationOptions:
     every: int = 4  # of those, measure one in so many
     rollout_frames: int = 300  # of the free rollout; clips are played back and forth
 
+    def __post_init__(self) -> None:
+        """Reject lengths that leave nothing to measure.
+
+        Raises:
+            ConfigError: Names the field and the least value.
+        """
+        for name, least in (("excess_frames", 3), ("every", 1), ("rollout_frames", 4)):
+            if getattr(self, name) < least:
+                raise ConfigError(
+                    f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
+                )
+
 
 def evaluate(
     params: Any,
