@@ -29,6 +29,7 @@ from eslr_jax.evaluation.hard_cases.build import (
 )
 from eslr_jax.evaluation.hard_cases.case import HardCase, Runs, Scenes
 from eslr_jax.evaluation.hard_cases.measures import (
+    MM,
     Measure,
     center,
     depths,
@@ -43,7 +44,6 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene import SceneOptions, prepare_scene
 from eslr_jax.types import Material
 
-_MM = 1e3  # millimetres per metre
 _RADIUS = 0.25  # [m] of the ball
 _HEIGHT = 0.30  # [m] of the sheet above the ball's centre
 _SWING_START = 0.5  # [s]
@@ -165,11 +165,11 @@ def _measure_turned(runs: Runs) -> list[Measure]:
         back = runs[label].positions[-1] @ matrix  # the inverse of a turn is its transpose
         difference = np.linalg.norm(back - straight[len(runs[label].positions) - 1], axis=-1)
         measures.append(
-            Measure(f"turned {label}: difference after 1 s, rms [mm]", _MM * _rms(difference), 5.0)
+            Measure(f"turned {label}: difference after 1 s, rms [mm]", MM * _rms(difference), 5.0)
         )
     path = center(runs["0"])
     drift = abs(path[-1, 0] - path[len(path) // 2, 0]) / (len(path) // 2 * FRAME)
-    return [*measures, Measure("sideways drift in the second second [mm/s]", _MM * drift, 5.0)]
+    return [*measures, Measure("sideways drift in the second second [mm/s]", MM * drift, 5.0)]
 
 
 def _rms(values: np.ndarray) -> float:
@@ -347,7 +347,7 @@ _DEPTHS = (5, 10, 20, 50)  # [mm]
 
 def _build_start_inside(options: dict[str, Any]) -> Scenes:
     return {
-        f"{depth} mm": drop_scene(options, height=_RADIUS - depth / _MM, seconds=1.0, is_swinging=False)
+        f"{depth} mm": drop_scene(options, height=_RADIUS - depth / MM, seconds=1.0, is_swinging=False)
         for depth in _DEPTHS
     }
 

@@ -25,7 +25,7 @@ from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_probl
 from eslr_jax.simulate.step import frame_problem, solve
 from eslr_jax.types import Garment, Material
 
-_MM = 1e3  # millimetres per metre
+MM = 1e3  # millimetres per metre
 _SETTLED = 1e4  # [s], a step so long that inertia is nothing: its minimum is the equilibrium
 _REFERENCE_ITERATIONS = 500  # leave 1e-5 of the drop
 _SETTLE_ITERATIONS = 3000
@@ -82,7 +82,7 @@ def depths(run: Run, *, exact: bool = False) -> Float[np.ndarray, "frames items"
                 continue
             is_near = np.min(collider.distance(items), axis=1) < _TRIANGLE_MARGIN
             distance[is_near] = np.minimum(distance[is_near], triangle_distances(collider, items[is_near]))
-        rows.append(-_MM * distance)
+        rows.append(-MM * distance)
     return np.stack(rows)
 
 

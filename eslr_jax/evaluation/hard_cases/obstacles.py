@@ -20,6 +20,7 @@ from eslr_jax.evaluation.hard_cases.build import (
 )
 from eslr_jax.evaluation.hard_cases.case import HardCase, Runs, Scenes
 from eslr_jax.evaluation.hard_cases.measures import (
+    MM,
     Measure,
     center,
     depths,
@@ -30,7 +31,6 @@ from eslr_jax.evaluation.hard_cases.measures import (
 from eslr_jax.evaluation.hard_cases.simulators import Run
 from eslr_jax.physics.problem import PhysicsParameters
 
-_MM = 1e3  # millimetres per metre
 _COLUMNS = 33  # vertices along a side of the half-metre sheet
 
 
@@ -175,10 +175,10 @@ def _measure_slope(runs: Runs) -> list[Measure]:
     creep = np.linalg.norm(path[-1] - path[half]) / ((len(path) - 1 - half) * run.timestep)
     steps = np.linalg.norm(np.diff(run.positions[half:], axis=0), axis=-1)
     return [
-        Measure("creep in the second half minute [mm/s]", _MM * float(creep), 1.0),
+        Measure("creep in the second half minute [mm/s]", MM * float(creep), 1.0),
         Measure(
             "motion in one frame, largest rms [mm]",
-            _MM * float(np.sqrt(np.mean(steps**2, axis=1)).max()),
+            MM * float(np.sqrt(np.mean(steps**2, axis=1)).max()),
             0.2,
         ),
         Measure("depth in the slope, 99.9 % [mm]", quantile_depth(run), None),
