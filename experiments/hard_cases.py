@@ -3,6 +3,7 @@
     python experiments/hard_cases.py physics
     python experiments/hard_cases.py network --model eslr-small
     python experiments/hard_cases.py corrected --model eslr-small --sheet
+    python experiments/hard_cases.py vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
 
 Writes `experiments/results/hard_cases_<simulator>.json` after every case and, with `--sheet`, a picture of all
 that ran beside it. Entries of an earlier file stay until their case is run anew.
@@ -16,6 +17,11 @@ import tempfile
 from pathlib import Path
 
 RESULTS = Path(__file__).resolve().parent / "results"
+PEERS = {
+    "vbd": (5, 20),
+    "style3d": (2, 20),
+    "xpbd": (None, 1),
+}  # substeps, iterations: the best of peers.json
 
 
 def merge(old: dict, new: dict) -> dict:
@@ -34,7 +40,7 @@ def merge(old: dict, new: dict) -> dict:
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("simulator", choices=["physics", "network", "corrected"])
+    parser.add_argument("simulator", choices=["physics", "network", "corrected", *PEERS])
     parser.add_argument("--model", default="eslr-small")
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("--corrector-steps", type=int, default=20)
@@ -48,6 +54,10 @@ def main() -> None:
 
     if options.simulator == "physics":
         simulator = physics_simulator(iterations=options.iterations)
+    elif options.simulator in PEERS:
+        from newton_cloth import Setting, newton_simulator
+
+        simulator = newton_simulator(Setting(options.simulator, *PEERS[options.simulator]))
     else:
         steps = options.corrector_steps if options.simulator == "corrected" else 0
         name = f"{options.model}, {steps} corrector iterations" if steps else options.model

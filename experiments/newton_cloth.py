@@ -2,8 +2,8 @@
 
 Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static
 mesh whose points and velocities are set, and whose search tree is refitted, before every substep; cloth meets it
-by vertices, at the distance that our vertices keep. There is no damping and no self-contact, as there is none in
-the scene; Style3D's own self-contact is switched off.
+by vertices, at the distance that our vertices keep. There is no damping, and self-contact only in scenes that ask
+for it: VBD's at our distance, Style3D's as it comes; XPBD has none for vertices and faces.
 
 How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas of the faces beside it):
 
@@ -32,10 +32,13 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from eslr_jax.errors import EslrError
+from eslr_jax.evaluation.hard_cases import Simulator, StressScene
 from eslr_jax.extras import require
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.types import ClothState, Garment, Material, Scene
+from eslr_jax.simulate.scan import Frames, join_frames
+from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other
 _LEAST_GAP = 0.01  # [m]; Newton's default
@@ -174,13 +177,21 @@ def contact_stiffness(scene: Scene, parameters: PhysicsParameters) -> float:
 class NewtonCloth:
     """A scene in one of Newton's solvers; steps frames from any state."""
 
-    def __init__(self, scene: Scene, setting: Setting, parameters: PhysicsParameters | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        setting: Setting,
+        parameters: PhysicsParameters | None = None,
+        *,
+        self_contact: bool = False,
+    ) -> None:
         """Build the model.
 
         Args:
             scene: Of `prepare_scene`.
             setting: Solver and effort.
             parameters: Physical constants.
+            self_contact: Keep layers apart, where the solver can.
 
         Raises:
             MissingExtraError: Newton is not installed.
@@ -204,7 +215,12 @@ class NewtonCloth:
             model.soft_contact_kd = 0.0
             model.soft_contact_mu = float(parameters.friction_coefficient)
             model.particle_grid, model.particle_max_radius = None, 0.0  # XPBD would keep all vertices apart
-            self._solver = _make_solver(newton, model, setting, float(parameters.friction_speed))
+            layer_distance = None
+            if self_contact:
+                layer_distance = float(contact_thickness(scene.garment, parameters.repulsion_thickness))
+            self._solver = _make_solver(
+                newton, model, setting, float(parameters.friction_speed), layer_distance
+            )
         self._mesh = None
         if self._body is not None:
             self._mesh = model.shape_source[0].mesh
@@ -327,15 +343,61 @@ def _build(newton: Any, scene: Scene, solver: str, cloth: Cloth, parameters: Phy
     return builder
 
 
-def _make_solver(newton: Any, model: Any, setting: Setting, friction_speed: float) -> Any:
-    """Return the solver."""
+def _make_solver(
+    newton: Any, model: Any, setting: Setting, friction_speed: float, layer_distance: float | None
+) -> Any:
+    """Return the solver; layers keep that distance [m], None: they pass through each other."""
     if setting.solver == "vbd":
-        return newton.solvers.SolverVBD(model, iterations=setting.iterations, friction_epsilon=friction_speed)
+        layers = {}
+        if layer_distance is not None:
+            layers = {
+                "particle_enable_self_contact": True,
+                "particle_self_contact_margin": layer_distance,
+                "particle_self_contact_gap": layer_distance,  # Newton's advice: half to all of the margin
+            }
+        return newton.solvers.SolverVBD(
+            model, iterations=setting.iterations, friction_epsilon=friction_speed, **layers
+        )
     if setting.solver == "xpbd":
         return newton.solvers.SolverXPBD(model, iterations=setting.iterations)
     solver = newton.solvers.SolverStyle3D(
         model, config=newton.solvers.SolverStyle3D.Config(iterations=setting.iterations)
     )
-    solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
+    if layer_distance is None:
+        solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
     solver.collision.friction_epsilon = friction_speed
     return solver
+
+
+def newton_simulator(setting: Setting) -> Simulator:
+    """Return a solver of Newton as a simulator of the hard cases.
+
+    Residuals stay zero: Newton reports none, and ours are not its own.
+
+    Args:
+        setting: Solver and effort.
+    """
+
+    def run(stress: StressScene) -> Trajectory:
+        scene = stress.scene
+        try:
+            cloth = NewtonCloth(scene, setting, stress.parameters, self_contact=stress.self_contact)
+            states = [scene.start]
+            for frame in range(scene.num_frames - 1):
+                states.append(cloth(states[-1], frame))
+        except EslrError:
+            raise
+        except Exception as error:  # of a package that names none
+            raise EslrError(f"{setting.name} refused the scene: {error}") from error
+        numpy = jax.numpy
+        frames = Frames(
+            positions=numpy.stack([state.position for state in states[1:]]),
+            velocities=numpy.stack([state.velocity for state in states[1:]]),
+            residuals=numpy.zeros(len(states) - 1),
+            iterations=numpy.full(len(states) - 1, cloth.substeps * setting.iterations),
+            needed_capacity=None,
+        )
+        return join_frames(scene.start, frames, states[-1])
+
+    substeps = "as many" if setting.substeps is None else setting.substeps
+    return Simulator(f"{setting.name}, {substeps}x{setting.iterations}", run)

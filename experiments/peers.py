@@ -37,7 +37,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import MissingExtraError
 from eslr_jax.evaluation.calibrate import device_name, example_scene
-from eslr_jax.evaluation.excess import measure_excess, trajectory_states
+from eslr_jax.evaluation.excess import answer_potentials, measure_excess, trajectory_states
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.hard_cases.simulators import split_frames
 from eslr_jax.evaluation.referee import Referee
@@ -45,7 +45,6 @@ from eslr_jax.evaluation.report import environment
 from eslr_jax.extras import require
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.simulate.scan import frame_inputs, simulate_scene
 from eslr_jax.simulate.step import frame_problem, step
@@ -157,20 +156,6 @@ def take_turns(
     return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
 
 
-@jax.jit
-def _potentials(answers, states, inputs, scene: Scene):
-    """Return the potential [J] of every answer to the frame that starts in the state beside it."""
-
-    def measure(frame):
-        answer, state, inputs = frame
-        problem = frame_problem(
-            scene.garment, state, inputs, scene.surface, scene.timestep, PhysicsParameters()
-        )
-        return potential(answer, problem, scene.garment, scene.material)
-
-    return jax.lax.map(measure, (answers, states, inputs))
-
-
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -196,7 +181,8 @@ def teach(
             method.step(jax.tree.map(lambda leaf, f=frame: leaf[f], states), frame).position
             for frame in frames
         ]
-        excess.append(np.asarray(_potentials(jnp.stack(answers), *taken, scene)) - ends.optimum)
+        reached = answer_potentials(jnp.stack(answers), *taken, scene, parameters)
+        excess.append(np.asarray(reached) - ends.optimum)
     return excess, np.maximum(ends.start - ends.optimum, 1e-9)
 
 

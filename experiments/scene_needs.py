@@ -16,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
+from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.evaluation.calibrate import device_name
+from eslr_jax.evaluation.hard_cases import StressScene, find_case
+from eslr_jax.evaluation.hard_cases.simulators import shorten
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.io.atomic import atomic_write
@@ -111,6 +113,20 @@ def main() -> None:
     layered = SimConfig(simulator="physics", solver_iterations=ITERATIONS, self_contact=True)
     result["T-shirt: self-contact against none"] = compare(
         {"with": steps(scene, layered), "without": steps(scene, config)}, turns
+    )
+    skirt = find_case("layers").build({})["skirt over trousers"]
+    assert isinstance(skirt, StressScene)
+    short = shorten(skirt, frames).scene
+    result["skirt over trousers: layers that collide against layers that don't"] = compare(
+        {"with": steps(short, layered), "without": steps(short, config)}, turns
+    )
+    still = pose_body(body, still_motion(body, frames), num_frames=frames)
+    result["T-shirt: moving body against a still one"] = compare(
+        {"moving": steps(scene, config), "still": steps(prepare_scene(shirt, still), config)}, turns
+    )
+    all_of_it = prepare_scene(shirt, poses, surface=whole, material=by_face)
+    result["T-shirt: all of that against what it needs"] = compare(
+        {"all": steps(all_of_it, layered), "needed": steps(scene, config)}, turns
     )
     result |= {"device": device_name(), "environment": environment()}
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation.excess import measure_excess
 from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.evaluation.scene_parts import Name, time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
@@ -130,7 +131,8 @@ def _measure(model: str | None, scenes: list[Scene], truths: list[Any]) -> Metho
         for count, energy in (excess.solver if model is None else excess.corrected).items():
             relative[count].append(np.maximum(energy - excess.optimum, 0.0) / drop)
     joined = {count: np.concatenate(parts) for count, parts in relative.items()}
-    times = _times(params, scenes[0], config)
+    counted = {count: (params, with_iterations(config, count)) for count in _TIMED_ITERATIONS}
+    times = {count: min(values) for count, values in time_frames(counted, scenes[0]).items()}
     low, high = _TIMED_ITERATIONS
     iteration_ms = (times[high] - times[low]) / (high - low)
     return Method(
@@ -143,8 +145,16 @@ def _measure(model: str | None, scenes: list[Scene], truths: list[Any]) -> Metho
     )
 
 
-def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
-    """Return milliseconds per frame with few and with many iterations, measured in turns."""
+def time_frames(
+    runs: Mapping[Name, tuple[Any, SimConfig]], scene: Scene, turns: int = _TURNS
+) -> dict[Name, list[float]]:
+    """Return milliseconds per frame of rollouts, one number per turn.
+
+    Args:
+        runs: Weights and configurations by name; all are rolled out in turns.
+        scene: Its first frames are simulated.
+        turns: Rollouts of each.
+    """
     frames = min(_TIMED_FRAMES, scene.num_frames)
     short = scene.replace(
         body_positions=None if scene.body_positions is None else scene.body_positions[:frames],
@@ -152,14 +162,13 @@ def _times(params: Any, scene: Scene, config: SimConfig) -> dict[int, float]:
         num_frames=frames,
     )
     parts = {
-        count: (
-            partial(simulate_scene, config=with_iterations(config, count)),
-            (params, short, PhysicsParameters()),
-        )
-        for count in _TIMED_ITERATIONS
+        name: (partial(simulate_scene, config=config), (params, short, PhysicsParameters()))
+        for name, (params, config) in runs.items()
     }
-    times = time_in_turns(parts, _TURNS)
-    return {count: min(values) / (frames - 1) for count, values in times.items()}
+    return {
+        name: [whole / (frames - 1) for whole in values]
+        for name, values in time_in_turns(parts, turns).items()
+    }
 
 
 def with_iterations(config: SimConfig, iterations: int, tolerance: float = 0.0) -> SimConfig:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from eslr_jax.config import SimConfig
 from eslr_jax.io.trajectory import TrajectoryFile
 from eslr_jax.physics.potential import next_friction_load, potential
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
+from eslr_jax.physics.problem import PhysicsParameters, start_guess
 from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import frame_inputs
 from eslr_jax.simulate.step import FrameInput, frame_problem, solve
@@ -82,24 +82,63 @@ def measure_excess(
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
     garment, material = scene.garment, scene.material
 
-    def energy(position: Array, problem: FrameProblem) -> Array:
-        return potential(position, problem, garment, material)
+    counts = [*iterations, _OPTIMUM_ITERATIONS]
+    origins = [0] * len(counts)  # 0: from the start, 1: from the model's answer
+    if params is not None:
+        counts += [*corrector_steps, _OPTIMUM_ITERATIONS]
+        origins += [1] * (len(counts) - len(origins))
 
     def measure(frame):
         state, inputs = frame
         problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-        start = start_guess(problem, garment)
-        run = partial(solve, problem, garment, material, memory=_MEMORY, tolerance=0.0)
-        corrected = {}
+        places = [start_guess(problem, garment)]
         if params is not None:
             assert config.model is not None
-            answer, _ = network_step(params, garment, material, problem, state, config.model)
-            corrected = {count: run(answer, iterations=count).value for count in corrector_steps}
-        solver = {count: run(start, iterations=count).value for count in iterations}
-        optimum = run(start, iterations=_OPTIMUM_ITERATIONS).value
-        if corrected:
+            places.append(network_step(params, garment, material, problem, state, config.model)[0])
+        stacked = jnp.stack(places)
+
+        def descend(task):
+            origin, count = task
+            place = stacked[origin]
+            return solve(
+                problem, garment, material, place, iterations=count, memory=_MEMORY, tolerance=0.0
+            ).value
+
+        # In turn, not unrolled: the solver is compiled once.
+        values = jax.lax.map(descend, (jnp.array(origins), jnp.array(counts)))
+        split = len(iterations)
+        solver = dict(zip(iterations, values[:split], strict=True))
+        optimum, corrected = values[split], {}
+        if params is not None:
+            corrected = dict(zip(corrector_steps, values[split + 1 : -1], strict=True))
             # The network may start in the basin of a deeper minimum than the solver finds.
-            optimum = jnp.minimum(optimum, run(answer, iterations=_OPTIMUM_ITERATIONS).value)
-        return Excess(energy(start, problem), optimum, solver, corrected)
+            optimum = jnp.minimum(optimum, values[-1])
+        return Excess(potential(places[0], problem, garment, material), optimum, solver, corrected)
 
     return jax.lax.map(measure, taken)
+
+
+@jax.jit
+def answer_potentials(
+    answers: Float[Array, "frames vertices 3"],
+    states: ClothState,
+    inputs: FrameInput,
+    scene: Scene,
+    parameters: PhysicsParameters,
+) -> Float[Array, " frames"]:
+    """Return the potential [J] of every answer to the frame that starts in the state beside it.
+
+    Args:
+        answers: Anybody's positions at t + 1 [m].
+        states: Cloth at t, of `trajectory_states`.
+        inputs: The frames' inputs.
+        scene: The scene.
+        parameters: Physical constants.
+    """
+
+    def measure(frame):
+        answer, state, inputs = frame
+        problem = frame_problem(scene.garment, state, inputs, scene.surface, scene.timestep, parameters)
+        return potential(answer, problem, scene.garment, scene.material)
+
+    return jax.lax.map(measure, (answers, states, inputs))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -70,9 +71,19 @@ def trajectory_report(
 def environment() -> dict[str, Any]:
     """Return the device and the versions that a figure was measured with."""
     device = jax.devices()[0]
-    kind = device.device_kind if device.platform != "cpu" else f"{platform.machine()} CPU"
+    kind = device.device_kind if device.platform != "cpu" else f"{platform.machine()}, {_processor()}"
     return {
         "device": f"{device.platform}: {kind}",
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
         | {"python": platform.python_version()},
     }
+
+
+def _processor() -> str:
+    """Return the name of the CPU, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

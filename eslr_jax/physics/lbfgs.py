@@ -63,7 +63,7 @@ def minimize(
     start: Float[Array, "vertices 3"],
     diagonal: Float[Array, " vertices"] | Stiffness,
     *,
-    iterations: int,
+    iterations: int | Int[Array, ""],
     memory: int = 8,
     residual_tolerance: Float[Array, ""] | float = 0.0,
     excess_tolerance: Float[Array, ""] | float = 0.0,
@@ -77,7 +77,7 @@ def minimize(
         diagonal: The initial Hessian of the recursion up to a scale: positive stiffness per vertex [N/m], or
             with springs between neighbours, which costs a quarter more per iteration and needs two to three
             times fewer of them.
-        iterations: Upper bound of iterations; static.
+        iterations: Upper bound of iterations.
         memory: Pairs of steps and gradient changes kept; static.
         residual_tolerance: Stop when the gradient norm [N] falls below it.
         excess_tolerance: Stop when what is left to gain is estimated to be below this share of what was gained

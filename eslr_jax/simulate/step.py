@@ -101,7 +101,7 @@ def solve(
     material: Material,
     start: Float[Array, "vertices 3"],
     *,
-    iterations: int,
+    iterations: int | Int[Array, ""],
     memory: int,
     tolerance: float,
 ) -> Minimum:

@@ -15,7 +15,6 @@ import argparse
 import dataclasses
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -294,7 +293,7 @@ def main() -> None:
     if options.keep_memory:
         keep_memory()
 
-    import jax
+    from eslr_jax.evaluation.report import environment
 
     sizes = {}
     for size in options.sizes:
@@ -314,12 +313,10 @@ def main() -> None:
         },
         "model": MODEL,
         "sizes": sizes,
-        "device": str(jax.devices()[0]),
-        "processor": platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "keeps_memory": options.keep_memory,
         "load": round(os.getloadavg()[0], 1),
-        "versions": {"jax": jax.__version__, "python": platform.python_version()},
+        **environment(),
     }
     if options.json == "-":
         print(json.dumps(report, indent=2))

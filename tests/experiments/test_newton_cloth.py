@@ -11,6 +11,7 @@ from newton_cloth import (
     Setting,
     bending_cotangents,
     contact_stiffness,
+    newton_simulator,
     prepare_cloth,
     springs,
     stable_substeps,
@@ -18,6 +19,7 @@ from newton_cloth import (
 )
 
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.hard_cases import run_case
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.hard_cases.build import corners_of, hanging_sheet, make_cloth, make_scene, sheet
 from eslr_jax.physics.bending import bending_energy
@@ -197,3 +199,11 @@ def test_vbd_minimises_our_potential_where_strains_are_small(tshirt):
     truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
     excess, drop = peers.teach([method], scene, truth, every=1)
     assert (excess[0] / drop).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_newton_runs_the_hard_cases():
+    pytest.importorskip("newton")
+    rows = run_case("free_fall", newton_simulator(Setting("vbd", 2, 10)))
+    assert {row["case"] for row in rows} == {"free_fall"}
+    assert len(rows) > 1  # a scene that Newton refuses leaves one row

@@ -1,0 +1,156 @@
+"""Whether `--budget` and `--tolerance` are kept: what they choose from the calibration, on clips it has not seen.
+
+    python experiments/budget_and_tolerance.py [--smoke] [--out DIR]
+
+A tolerance is kept by a frame that leaves at most that share of its drop above the optimum; counted over frames
+of free rollouts on the test clips. A budget is kept by the median time per frame, all choices timed in turns.
+Writes budget_and_tolerance.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.assets import load_model, load_splits
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.calibrate import (
+    SOLVER,
+    Choice,
+    Method,
+    choose,
+    device_name,
+    example_scene,
+    read_calibration,
+    time_frames,
+    with_iterations,
+)
+from eslr_jax.evaluation.excess import answer_potentials, measure_excess, trajectory_states
+from eslr_jax.evaluation.report import environment
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.types import Scene
+
+RESULTS = Path(__file__).parent / "results"
+GARMENTS = ("tshirt", "dress", "pants")
+TOLERANCES = (0.05, 0.01, 0.001)
+BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration knows of
+EVERY = 5  # frames between those whose excess is measured
+
+
+def simulator(choice: Choice) -> tuple[Any, SimConfig]:
+    """Return weights and configuration of what was chosen."""
+    params, config = None, SimConfig(simulator="physics")
+    if choice.method != SOLVER:
+        params, architecture = load_model(choice.method)
+        config = SimConfig(model=architecture)
+    return params, with_iterations(config, choice.iterations, choice.tolerance)
+
+
+def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, float]:
+    """Return the excess of frames of a free rollout over their drop, and the mean of iterations spent."""
+    params, config = simulator(choice)
+    parameters = PhysicsParameters()
+    trajectory = simulate_scene(params, scene, parameters, config)
+    ends = jax.device_get(
+        measure_excess(
+            None, trajectory, scene, parameters, config, every=every, iterations=(), corrector_steps=()
+        )
+    )
+    states, inputs = trajectory_states(trajectory, scene, parameters)
+    taken = jax.tree.map(lambda leaf: leaf[1::every], (trajectory.positions[1:], states, inputs))
+    left = np.asarray(answer_potentials(*taken, scene, parameters)) - ends.optimum
+    shares = np.maximum(left, 0.0) / np.maximum(ends.start - ends.optimum, 1e-9)
+    return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
+
+
+def fastest(methods: tuple[Method, ...], num_vertices: int) -> float:
+    """Return the milliseconds of the fastest frame of that size."""
+    nearest = min({m.vertices for m in methods}, key=lambda v: abs(np.log(v / num_vertices)))
+    least = min(m.fixed_ms + m.iteration_ms for m in methods if m.vertices == nearest)
+    return least * num_vertices / nearest
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
+    parser.add_argument(
+        "--calibration", type=Path, help="this device's own, or the shipped one, if not given"
+    )
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true")
+    arguments = parser.parse_args()
+    garments, clips, frames, every = GARMENTS, load_splits()["motions"]["test"], 60, EVERY
+    tolerances, budgets = TOLERANCES, BUDGETS
+    if arguments.smoke:
+        garments, clips, frames, every, arguments.sizes = garments[:1], clips[:1], 6, 2, ["1k"]
+        tolerances, budgets = tolerances[:1], budgets[:1]
+    calibration = read_calibration(arguments.calibration)
+    kept: dict[str, list[dict[str, Any]]] = {"tolerance": [], "budget": []}
+    for size in arguments.sizes:
+        shares: dict[float, list[np.ndarray]] = {tolerance: [] for tolerance in tolerances}
+        chosen: dict[float, list[Choice]] = {tolerance: [] for tolerance in tolerances}
+        spent: dict[float, list[float]] = {tolerance: [] for tolerance in tolerances}
+        for garment in garments:
+            scenes = [example_scene(garment, size, clip, frames) for clip in clips]
+            count = int(np.sum(scenes[0].garment.vertex_mask))
+            for tolerance in tolerances:
+                choice = choose(calibration, count, tolerance=tolerance)
+                chosen[tolerance].append(choice)
+                for scene in scenes:
+                    left, iterations = frame_shares(choice, scene, every)
+                    shares[tolerance].append(left)
+                    spent[tolerance].append(iterations)
+            least = fastest(calibration.methods, count)
+            choices = {
+                factor * least: choose(calibration, count, budget_ms=factor * least) for factor in budgets
+            }
+            runs = {budget: simulator(choice) for budget, choice in choices.items()}
+            for budget, milliseconds in time_frames(runs, scenes[0]).items():
+                choice, took = choices[budget], float(np.median(milliseconds))
+                row = {"size": size, "garment": garment, "method": choice.method}
+                row |= {"iterations": choice.iterations, "budget_ms": budget, "frame_ms": took}
+                kept["budget"].append(row)
+                print(f"{size} {garment}: budget {budget:.1f} ms, took {took:.1f} ms", flush=True)
+            jax.clear_caches()
+        for tolerance in tolerances:
+            joined = np.concatenate(shares[tolerance])
+            row = {
+                "size": size,
+                "tolerance": tolerance,
+                "methods": sorted({choice.method for choice in chosen[tolerance]}),
+                "frames": len(joined),
+                "kept": float(np.mean(joined <= tolerance)),
+                "excess_relative_median": float(np.median(joined)),
+                "excess_relative_p99": float(np.quantile(joined, 0.99)),
+                "iterations_mean": float(np.mean(spent[tolerance])),
+                "iterations_allowed": max(choice.iterations for choice in chosen[tolerance]),
+            }
+            kept["tolerance"].append(row)
+            print(f"{size}: tolerance {tolerance:.1%} kept by {row['kept']:.2%} of {len(joined)} frames")
+    ratios = [row["frame_ms"] / row["budget_ms"] for row in kept["budget"]]
+    result = {
+        "clips": clips,
+        **kept,
+        "budget_ratio_median": float(np.median(ratios)),
+        "calibrated_on": calibration.device,
+        "processor": device_name(),
+        **environment(),
+    }
+    print(f"time over budget, median: {result['budget_ratio_median']:.2f}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(arguments.out / "budget_and_tolerance.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

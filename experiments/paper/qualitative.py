@@ -1,0 +1,152 @@
+"""The paper's two figures: how the networks' cloth looks, and where it stores stretch energy.
+
+    python experiments/paper/qualitative.py [--smoke]
+
+Free rollouts on an unseen clip, the same frame of each. The optimum stands where the paper has ARCSim, a
+reference that no network takes part in. Writes qualitative.png (cloth), stretch_energy.png (energy per area on
+cloth, one scale for all), stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from native_garments import MODELS
+from rollouts import OPTIMUM, arguments, simulator, write
+
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.assets.load import default_model
+from eslr_jax.body.motion import pose_body
+from eslr_jax.evaluation.evaluate import back_and_forth
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.render import render_frame, side_by_side, write_png
+from eslr_jax.render.colors import color_scale
+from eslr_jax.scene import prepare_scene
+from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.types import Scene
+
+GARMENTS = ("tshirt", "dress")
+_SIZE = (240, 340)  # of a picture, width and height [pixels]
+_CAMERA = 25.0  # [degrees] from the front towards the side
+_FULL_SCALE = 0.98  # quantile of the optimum's energy per area at which the colours end
+_SHARES = (0.5, 0.9, 0.99)  # quantiles in the table
+
+
+@jax.jit
+def face_energies(positions: Float[Array, "frames vertices 3"], scene: Scene) -> Float[Array, "frames faces"]:
+    """Return the stretch energy of every face per area [J/m2]: it is linear in each face's thickness."""
+    garment, material = scene.garment, scene.material
+    thickness = jnp.broadcast_to(material.thickness, garment.rest_areas.shape)
+
+    def frame(position: Float[Array, "vertices 3"]) -> Float[Array, " faces"]:
+        def energy(thickness):
+            return stretch_energy(position, garment, material.replace(thickness=thickness))
+
+        return jax.grad(energy)(thickness) * thickness / jnp.maximum(garment.rest_areas, 1e-12)
+
+    return jax.lax.map(frame, positions)
+
+
+def at_vertices(energies: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return the mean over a vertex' faces, weighted by area."""
+    faces, areas = np.asarray(scene.garment.faces), np.asarray(scene.garment.rest_areas)
+    total, weight = np.zeros((2, len(scene.garment.rest_positions)))
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], areas * energies)
+        np.add.at(weight, faces[:, corner], areas)
+    return total / np.maximum(weight, 1e-12)
+
+
+def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
+    """Draw the share of faces that hold more than an energy per area."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(6.4, 3.6))
+    levels = np.geomspace(0.01, 1e3, 200)  # [J/m2]
+    for name, values in energies.items():
+        share = 1.0 - np.searchsorted(np.sort(values), levels) / len(values)
+        axis.loglog(levels, np.maximum(share, 1e-7), label=name, color="#1b1b1b" if name == OPTIMUM else None)
+    axis.set_ylim(1e-5, 1.2)
+    axis.set_xlabel("stretch energy per area [J/m2]")
+    axis.set_ylabel("share of faces above it")
+    axis.grid(True, which="both", alpha=0.2)
+    axis.legend(fontsize=8)
+    figure.tight_layout()
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+
+
+def main() -> None:
+    """Simulate, render and write."""
+    chosen = arguments(__doc__, frames=90)
+    clip = load_splits()["motions"]["test"][0]
+    models, garments = (*MODELS[::-1], default_model(), OPTIMUM), GARMENTS
+    if chosen.smoke:
+        models, garments = models[-1:], garments[:1]
+    body = load_body()
+    poses = pose_body(body, back_and_forth(load_motion(clip), chosen.frames), num_frames=chosen.frames)
+    results: dict[tuple[str, str], tuple[Any, Scene, np.ndarray]] = {}
+    for name in models:
+        params, config, options = simulator(name)
+        for garment in garments:
+            scene = prepare_scene(load_garment(garment, vertices=chosen.vertices, **options), poses)
+            positions = simulate_scene(params, scene, PhysicsParameters(), config).positions
+            results[name, garment] = np.asarray(positions), scene, np.asarray(face_energies(positions, scene))
+            print(name, garment, flush=True)
+
+    plain, colored = [], []
+    for garment in garments:
+        reference = results[OPTIMUM, garment][2][-1]
+        limit = float(np.quantile(reference[reference > 0], _FULL_SCALE))
+        for name in models:
+            positions, scene, energies = results[name, garment]
+            is_face = np.asarray(scene.garment.rest_areas) > 0
+            mesh = (
+                np.asarray(poses.positions)[-1],
+                np.asarray(poses.faces),
+                positions[-1],
+                np.asarray(scene.garment.faces)[is_face],
+            )
+            view = {"camera": _CAMERA, "size": _SIZE}
+            colors = color_scale(at_vertices(energies[-1], scene), 0.0, limit)
+            plain.append(render_frame(*mesh, **view))
+            colored.append(render_frame(*mesh, **view, vertex_colors=colors))
+    labels = list(models) * len(garments)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    for pictures, file in ((plain, "qualitative.png"), (colored, "stretch_energy.png")):
+        write_png(chosen.out / file, side_by_side(pictures, labels, columns=len(models)))
+
+    joined = {
+        name: np.concatenate(
+            [
+                results[name, garment][2][1:][
+                    :, np.asarray(results[name, garment][1].garment.rest_areas) > 0
+                ].ravel()
+                for garment in garments
+            ]
+        )
+        for name in models
+    }
+    draw_distribution(joined, chosen.out / "stretch_energy_distribution.png")
+    rows = {
+        name: {
+            "mean_j_m2": float(values.mean()),
+            **{f"p{100 * share:g}_j_m2": float(np.quantile(values, share)) for share in _SHARES},
+        }
+        for name, values in joined.items()
+    }
+    sizes = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
+    write({**sizes, "mean": rows}, chosen.out / "stretch_energy.json")
+
+
+if __name__ == "__main__":
+    main()
