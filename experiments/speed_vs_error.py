@@ -1,13 +1,14 @@
 """Speed against error: excess over the optimum against time per frame, for the solver, networks and both.
 
-    python experiments/speed_vs_error.py                 # 1k and 4k, about twenty minutes on two cores
+    python experiments/speed_vs_error.py                 # 1k and 4k, about half an hour on two cores
+    python experiments/speed_vs_error.py --sizes 10k     # joins the sizes that the file already holds
     python experiments/speed_vs_error.py --peers         # with Newton's solvers, which the extra `peers` installs
     python experiments/speed_vs_error.py --smoke --out DIR
 
 Every method starts from the same states, those of the near-optimal rollout on a test clip, so errors are
 teacher-forced. A method's time is a fixed part (contacts, network) and a part per L-BFGS iteration, measured in
 turns. Free rollouts follow for a few settings. What the peers are and how they are measured: `peers.py`.
-Writes speed_vs_error.json and .png.
+Writes speed_vs_error.json and .png after every size.
 """
 
 from __future__ import annotations
@@ -97,7 +98,9 @@ def draw(result: dict, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     sizes, peers = list(result["sizes"]), result["peers"]
-    figure, axes = plt.subplots(1, len(sizes), figsize=(5.2 * len(sizes), 4.2), sharey=True, squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(sizes), figsize=(5.2 * len(sizes), 4.8), sharey=True, squeeze=False, layout="constrained"
+    )
     for axis, size in zip(axes[0], sizes, strict=True):
         for name, entries in result["sizes"][size]["methods"].items():
             shown = [entry for entry in entries if entry["excess_relative_median"] > 1e-6]
@@ -118,8 +121,8 @@ def draw(result: dict, path: Path) -> None:
         axis.set_xlabel("time per frame [ms]")
         axis.grid(True, which="both", alpha=0.2)
     axes[0][0].set_ylabel("excess over the optimum / the frame's drop (median)")
-    axes[0][0].legend(fontsize=8)
-    figure.tight_layout()
+    lines, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside lower center", ncols=4, fontsize=8)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
 
@@ -135,25 +138,32 @@ def main() -> None:
     parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
     arguments = parser.parse_args()
-    garments, frames, rollout_frames, settings = GARMENTS, 60, 100, SETTINGS
+    garments, frames, rollout_frames, settings = GARMENTS, 40, 60, SETTINGS
     if arguments.smoke:
         garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 6, SMOKE_SETTINGS
         arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
+    path = arguments.out / "speed_vs_error.json"
     result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}
+    if path.exists() and not arguments.smoke:
+        older = json.loads(path.read_text())
+        result |= {name: older[name] for name in ("peers", "sizes")}
+    arguments.out.mkdir(parents=True, exist_ok=True)
     for size in arguments.sizes:
         scenes = [example_scene(garment, size, CLIP, frames) for garment in garments]
         methods = measure_methods((None, *arguments.models), scenes)
+        print(f"{size}: methods measured", flush=True)
+        measured = {method.name: points(method) for method in methods}
+        if arguments.peers:
+            peers = peer_points(scenes, settings)
+            result["peers"] = list(peers)
+            measured |= peers
+            print(f"{size}: peers measured", flush=True)
         rollouts = {
             name or SOLVER: [
                 entry for g in garments for entry in free_rollouts(name, g, size, rollout_frames)
             ]
             for name in (None, *arguments.models[:1])
         }
-        measured = {method.name: points(method) for method in methods}
-        if arguments.peers:
-            peers = peer_points(scenes, settings)
-            result["peers"] = list(peers)
-            measured |= peers
         result["sizes"][size] = {
             "methods": measured,
             "costs": [
@@ -166,24 +176,27 @@ def main() -> None:
             ],
             "budgets": who_wins(measured),
             "rollouts": rollouts,
+            "environment": environment(),
         }
+        if arguments.peers:
+            result["sizes"][size]["environment"]["versions"] |= peer_versions()
+        draw(result, arguments.out / "speed_vs_error.png")
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(result, indent=1) + "\n")
+        print_budgets(size, result["sizes"][size]["budgets"])
         jax.clear_caches()
-    result["environment"] = environment()
-    if result["peers"]:
-        result["environment"]["versions"] |= peer_versions()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    draw(result, arguments.out / "speed_vs_error.png")
-    with atomic_write(arguments.out / "speed_vs_error.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
-    for size, measured in result["sizes"].items():
-        print(size)
-        for row in measured["budgets"]:
-            cells = ", ".join(
-                f"{name} {'-' if value is None else f'{value:.3%}'}"
-                for name, value in row.items()
-                if name != "budget_ms"
-            )
-            print(f"  {row['budget_ms']:7.1f} ms: {cells}")
+
+
+def print_budgets(size: str, rows: list[dict]) -> None:
+    """Print the best excess of every method within each budget."""
+    print(size)
+    for row in rows:
+        cells = ", ".join(
+            f"{name} {'-' if value is None else f'{value:.3%}'}"
+            for name, value in row.items()
+            if name != "budget_ms"
+        )
+        print(f"  {row['budget_ms']:7.1f} ms: {cells}", flush=True)
 
 
 if __name__ == "__main__":
