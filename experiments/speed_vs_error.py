@@ -40,7 +40,7 @@ from eslr_jax.simulate.scan import simulate_scene
 RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
 GARMENTS = ("tshirt", "dress", "pants")
-ROLLOUTS = {SOLVER: (5, 10, 20, 50, 100), "network": (0, 5, 20)}  # iterations of the free rollouts
+ROLLOUTS = (5, 10, 20, 50, 100), (0, 5, 20)  # iterations of free rollouts, by the solver and behind a network
 COLORS = {SOLVER: "#1b1b1b"}
 
 
@@ -57,7 +57,9 @@ def points(method: Method) -> list[dict]:
     ]
 
 
-def free_rollouts(model: str | None, garment: str, size: str, num_frames: int) -> list[dict]:
+def free_rollouts(
+    model: str | None, garment: str, size: str, num_frames: int, counts: tuple[int, ...]
+) -> list[dict]:
     """Return the report of free rollouts with several iteration counts."""
     scene = example_scene(garment, size, CLIP, num_frames)
     params, config = None, SimConfig(simulator="physics")
@@ -65,7 +67,7 @@ def free_rollouts(model: str | None, garment: str, size: str, num_frames: int) -
         params, architecture = load_model(model)
         config = SimConfig(model=architecture)
     reports = []
-    for count in ROLLOUTS[SOLVER if model is None else "network"]:
+    for count in counts:
         trajectory = simulate_scene(params, scene, PhysicsParameters(), with_iterations(config, count))
         report = trajectory_report(trajectory, scene)
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
@@ -139,9 +141,11 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
     arguments = parser.parse_args()
     garments, frames, rollout_frames, settings = GARMENTS, 40, 60, SETTINGS
+    solver_counts, network_counts = ROLLOUTS
     if arguments.smoke:
         garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 6, SMOKE_SETTINGS
         arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
+        solver_counts, network_counts = solver_counts[:1], network_counts[:1]
     path = arguments.out / "speed_vs_error.json"
     result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}
     if path.exists() and not arguments.smoke:
@@ -160,9 +164,11 @@ def main() -> None:
             print(f"{size}: peers measured", flush=True)
         rollouts = {
             name or SOLVER: [
-                entry for g in garments for entry in free_rollouts(name, g, size, rollout_frames)
+                entry
+                for garment in garments
+                for entry in free_rollouts(name, garment, size, rollout_frames, counts)
             ]
-            for name in (None, *arguments.models[:1])
+            for name, counts in ((None, solver_counts), *((m, network_counts) for m in arguments.models[:1]))
         }
         result["sizes"][size] = {
             "methods": measured,
