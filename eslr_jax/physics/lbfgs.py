@@ -13,9 +13,7 @@ from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
-_CAUTION = (
-    400.0  # the recursion underestimates soft directions: asked 1 %, 99 % of frames keep it, 83 % with 40
-)
+_CAUTION = 400.0  # soft directions are underestimated: 99 % of frames keep what is asked, 83 % at 40
 
 
 class Minimum(NamedTuple):
