@@ -23,9 +23,9 @@ from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.calibrate import (
     SOLVER,
     Choice,
-    Method,
     choose,
     device_name,
+    methods_at,
     read_calibration,
     time_frames,
     with_iterations,
@@ -71,13 +71,6 @@ def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, 
     return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
 
 
-def fastest(methods: tuple[Method, ...], num_vertices: int) -> float:
-    """Return the milliseconds of the fastest frame of that size."""
-    nearest = min({m.vertices for m in methods}, key=lambda v: abs(np.log(v / num_vertices)))
-    least = min(m.fixed_ms + m.iteration_ms for m in methods if m.vertices == nearest)
-    return least * num_vertices / nearest
-
-
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(
@@ -114,7 +107,7 @@ def main() -> None:
                     left, iterations = frame_shares(choice, scene, every)
                     shares[tolerance].append(left)
                     spent[tolerance].append(iterations)
-            least = fastest(calibration.methods, count)
+            least = min(m.fixed_ms + m.iteration_ms for m in methods_at(calibration, count))
             choices = {
                 factor * least: choose(calibration, count, budget_ms=factor * least) for factor in budgets
             }

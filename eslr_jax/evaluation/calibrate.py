@@ -199,8 +199,17 @@ def choose(
     """
     if (budget_ms is None) == (tolerance is None):
         raise ConfigError("give either a budget or a tolerance")
+    methods = methods_at(calibration, num_vertices)
+    if budget_ms is not None:
+        return _within_budget(methods, budget_ms)
+    assert tolerance is not None
+    return _within_tolerance(methods, tolerance)
+
+
+def methods_at(calibration: Calibration, num_vertices: int) -> list[Method]:
+    """Return the methods of the size measured nearest by, their costs scaled to a number of vertices."""
     nearest = min({m.vertices for m in calibration.methods}, key=lambda v: abs(np.log(v / num_vertices)))
-    methods = [
+    return [
         dataclasses.replace(
             method,
             fixed_ms=method.fixed_ms * num_vertices / nearest,
@@ -209,10 +218,6 @@ def choose(
         for method in calibration.methods
         if method.vertices == nearest
     ]
-    if budget_ms is not None:
-        return _within_budget(methods, budget_ms)
-    assert tolerance is not None
-    return _within_tolerance(methods, tolerance)
 
 
 def _within_budget(methods: list[Method], budget_ms: float) -> Choice:

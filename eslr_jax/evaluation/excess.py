@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float
 from eslr_jax.config import SimConfig
 from eslr_jax.io.trajectory import TrajectoryFile
 from eslr_jax.physics.potential import next_friction_load, potential
-from eslr_jax.physics.problem import PhysicsParameters, start_guess
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
 from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import frame_inputs
 from eslr_jax.simulate.step import FrameInput, frame_problem, solve
@@ -118,6 +119,37 @@ def measure_excess(
     return jax.lax.map(measure, taken)
 
 
+def map_answers(
+    measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Array],
+    answers: Float[Array, "frames vertices 3"],
+    states: ClothState,
+    inputs: FrameInput,
+    scene: Scene,
+    parameters: PhysicsParameters,
+    config: SimConfig | None = None,
+) -> Array:
+    """State the problem of every frame and return what `measure` makes of its answer.
+
+    Args:
+        measure: Of an answer and its frame's problem.
+        answers: Anybody's positions at t + 1 [m].
+        states: Cloth at t, of `trajectory_states`.
+        inputs: The frames' inputs.
+        scene: The scene.
+        parameters: Physical constants.
+        config: Says whether layers and tips collide; neither does by default.
+    """
+
+    def frame(arguments):
+        answer, state, inputs = arguments
+        problem = frame_problem(
+            scene.garment, state, inputs, scene.surface, scene.timestep, parameters, config
+        )
+        return measure(answer, problem)
+
+    return jax.lax.map(frame, (answers, states, inputs))
+
+
 @jax.jit
 def answer_potentials(
     answers: Float[Array, "frames vertices 3"],
@@ -126,19 +158,9 @@ def answer_potentials(
     scene: Scene,
     parameters: PhysicsParameters,
 ) -> Float[Array, " frames"]:
-    """Return the potential [J] of every answer to the frame that starts in the state beside it.
+    """Return the potential [J] of every answer to the frame that starts in the state beside it; `map_answers`."""
 
-    Args:
-        answers: Anybody's positions at t + 1 [m].
-        states: Cloth at t, of `trajectory_states`.
-        inputs: The frames' inputs.
-        scene: The scene.
-        parameters: Physical constants.
-    """
-
-    def measure(frame):
-        answer, state, inputs = frame
-        problem = frame_problem(scene.garment, state, inputs, scene.surface, scene.timestep, parameters)
+    def measure(answer: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
         return potential(answer, problem, scene.garment, scene.material)
 
-    return jax.lax.map(measure, (answers, states, inputs))
+    return map_answers(measure, answers, states, inputs, scene, parameters)

@@ -15,7 +15,7 @@ from eslr_jax.assets import prepare_stored
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.excess import map_answers, trajectory_states
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.garment import GarmentFile
@@ -25,7 +25,7 @@ from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters
 from eslr_jax.scene import initial_state
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from eslr_jax.simulate.step import FrameInput, solve
 from eslr_jax.types import ClothState, Garment, Material, Scene
 
 FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "excess", "distance")
@@ -153,14 +153,12 @@ def _every_frame(
     """State the problem of every frame and return a value of its answer [J]."""
     garment, material = scene.garment, scene.material
 
-    def frame(arguments):
-        answer, state, inputs = arguments
-        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, _PARAMETERS, config)
+    def measure(answer: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
         if name == "excess":
             return excess_shares(answer, problem, garment, material)
         return energy_shares(name.removesuffix("-energy"), answer, problem, garment, material)
 
-    return jax.lax.map(frame, (answers, states, inputs))
+    return map_answers(measure, answers, states, inputs, scene, _PARAMETERS, config)
 
 
 def energy_shares(
