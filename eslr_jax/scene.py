@@ -19,7 +19,10 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
-REACH = 0.12  # [m] that cloth is expected to stray from its skinned position; farther body faces are left out
+REACH = (
+    0.08  # [m] that cloth strays from its skinned position, besides how loose it is; other faces are left out
+)
+_SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 _SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take the skinned start out of the body
 _START_CLEARANCE = 2e-3  # [m]; the collision thickness
@@ -29,7 +32,7 @@ _START_CLEARANCE = 2e-3  # [m]; the collision thickness
 class SceneOptions:
     """What to model beyond what is there; host only."""
 
-    reach: float = REACH  # [m]
+    reach: float = REACH  # [m], besides how far the garment hangs from the body at rest
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
 
@@ -63,9 +66,8 @@ def prepare_scene(
         raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
     skinned = skin_garment(garment, poses.joint_transforms)
     if surface is None and options.has_body:
-        faces = reachable_faces(garment, skinned, poses, options.reach)
-        if len(faces):
-            surface = prepare_surface(np.asarray(poses.rest_positions), faces)
+        is_near = reachable_vertices(garment, skinned, poses, options.reach)
+        surface = _surface_near(is_near, poses)
     body_positions = None if surface is None else poses.positions[:, surface.vertex_ids]
     position = skinned[0]
     if surface is not None:
@@ -132,30 +134,56 @@ def initial_state(position: jax.Array, velocity: jax.Array) -> ClothState:
     )
 
 
-def reachable_faces(garment: Garment, skinned: jax.Array, poses: BodyMotion, reach: float) -> np.ndarray:
-    """Return the obstacle faces that come within `reach` of the skinned garment in a sample of frames.
+def reachable_vertices(garment: Garment, skinned: jax.Array, poses: BodyMotion, reach: float) -> np.ndarray:
+    """Return which body vertices the skinned garment can reach in a sample of frames.
 
     A T-shirt's scene then searches no legs, no head and no feet.
     """
-    is_real = np.asarray(garment.vertex_mask)
     frames = np.unique(np.linspace(0, len(skinned) - 1, _SAMPLED_FRAMES).astype(int))
+    is_real = np.asarray(garment.vertex_mask)
+    radii = reach + _looseness(garment, poses)
     is_near = np.zeros(poses.positions.shape[1], bool)
     for frame in frames:
-        tree = cKDTree(np.asarray(skinned[frame])[is_real])
-        distance, _ = tree.query(np.asarray(poses.positions[frame]), distance_upper_bound=reach)
-        is_near |= np.isfinite(distance)
-    faces = np.asarray(poses.faces)
-    return faces[is_near[faces].any(axis=1) & np.asarray(poses.is_obstacle)]
+        is_near |= _within(radii, np.asarray(skinned[frame])[is_real], np.asarray(poses.positions[frame]))
+    return is_near
 
 
-def shared_surface(garments: Sequence[Garment], body: Body | BodyMotion, reach: float = 0.15) -> BodySurface:
-    """Return the obstacle faces within `reach` [m] of any of the garments in the rest pose."""
-    points = np.concatenate([np.asarray(g.rest_positions)[np.asarray(g.vertex_mask)] for g in garments])
+def shared_surface(
+    garments: Sequence[Garment], body: Body | BodyMotion, reach: float = _SHARED_REACH
+) -> BodySurface | None:
+    """Return the obstacle faces that any of the garments can reach in the rest pose; `reach` in metres."""
     rest = np.asarray(body.rest_positions)
-    distance, _ = cKDTree(points).query(rest, distance_upper_bound=reach)
-    faces = np.asarray(body.faces)
-    chosen = np.isfinite(distance)[faces].any(axis=1) & np.asarray(body.is_obstacle)
-    return prepare_surface(rest, faces[chosen])
+    is_near = np.zeros(len(rest), bool)
+    for garment in garments:
+        points = np.asarray(garment.rest_positions)[np.asarray(garment.vertex_mask)]
+        is_near |= _within(reach + _looseness(garment, body), points, rest)
+    return _surface_near(is_near, body)
+
+
+def _surface_near(is_near: np.ndarray, body: Body | BodyMotion) -> BodySurface | None:
+    """Return the surface of the obstacle faces with a vertex among those; None without any."""
+    faces = np.asarray(body.faces)[np.asarray(body.is_obstacle)]
+    is_kept = is_near[faces].any(axis=1)
+    if not is_kept.any():
+        return None
+    rim = np.intersect1d(faces[is_kept], faces[~is_kept])
+    return prepare_surface(np.asarray(body.rest_positions), faces[is_kept], rim=rim)
+
+
+def _looseness(garment: Garment, body: Body | BodyMotion) -> np.ndarray:
+    """Return how far real vertices hang from the body at rest [m]: a hem swings, a collar does not."""
+    obstacle = np.unique(np.asarray(body.faces)[np.asarray(body.is_obstacle)])
+    points = np.asarray(garment.rest_positions)[np.asarray(garment.vertex_mask)]
+    distance, _ = cKDTree(np.asarray(body.rest_positions)[obstacle]).query(points)
+    return distance
+
+
+def _within(radii: np.ndarray, centers: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return which points lie within the radius around any of the centers."""
+    is_within = np.zeros(len(points), bool)
+    for hits in cKDTree(points).query_ball_point(centers, radii):
+        is_within[hits] = True
+    return is_within
 
 
 @jax.jit

@@ -219,9 +219,10 @@ def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: d
 
     faces = np.asarray(scene.garment.faces)
     timestep = float(poses.timestep)
-    contact_faces, surface = np.empty((0, 3), np.int32), scene.surface
+    contact_faces, contact_rim, surface = np.empty((0, 3), np.int32), np.empty(0, np.int32), scene.surface
     if surface is not None:
-        contact_faces = np.asarray(surface.vertex_ids)[np.asarray(surface.faces)]
+        vertex_ids = np.asarray(surface.vertex_ids)
+        contact_faces, contact_rim = vertex_ids[np.asarray(surface.faces)], vertex_ids[surface.is_rim]
     write_trajectory(
         out / "trajectory.npz",
         positions=positions,
@@ -232,6 +233,7 @@ def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: d
         body_faces=np.asarray(poses.faces),
         body_rest_positions=np.asarray(poses.rest_positions),
         contact_faces=contact_faces,
+        contact_rim=contact_rim,
         metadata=report,
     )
     meshes, skinned = [AnimatedMesh("garment", positions, faces)], None

@@ -115,7 +115,9 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
         if trajectory.body_rest_positions is None or trajectory.contact_faces is None:
             raise AssetError(f"{run.name} lacks its body's rest pose, which contacts need; simulate it again")
         if len(trajectory.contact_faces):
-            surface = prepare_surface(trajectory.body_rest_positions, trajectory.contact_faces)
+            surface = prepare_surface(
+                trajectory.body_rest_positions, trajectory.contact_faces, rim=trajectory.contact_rim
+            )
             body = jnp.asarray(trajectory.body_positions)[:, surface.vertex_ids]
     return Scene(
         garment=garment,

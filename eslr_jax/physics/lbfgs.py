@@ -161,23 +161,20 @@ def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, sl
     """
     slack = 4 * jnp.finfo(state.x.dtype).eps * jnp.abs(state.value)
 
-    def trial(size):
-        x = state.x + size * direction
-        return (x, *value_and_gradient(x))
-
-    def is_rejected(carry):
-        size, halvings, _, value, _ = carry
+    def is_wanting(carry):
+        size, trials, _, value, _ = carry
         is_good = value <= state.value + _ARMIJO * size * slope + slack
-        return ~is_good & (halvings < _MAX_HALVINGS)
+        return (trials == 0) | (~is_good & (trials <= _MAX_HALVINGS))
 
-    def halve(carry):
-        size, halvings, *_ = carry
-        return (0.5 * size, halvings + 1, *trial(0.5 * size))
+    def trial(carry):
+        size, trials, *_ = carry
+        size = jnp.where(trials == 0, 1.0, 0.5 * size)
+        x = state.x + size * direction
+        return (size, trials + 1, x, *value_and_gradient(x))
 
-    one = jnp.ones((), state.x.dtype)
-    _, _, x, value, gradient = jax.lax.while_loop(
-        is_rejected, halve, (one, jnp.zeros((), jnp.int32), *trial(one))
-    )
+    # The first trial is one of the loop's, so that the energy is compiled once.
+    untried = (jnp.zeros((), state.x.dtype), jnp.int32(0), state.x, state.value, state.gradient)
+    *_, x, value, gradient = jax.lax.while_loop(is_wanting, trial, untried)
     is_kept = (value <= state.value + slack) & (slope < 0)
     return (
         jnp.where(is_kept, x, state.x),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -30,7 +31,8 @@ def solver_start(problem: FrameProblem, garment: Garment, material: Material) ->
     fall = problem.parameters.gravity * problem.timestep * problem.timestep
     falling = problem.inertial_guess - jnp.array([[0.0, 1.0, 0.0]], inertial.dtype) * fall
     ballistic = start_guess(problem.replace(inertial_guess=falling), garment)
-    values = [potential(guess, problem, garment, material) for guess in (inertial, ballistic)]
+    guesses = jnp.stack([inertial, ballistic])
+    values = jax.lax.map(lambda guess: potential(guess, problem, garment, material), guesses)
     return spread_collapsed(jnp.where(values[1] < values[0], ballistic, inertial), problem, garment)
 
 
