@@ -17,18 +17,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from eslr_jax.assets import load_body, load_garment, load_model, load_motion, load_splits
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.calibrate import (
-    SOLVER,
     Choice,
     choose,
     device_name,
     methods_at,
     read_calibration,
+    simulator_of,
     time_frames,
-    with_iterations,
 )
 from eslr_jax.evaluation.excess import answer_potentials, measure_excess, trajectory_states
 from eslr_jax.evaluation.report import environment
@@ -45,18 +43,9 @@ BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration
 EVERY = 5  # frames between those whose excess is measured
 
 
-def simulator(choice: Choice) -> tuple[Any, SimConfig]:
-    """Return weights and configuration of what was chosen."""
-    params, config = None, SimConfig(simulator="physics")
-    if choice.method != SOLVER:
-        params, architecture = load_model(choice.method)
-        config = SimConfig(model=architecture)
-    return params, with_iterations(config, choice.iterations, choice.tolerance)
-
-
 def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, float]:
     """Return the excess of frames of a free rollout over their drop, and the mean of iterations spent."""
-    params, config = simulator(choice)
+    params, config = simulator_of(choice.method, choice.iterations, choice.tolerance)
     parameters = PhysicsParameters()
     trajectory = simulate_scene(params, scene, parameters, config)
     ends = jax.device_get(
@@ -111,7 +100,10 @@ def main() -> None:
             choices = {
                 factor * least: choose(calibration, count, budget_ms=factor * least) for factor in budgets
             }
-            runs = {budget: simulator(choice) for budget, choice in choices.items()}
+            runs = {
+                budget: simulator_of(choice.method, choice.iterations, choice.tolerance)
+                for budget, choice in choices.items()
+            }
             alone = prepare_scene(cloth, motions[0])  # not padded to the clips' common size
             for budget, milliseconds in time_frames(runs, alone).items():
                 choice, took = choices[budget], float(np.median(milliseconds))

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +70,6 @@ def main() -> None:
     whole = prepare_surface(np.asarray(poses.rest_positions), np.asarray(poses.faces))
     scene = prepare_scene(shirt, poses)
     everything = prepare_scene(shirt, poses, surface=whole)
-    bare = prepare_scene(shirt, poses, options=SceneOptions(has_body=False))
     num_faces = shirt.faces.shape[0]
     by_face = COTTON.replace(
         **{name: jnp.full(num_faces, getattr(COTTON, name)) for name in ("lame_mu", "lame_lambda")}
@@ -81,7 +82,55 @@ def main() -> None:
             (scene.start.position,),
         )
 
-    result = {
+    layered = SimConfig(simulator="physics", solver_iterations=ITERATIONS, self_contact=True)
+
+    def skirt() -> Scene:
+        """Return the hard case's skirt over trousers, which collide."""
+        case = find_case("layers").build({})["skirt over trousers"]
+        assert isinstance(case, StressScene)
+        return shorten(case, frames).scene
+
+    def still() -> Scene:
+        """Return the shirt on a body that does not move."""
+        return prepare_scene(shirt, pose_body(body, still_motion(body, frames), num_frames=frames))
+
+    def dress() -> Scene:
+        """Return a garment with pins."""
+        return prepare_scene(load_garment("dress", vertices=arguments.vertices), poses)
+
+    needed = (scene, config)
+    # What is compared with what, as scenes and configurations; the smoke run takes the first of them.
+    pairs: dict[str, Callable[[], dict[str, tuple[Scene, SimConfig]]]] = {
+        "T-shirt: with a body against without": lambda: {
+            "with": needed,
+            "without": (prepare_scene(shirt, poses, options=SceneOptions(has_body=False)), config),
+        },
+        "T-shirt: self-contact against none": lambda: {"with": (scene, layered), "without": needed},
+        "T-shirt: whole body against what it reaches": lambda: {
+            "whole body": (everything, config),
+            "reached": needed,
+        },
+        "T-shirt: fabric per face against one fabric": lambda: {
+            "per face": (prepare_scene(shirt, poses, material=by_face), config),
+            "one": needed,
+        },
+        "dress: pins that move against none": lambda: {
+            "pinned": (pinned := dress(), config),
+            "free": (pinned.replace(pin_targets=None), config),
+        },
+        "skirt over trousers: layers that collide against layers that don't": lambda: {
+            "with": (short := skirt(), layered),
+            "without": (short, config),
+        },
+        "T-shirt: moving body against a still one": lambda: {"moving": needed, "still": (still(), config)},
+        "T-shirt: all of that against what it needs": lambda: {
+            "all": (prepare_scene(shirt, poses, surface=whole, material=by_face), layered),
+            "needed": needed,
+        },
+    }
+    if arguments.smoke:
+        pairs = dict(list(pairs.items())[:1])
+    result: dict[str, Any] = {
         "vertices": int(np.sum(shirt.vertex_mask)),
         "frames": frames - 1,
         "solver_iterations": ITERATIONS,
@@ -89,52 +138,14 @@ def main() -> None:
             "body_faces": [int(whole.faces.shape[0]), int(scene.surface.faces.shape[0])],
             **compare({"whole body": search(everything), "reached": search(scene)}, turns),
         },
-        "T-shirt: whole body against what it reaches": compare(
-            {"whole body": steps(everything, config), "reached": steps(scene, config)}, turns
-        ),
-        "T-shirt: with a body against without": compare(
-            {"with": steps(scene, config), "without": steps(bare, config)}, turns
-        ),
-        "T-shirt: fabric per face against one fabric": compare(
-            {
-                "per face": steps(prepare_scene(shirt, poses, material=by_face), config),
-                "one": steps(scene, config),
-            },
-            turns,
-        ),
-        "dress: pins that move against none": compare(
-            {
-                "pinned": steps(dress := prepare_scene(load_garment("dress"), poses), config),
-                "free": steps(dress.replace(pin_targets=None), config),
-            },
-            turns,
-        ),
     }
-    layered = SimConfig(simulator="physics", solver_iterations=ITERATIONS, self_contact=True)
-    result["T-shirt: self-contact against none"] = compare(
-        {"with": steps(scene, layered), "without": steps(scene, config)}, turns
-    )
-    skirt = find_case("layers").build({})["skirt over trousers"]
-    assert isinstance(skirt, StressScene)
-    short = shorten(skirt, frames).scene
-    result["skirt over trousers: layers that collide against layers that don't"] = compare(
-        {"with": steps(short, layered), "without": steps(short, config)}, turns
-    )
-    still = pose_body(body, still_motion(body, frames), num_frames=frames)
-    result["T-shirt: moving body against a still one"] = compare(
-        {"moving": steps(scene, config), "still": steps(prepare_scene(shirt, still), config)}, turns
-    )
-    all_of_it = prepare_scene(shirt, poses, surface=whole, material=by_face)
-    result["T-shirt: all of that against what it needs"] = compare(
-        {"all": steps(all_of_it, layered), "needed": steps(scene, config)}, turns
-    )
+    for name, scenes in pairs.items():
+        result[name] = compare({label: steps(*pair) for label, pair in scenes().items()}, turns)
+        print(f"{name}: {result[name]['ratio']:.2f}x", flush=True)
     result |= {"device": device_name(), "environment": environment()}
     arguments.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(arguments.out / "scene_needs.json") as temporary:
         temporary.write_text(json.dumps(result, indent=1) + "\n")
-    for name, measured in result.items():
-        if isinstance(measured, dict) and "ratio" in measured:
-            print(f"{name}: {measured['ratio']:.2f}x")
 
 
 if __name__ == "__main__":

@@ -22,15 +22,14 @@ import jax
 import numpy as np
 from peers import SETTINGS, SMOKE_SETTINGS, peer_points, peer_versions
 
-from eslr_jax.assets import asset_names, load_model
-from eslr_jax.config import SimConfig
+from eslr_jax.assets import asset_names
 from eslr_jax.evaluation.calibrate import (
     SOLVER,
     Method,
     device_name,
     example_scene,
     measure_methods,
-    with_iterations,
+    simulator_of,
 )
 from eslr_jax.evaluation.report import environment, trajectory_report
 from eslr_jax.io.atomic import atomic_write
@@ -57,18 +56,13 @@ def points(method: Method) -> list[dict]:
     ]
 
 
-def free_rollouts(
-    model: str | None, garment: str, size: str, num_frames: int, counts: tuple[int, ...]
-) -> list[dict]:
+def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: tuple[int, ...]) -> list[dict]:
     """Return the report of free rollouts with several iteration counts."""
     scene = example_scene(garment, size, CLIP, num_frames)
-    params, config = None, SimConfig(simulator="physics")
-    if model is not None:
-        params, architecture = load_model(model)
-        config = SimConfig(model=architecture)
     reports = []
     for count in counts:
-        trajectory = simulate_scene(params, scene, PhysicsParameters(), with_iterations(config, count))
+        params, config = simulator_of(name, count)
+        trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
         report = trajectory_report(trajectory, scene)
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
         reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})
@@ -143,9 +137,9 @@ def main() -> None:
     garments, frames, rollout_frames, settings = GARMENTS, 40, 60, SETTINGS
     solver_counts, network_counts = ROLLOUTS
     if arguments.smoke:
-        garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 6, SMOKE_SETTINGS
+        garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 8, SMOKE_SETTINGS
         arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
-        solver_counts, network_counts = solver_counts[:1], network_counts[:1]
+        solver_counts = network_counts = (10,)  # which the calibration has compiled
     path = arguments.out / "speed_vs_error.json"
     result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}
     if path.exists() and not arguments.smoke:
@@ -154,7 +148,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     for size in arguments.sizes:
         scenes = [example_scene(garment, size, CLIP, frames) for garment in garments]
-        methods = measure_methods((None, *arguments.models), scenes)
+        methods = measure_methods((SOLVER, *arguments.models), scenes)
         print(f"{size}: methods measured", flush=True)
         measured = {method.name: points(method) for method in methods}
         if arguments.peers:
@@ -163,12 +157,15 @@ def main() -> None:
             measured |= peers
             print(f"{size}: peers measured", flush=True)
         rollouts = {
-            name or SOLVER: [
+            name: [
                 entry
                 for garment in garments
                 for entry in free_rollouts(name, garment, size, rollout_frames, counts)
             ]
-            for name, counts in ((None, solver_counts), *((m, network_counts) for m in arguments.models[:1]))
+            for name, counts in (
+                (SOLVER, solver_counts),
+                *((m, network_counts) for m in arguments.models[:1]),
+            )
         }
         result["sizes"][size] = {
             "methods": measured,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -316,17 +317,24 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     """Load a trained network.
 
     Args:
-        name: Name of a bundled model, or path of an exported npz file.
+        name: Name of a bundled model, or path of an exported npz file; `NAME:PASSES` takes more or fewer passes
+            per frame than it was trained with, for less error or less time.
 
     Returns:
         Its weights and its architecture.
 
     Raises:
-        AssetError: There is no such model, or the file is damaged.
+        AssetError: There is no such model, it can't take so many passes, or the file is damaged.
         CheckpointError: The file is for another architecture or a newer version.
     """
-    path = Path(name) if _is_path(str(name)) else find_asset("model", str(name))
-    params, config, _ = read_weights(path)
+    parts = re.fullmatch(r"(.+):(\d+)", str(name))
+    model = parts[1] if parts else str(name)
+    params, config, _ = read_weights(Path(model) if _is_path(model) else find_asset("model", model))
+    if parts:
+        try:
+            config = dataclasses.replace(config, passes=int(parts[2]))
+        except ValueError as error:
+            raise AssetError(f"model {name}: {error}") from error
     return params, config
 
 

@@ -19,14 +19,14 @@ from eslr_jax.assets.catalog import data_folder
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation.excess import measure_excess
+from eslr_jax.evaluation.excess import Excess, measure_excess
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import Name, time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
 from eslr_jax.simulate.scan import simulate_scene
-from eslr_jax.types import Scene
+from eslr_jax.types import Scene, Trajectory
 
 FORMAT = 1
 ITERATIONS = (0, 1, 2, 5, 10, 20, 40, 80, 160)
@@ -83,7 +83,7 @@ def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) ->
     methods: list[Method] = []
     for size in sizes:
         scenes = [example_scene(name, size, _CLIP) for name in _GARMENTS]
-        methods += measure_methods((None, *models), scenes)
+        methods += measure_methods((SOLVER, *models), scenes)
     return Calibration(device_name(), tuple(methods))
 
 
@@ -93,56 +93,79 @@ def example_scene(garment: str, size: str, clip: str, num_frames: int = _FRAMES)
     return prepare_scene(load_garment(garment, vertices=size), poses)  # type: ignore[arg-type]
 
 
-def measure_methods(models: tuple[str | None, ...], scenes: list[Scene]) -> list[Method]:
-    """Measure error and cost of the solver (None) and of networks, on states of the optimum's own rollouts.
+def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:
+    """Measure error and cost of methods, on states of the optimum's own rollouts.
+
+    The optimum of a frame is the least that any of them finds: a network may lead into a deeper minimum.
 
     Args:
-        models: Names of networks; None is the solver alone.
+        names: Of bundled networks; SOLVER is the solver alone.
         scenes: Of one size; the first is timed.
     """
     near_optimum = SimConfig(simulator="physics")
     truths = [simulate_scene(None, scene, PhysicsParameters(), near_optimum) for scene in scenes]
-    return [_measure(model, scenes, truths) for model in models]
+    measured = {
+        name: [_measure_excess(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
+        for name in names
+    }
+    optima = [
+        np.min([ends.optimum for ends in same], axis=0) for same in zip(*measured.values(), strict=True)
+    ]
+    return [_describe(name, excesses, optima, scenes[0]) for name, excesses in measured.items()]
 
 
-def _measure(model: str | None, scenes: list[Scene], truths: list[Any]) -> Method:
-    """Measure one method's error on all scenes and its cost on the first."""
-    parameters = PhysicsParameters()
-    params, config = None, SimConfig(simulator="physics")
-    if model is not None:
-        params, architecture = load_model(model)
-        config = SimConfig(model=architecture)
-    counts = ITERATIONS[1:] if model is None else ITERATIONS
-    relative: dict[int, list[np.ndarray]] = {count: [] for count in counts}
-    for scene, truth in zip(scenes, truths, strict=True):
-        excess = jax.device_get(
-            measure_excess(
-                params,
-                truth,
-                scene,
-                parameters,
-                config,
-                every=_EVERY,
-                iterations=counts if model is None else (),
-                corrector_steps=counts,
-            )
+def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
+    """Return the potentials that a method leaves after every count of `ITERATIONS`, as NumPy arrays."""
+    params, config = simulator_of(name)
+    is_solver = name == SOLVER
+    return jax.device_get(
+        measure_excess(
+            params,
+            truth,
+            scene,
+            PhysicsParameters(),
+            config,
+            every=_EVERY,
+            iterations=ITERATIONS[1:] if is_solver else (),
+            corrector_steps=ITERATIONS,
         )
-        drop = np.maximum(excess.start - excess.optimum, 1e-9)
-        for count, energy in (excess.solver if model is None else excess.corrected).items():
-            relative[count].append(np.maximum(energy - excess.optimum, 0.0) / drop)
+    )
+
+
+def _describe(name: str, excesses: list[Excess], optima: list[np.ndarray], timed: Scene) -> Method:
+    """Return a method's errors over all scenes, and its cost on one."""
+    relative: dict[int, list[np.ndarray]] = {}
+    for ends, optimum in zip(excesses, optima, strict=True):
+        drop = np.maximum(ends.start - optimum, 1e-9)
+        for count, energy in (ends.solver if name == SOLVER else ends.corrected).items():
+            relative.setdefault(count, []).append(np.maximum(energy - optimum, 0.0) / drop)
     joined = {count: np.concatenate(parts) for count, parts in relative.items()}
-    counted = {count: (params, with_iterations(config, count)) for count in _TIMED_ITERATIONS}
-    times = {count: float(np.median(values)) for count, values in time_frames(counted, scenes[0]).items()}
+    counted = {count: simulator_of(name, count) for count in _TIMED_ITERATIONS}
+    times = {count: float(np.median(values)) for count, values in time_frames(counted, timed).items()}
     low, high = _TIMED_ITERATIONS
     iteration_ms = (times[high] - times[low]) / (high - low)
     return Method(
-        name=SOLVER if model is None else model,
-        vertices=int(np.sum(scenes[0].garment.vertex_mask)),
+        name=name,
+        vertices=int(np.sum(timed.garment.vertex_mask)),
         fixed_ms=max(times[low] - low * iteration_ms, 0.0),
         iteration_ms=iteration_ms,
         median={str(count): float(np.median(values)) for count, values in joined.items()},
         p99={str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
     )
+
+
+def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tuple[Any, SimConfig]:
+    """Return weights and configuration of a method: the solver, or a network with the solver behind it.
+
+    Args:
+        name: SOLVER, whose weights are None, or the name of a bundled network.
+        iterations: Of the solver, per frame.
+        tolerance: See `SimConfig`.
+    """
+    if name == SOLVER:
+        return None, SimConfig(simulator="physics", solver_iterations=iterations, tolerance=tolerance)
+    params, architecture = load_model(name)
+    return params, SimConfig(model=architecture, corrector_steps=iterations, tolerance=tolerance)
 
 
 def time_frames(
@@ -169,12 +192,6 @@ def time_frames(
         name: [whole / (frames - 1) for whole in values]
         for name, values in time_in_turns(parts, turns).items()
     }
-
-
-def with_iterations(config: SimConfig, iterations: int, tolerance: float = 0.0) -> SimConfig:
-    """Return a configuration with so many solver iterations per frame, behind the network if it has one."""
-    name = "solver_iterations" if config.simulator == "physics" else "corrector_steps"
-    return dataclasses.replace(config, **{name: iterations, "tolerance": tolerance})
 
 
 def choose(

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.calibrate import SOLVER, simulator_of
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
@@ -46,10 +47,11 @@ def arguments(description: str | None, *, frames: int = 150) -> argparse.Namespa
 def simulator(model: str) -> tuple[Any, SimConfig, dict[str, Any]]:
     """Return weights, configuration and garment options of a network, or of the optimum."""
     if model == OPTIMUM:
-        return None, SimConfig(simulator="physics", solver_iterations=_OPTIMUM_ITERATIONS), {}
-    params, architecture = load_model(model)
+        return *simulator_of(SOLVER, _OPTIMUM_ITERATIONS), {}
+    params, config = simulator_of(model)
+    assert config.model is not None
     names = ("embedding_size", "embedding_mode")
-    return params, SimConfig(model=architecture), {name: getattr(architecture, name) for name in names}
+    return params, config, {name: getattr(config.model, name) for name in names}
 
 
 def table(

@@ -41,6 +41,14 @@ def test_unknown_names_list_what_exists(load):
         load("nosuchthing")
 
 
+def test_a_network_takes_as_many_passes_as_are_asked_for():
+    _, trained = load_model("eslr-small")
+    _, fewer = load_model("eslr-small:3")
+    assert fewer == dataclasses.replace(trained, passes=3)
+    with pytest.raises(AssetError, match="passes must be at least 1"):
+        load_model("eslr-small:0")
+
+
 def test_close_names_are_suggested():
     with pytest.raises(AssetError, match="did you mean cmu_016_32"):
         load_motion("cmu_016_23x".replace("23x", "3 2"))
