@@ -28,7 +28,7 @@ from eslr_jax.evaluation.calibrate import (
     simulator_of,
     time_frames,
 )
-from eslr_jax.evaluation.excess import answer_potentials, measure_excess, trajectory_states
+from eslr_jax.evaluation.excess import measure_excess
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
@@ -53,10 +53,7 @@ def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, 
             None, trajectory, scene, parameters, config, every=every, iterations=(), corrector_steps=()
         )
     )
-    states, inputs = trajectory_states(trajectory, scene, parameters)
-    taken = jax.tree.map(lambda leaf: leaf[1::every], (trajectory.positions[1:], states, inputs))
-    left = np.asarray(answer_potentials(*taken, scene, parameters)) - ends.optimum
-    shares = np.maximum(left, 0.0) / np.maximum(ends.start - ends.optimum, 1e-9)
+    shares = np.maximum(ends.answer - ends.optimum, 0.0) / np.maximum(ends.start - ends.optimum, 1e-9)
     return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
 
 

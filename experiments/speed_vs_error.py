@@ -69,21 +69,30 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
     return reports
 
 
-def who_wins(by_name: dict[str, list[dict]]) -> list[dict]:
-    """Return, for a range of budgets, the best excess of every method's points."""
+def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
+    """Return, for a range of budgets, the excess of every method within them.
+
+    Ours can take any number of iterations between those that were measured, where the logarithm of the excess
+    is taken as linear; a peer's settings are single points, of which the best counts.
+    """
     least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
     most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
-    rows = []
-    for budget in np.geomspace(least, most, 8):
-        best = {
-            name: min(
-                (entry["excess_relative_median"] for entry in entries if entry["frame_ms"] <= budget),
-                default=None,
-            )
-            for name, entries in by_name.items()
-        }
-        rows.append({"budget_ms": float(budget), **best})
-    return rows
+
+    def within(name: str, budget: float) -> float | None:
+        times, excesses = (
+            np.array([entry[key] for entry in by_name[name]])
+            for key in ("frame_ms", "excess_relative_median")
+        )
+        if budget < times.min():
+            return None
+        if name in peers:
+            return float(excesses[times <= budget].min())
+        return float(np.exp(np.interp(budget, times, np.log(np.maximum(excesses, 1e-7)))))
+
+    return [
+        {"budget_ms": float(budget), **{name: within(name, budget) for name in by_name}}
+        for budget in np.geomspace(least, most, 8)
+    ]
 
 
 def draw(result: dict, path: Path) -> None:
@@ -177,7 +186,7 @@ def main() -> None:
                 }
                 for method in methods
             ],
-            "budgets": who_wins(measured),
+            "budgets": who_wins(measured, result["peers"]),
             "rollouts": rollouts,
             "environment": environment(),
         }
@@ -195,7 +204,7 @@ def print_budgets(size: str, rows: list[dict]) -> None:
     print(size)
     for row in rows:
         cells = ", ".join(
-            f"{name} {'-' if value is None else f'{value:.3%}'}"
+            f"{name} {'-' if value is None else f'{value:.4%}'}"
             for name, value in row.items()
             if name != "budget_ms"
         )

@@ -96,10 +96,11 @@ def example_scene(garment: str, size: str, clip: str, num_frames: int = _FRAMES)
 def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:
     """Measure error and cost of methods, on states of the optimum's own rollouts.
 
-    The optimum of a frame is the least that any of them finds: a network may lead into a deeper minimum.
+    The optimum of a frame is the least that any of them finds: a network may lead into a deeper minimum. All
+    are timed in turns, since a machine's speed changes within minutes.
 
     Args:
-        names: Of bundled networks; SOLVER is the solver alone.
+        names: Of networks; SOLVER is the solver alone.
         scenes: Of one size; the first is timed.
     """
     near_optimum = SimConfig(simulator="physics")
@@ -111,7 +112,15 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
     optima = [
         np.min([ends.optimum for ends in same], axis=0) for same in zip(*measured.values(), strict=True)
     ]
-    return [_describe(name, excesses, optima, scenes[0]) for name, excesses in measured.items()]
+    runs = {(name, count): simulator_of(name, count) for name in names for count in _TIMED_ITERATIONS}
+    times = {run: float(np.median(values)) for run, values in time_frames(runs, scenes[0]).items()}
+    num_vertices = int(np.sum(scenes[0].garment.vertex_mask))
+    return [
+        _describe(
+            name, excesses, optima, tuple(times[name, count] for count in _TIMED_ITERATIONS), num_vertices
+        )
+        for name, excesses in measured.items()
+    ]
 
 
 def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
@@ -132,22 +141,22 @@ def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
     )
 
 
-def _describe(name: str, excesses: list[Excess], optima: list[np.ndarray], timed: Scene) -> Method:
-    """Return a method's errors over all scenes, and its cost on one."""
+def _describe(
+    name: str, excesses: list[Excess], optima: list[np.ndarray], times: tuple[float, ...], num_vertices: int
+) -> Method:
+    """Return a method's errors over all scenes, and its cost from the times [ms] of `_TIMED_ITERATIONS`."""
     relative: dict[int, list[np.ndarray]] = {}
     for ends, optimum in zip(excesses, optima, strict=True):
         drop = np.maximum(ends.start - optimum, 1e-9)
         for count, energy in (ends.solver if name == SOLVER else ends.corrected).items():
             relative.setdefault(count, []).append(np.maximum(energy - optimum, 0.0) / drop)
     joined = {count: np.concatenate(parts) for count, parts in relative.items()}
-    counted = {count: simulator_of(name, count) for count in _TIMED_ITERATIONS}
-    times = {count: float(np.median(values)) for count, values in time_frames(counted, timed).items()}
     low, high = _TIMED_ITERATIONS
-    iteration_ms = (times[high] - times[low]) / (high - low)
+    iteration_ms = (times[1] - times[0]) / (high - low)
     return Method(
         name=name,
-        vertices=int(np.sum(timed.garment.vertex_mask)),
-        fixed_ms=max(times[low] - low * iteration_ms, 0.0),
+        vertices=num_vertices,
+        fixed_ms=max(times[0] - low * iteration_ms, 0.0),
         iteration_ms=iteration_ms,
         median={str(count): float(np.median(values)) for count, values in joined.items()},
         p99={str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},

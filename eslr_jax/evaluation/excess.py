@@ -29,6 +29,7 @@ class Excess(NamedTuple):
 
     start: Float[Array, " frames"]  # at the pushed-out inertial guess
     optimum: Float[Array, " frames"]
+    answer: Float[Array, " frames"]  # what the trajectory itself did
     solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from that start
     corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
 
@@ -80,7 +81,7 @@ def measure_excess(
         corrector_steps: L-BFGS iterations behind the model; static.
     """
     states, inputs = trajectory_states(trajectory, scene, parameters)
-    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
+    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs, trajectory.positions[1:]))
     garment, material = scene.garment, scene.material
 
     counts = [*iterations, _OPTIMUM_ITERATIONS]
@@ -90,7 +91,7 @@ def measure_excess(
         origins += [1] * (len(counts) - len(origins))
 
     def measure(frame):
-        state, inputs = frame
+        state, inputs, answer = frame
         problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
         places = [start_guess(problem, garment)]
         if params is not None:
@@ -114,7 +115,10 @@ def measure_excess(
             corrected = dict(zip(corrector_steps, values[split + 1 : -1], strict=True))
             # The network may start in the basin of a deeper minimum than the solver finds.
             optimum = jnp.minimum(optimum, values[-1])
-        return Excess(potential(places[0], problem, garment, material), optimum, solver, corrected)
+        start, answered = jax.lax.map(
+            lambda x: potential(x, problem, garment, material), jnp.stack([places[0], answer])
+        )
+        return Excess(start, optimum, answered, solver, corrected)
 
     return jax.lax.map(measure, taken)
 

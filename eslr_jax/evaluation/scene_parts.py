@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
 import jax
@@ -20,7 +20,7 @@ from eslr_jax.simulate.scan import frame_inputs
 from eslr_jax.simulate.step import frame_problem, solve, step
 from eslr_jax.types import BodyMotion, Scene
 
-Name = TypeVar("Name", str, int)
+Name = TypeVar("Name", bound=Hashable)
 _TURNS = 15  # timings of every part, in turns; medians count
 _ITERATIONS = 20  # of the solver's part
 
