@@ -40,7 +40,6 @@ RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
 GARMENTS = ("tshirt", "dress", "pants")
 ROLLOUTS = (5, 10, 20, 50, 100), (0, 5, 20)  # iterations of free rollouts, by the solver and behind a network
-COLORS = {SOLVER: "#1b1b1b"}
 
 
 def points(method: Method) -> list[dict]:
@@ -103,6 +102,9 @@ def draw(result: dict, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     sizes, peers = list(result["sizes"]), result["peers"]
+    names = dict.fromkeys(name for size in sizes for name in result["sizes"][size]["methods"])
+    colors = {name: "#1b1b1b" if name == SOLVER else f"C{k % 10}" for k, name in enumerate(names)}
+    lines = {}
     figure, axes = plt.subplots(
         1, len(sizes), figsize=(5.2 * len(sizes), 4.8), sharey=True, squeeze=False, layout="constrained"
     )
@@ -113,7 +115,7 @@ def draw(result: dict, path: Path) -> None:
             times, errors = (
                 [entry[key] for entry in shown] for key in ("frame_ms", "excess_relative_median")
             )
-            axis.loglog(times, errors, "o-", label=label, color=COLORS.get(name), markersize=4)
+            (lines[label],) = axis.loglog(times, errors, "o-", color=colors[name], markersize=4)
             for entry in shown:
                 axis.annotate(
                     str(entry["iterations"]),
@@ -126,8 +128,7 @@ def draw(result: dict, path: Path) -> None:
         axis.set_xlabel("time per frame [ms]")
         axis.grid(True, which="both", alpha=0.2)
     axes[0][0].set_ylabel("excess over the optimum / the frame's drop (median)")
-    lines, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(lines, labels, loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize=8)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
 
