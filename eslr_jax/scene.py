@@ -19,9 +19,8 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
-REACH = (
-    0.08  # [m] that cloth strays from its skinned position, besides how loose it is; other faces are left out
-)
+# [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
+REACH = 0.08
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 _SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take the skinned start out of the body
@@ -144,7 +143,9 @@ def reachable_vertices(garment: Garment, skinned: jax.Array, poses: BodyMotion, 
     radii = reach + _looseness(garment, poses)
     is_near = np.zeros(poses.positions.shape[1], bool)
     for frame in frames:
-        is_near |= _within(radii, np.asarray(skinned[frame])[is_real], np.asarray(poses.positions[frame]))
+        far = np.flatnonzero(~is_near)  # once is enough
+        points = np.asarray(poses.positions[frame])[far]
+        is_near[far] = _within(radii, np.asarray(skinned[frame])[is_real], points)
     return is_near
 
 
