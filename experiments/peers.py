@@ -229,9 +229,11 @@ def describe_rollout(positions: np.ndarray, scene: Scene) -> dict[str, Any]:
     return row | count_intersections(positions[-1], scene)
 
 
-def measure_scene(scene: Scene, settings: tuple[Setting, ...], every: int) -> list[dict[str, Any]]:
-    """Return a row of plain values per method."""
-    methods = [our_method(scene, *effort) for effort in OURS] + newton_methods(scene, settings)
+def measure_scene(
+    scene: Scene, efforts: tuple[tuple[int, int], ...], settings: tuple[Setting, ...], every: int
+) -> list[dict[str, Any]]:
+    """Return a row of plain values per method: ours by efforts, Newton's by settings."""
+    methods = [our_method(scene, *effort) for effort in efforts] + newton_methods(scene, settings)
     truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
     excess, drop = teach(methods, scene, truth, every)
@@ -340,10 +342,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
     arguments = parser.parse_args()
-    settings = SETTINGS
+    efforts, settings = OURS, SETTINGS
     if arguments.smoke:
         arguments.scenes, arguments.frames = ["tshirt_1k"], 8
-        settings = SMOKE_SETTINGS
+        efforts, settings = OURS[-1:], SMOKE_SETTINGS
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
         "clip": CLIP,
@@ -357,7 +359,7 @@ def main() -> None:
     result["versions"] |= peer_versions()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.scenes:
-        rows = measure_scene(make_scene(name, arguments.frames), settings, EVERY)
+        rows = measure_scene(make_scene(name, arguments.frames), efforts, settings, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         with atomic_write(arguments.out / "peers.json") as temporary:  # after every scene: they take minutes

@@ -125,23 +125,23 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
 
 
 def take_turns(parts: dict[str, tuple[Callable, tuple]], turns: int = _TURNS) -> dict[str, float]:
-    """Return the median milliseconds of jitted functions that are called in turns.
+    """Return the median milliseconds of functions that are jitted and called in turns.
 
     Args:
         parts: Functions with their arguments.
         turns: Calls of each.
     """
-    return {name: float(np.median(values)) for name, values in time_in_turns(parts, turns).items()}
+    jitted = {name: (jax.jit(function), arguments) for name, (function, arguments) in parts.items()}
+    return {name: float(np.median(values)) for name, values in time_in_turns(jitted, turns).items()}
 
 
 def time_in_turns(parts: dict[Name, tuple[Callable, tuple]], turns: int) -> dict[Name, list[float]]:
-    """Return the milliseconds of every call of jitted functions that are called in turns; see `take_turns`."""
-    compiled = {name: jax.jit(function) for name, (function, _) in parts.items()}
+    """Return the milliseconds of every call of functions that are jitted already; see `take_turns`."""
     times: dict[Name, list[float]] = {name: [] for name in parts}
     for turn in range(turns + 1):
-        for name, (_, arguments) in parts.items():
+        for name, (function, arguments) in parts.items():
             began = time.perf_counter()
-            jax.block_until_ready(compiled[name](*arguments))
+            jax.block_until_ready(function(*arguments))
             if turn:  # the first compiles
                 times[name].append((time.perf_counter() - began) * 1e3)
     return times

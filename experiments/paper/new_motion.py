@@ -18,9 +18,9 @@ def main() -> None:
     chosen = arguments(__doc__, frames=100)
     splits = load_splits()
     clips, garments = splits["motions"]["unseen_motion"], ["tshirt", "dress"]
+    models: tuple[str, ...] = (default_model(), "mgn-small-6k", OPTIMUM)
     if chosen.smoke:
-        garments, clips = garments[:1], clips[:1]
-    models = (default_model(), "mgn-small-6k", OPTIMUM)
+        garments, clips, models = garments[:1], clips[:1], models[1:]
     measured = table(models, garments, clips, vertices=chosen.vertices, frames=chosen.frames)
     result = {"clips": clips, "frames": chosen.frames, "vertices": chosen.vertices, "garments": measured}
     write({**result, "mean": mean_over_garments(measured)}, chosen.out / "new_motion.json")
