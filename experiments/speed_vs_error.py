@@ -28,6 +28,7 @@ from eslr_jax.evaluation.calibrate import (
     Method,
     device_name,
     example_scene,
+    interpolate_excess,
     measure_methods,
     simulator_of,
 )
@@ -71,22 +72,17 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
 def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
     """Return, for a range of budgets, the excess of every method within them.
 
-    Ours can take any number of iterations between those that were measured, where the logarithm of the excess
-    is taken as linear; a peer's settings are single points, of which the best counts.
+    Ours can take any number of iterations between those that were measured; a peer's settings are single points,
+    of which the best counts.
     """
     least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
     most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
 
     def within(name: str, budget: float) -> float | None:
-        times, excesses = (
-            np.array([entry[key] for entry in by_name[name]])
-            for key in ("frame_ms", "excess_relative_median")
-        )
-        if budget < times.min():
-            return None
+        curve = {entry["frame_ms"]: entry["excess_relative_median"] for entry in by_name[name]}
         if name in peers:
-            return float(excesses[times <= budget].min())
-        return float(np.exp(np.interp(budget, times, np.log(np.maximum(excesses, 1e-7)))))
+            return min((excess for time, excess in curve.items() if time <= budget), default=None)
+        return interpolate_excess(curve, budget) if budget >= min(curve) else None
 
     return [
         {"budget_ms": float(budget), **{name: within(name, budget) for name in by_name}}

@@ -252,7 +252,7 @@ def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
         count = int((budget_ms - method.fixed_ms) / method.iteration_ms)
         count = min(count, ITERATIONS[-1])
         if count >= min(int(key) for key in method.median):
-            options.append((_interpolate(method.median, count), method, count))
+            options.append((interpolate_excess(method.median, count), method, count))
     if not options:
         least = min(method.fixed_ms + method.iteration_ms for method in methods)
         raise ConfigError(f"--budget {budget_ms:g}ms: the fastest frame here takes {least:.1f} ms")
@@ -273,7 +273,7 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
     options = []
     for method in methods:
         counts = range(min(int(key) for key in method.p99), ITERATIONS[-1] + 1)
-        count = next((count for count in counts if _interpolate(method.p99, count) <= tolerance), None)
+        count = next((count for count in counts if interpolate_excess(method.p99, count) <= tolerance), None)
         if count is not None:
             options.append((method.fixed_ms + count * method.iteration_ms, method, count))
     if not options:
@@ -287,17 +287,22 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
         iterations=_MOST_ITERATIONS,
         tolerance=tolerance,
         expected_ms=cost,
-        expected_excess=_interpolate(method.median, count),
+        expected_excess=interpolate_excess(method.median, count),
         reason=f"fastest below {tolerance:.2%} on 99 % of frames"
         + (f" (others: {others})" if others else ""),
     )
 
 
-def _interpolate(curve: dict[str, float], count: int) -> float:
-    """Return the excess after `count` iterations: between measurements its logarithm is linear."""
-    counts = sorted(int(key) for key in curve)
-    values = [np.log(max(curve[str(key)], 1e-7)) for key in counts]
-    return float(np.exp(np.interp(count, counts, values)))
+def interpolate_excess(curve: Mapping[Any, float], place: float) -> float:
+    """Return a curve's excess at a place: between measurements its logarithm is linear, beyond them it stays.
+
+    Args:
+        curve: Relative excess by iterations or by milliseconds; keys are numbers, or their text as JSON has it.
+        place: The same.
+    """
+    keys = sorted(curve, key=float)
+    values = [np.log(max(curve[key], 1e-7)) for key in keys]
+    return float(np.exp(np.interp(place, [float(key) for key in keys], values)))
 
 
 def device_name() -> str:
