@@ -45,9 +45,9 @@ EVERY = 5  # frames between those whose excess is measured
 
 def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, float]:
     """Return the excess of frames of a free rollout over their drop, and the mean of iterations spent."""
-    params, config = simulator_of(choice.method, choice.iterations, choice.tolerance)
+    params, config = simulator_of(choice.method, tolerance=choice.tolerance)
     parameters = PhysicsParameters()
-    trajectory = simulate_scene(params, scene, parameters, config)
+    trajectory = simulate_scene(params, scene, parameters, config, choice.iterations)
     ends = jax.device_get(
         measure_excess(
             None, trajectory, scene, parameters, config, every=every, iterations=(), corrector_steps=()
@@ -98,7 +98,7 @@ def main() -> None:
                 factor * least: choose(calibration, count, budget_ms=factor * least) for factor in budgets
             }
             runs = {
-                budget: simulator_of(choice.method, choice.iterations, choice.tolerance)
+                budget: (*simulator_of(choice.method), choice.iterations)
                 for budget, choice in choices.items()
             }
             alone = prepare_scene(cloth, motions[0])  # not padded to the clips' common size

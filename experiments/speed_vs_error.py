@@ -60,9 +60,9 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
     """Return the report of free rollouts with several iteration counts."""
     scene = example_scene(garment, size, CLIP, num_frames)
     reports = []
+    params, config = simulator_of(name)
     for count in counts:
-        params, config = simulator_of(name, count)
-        trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
+        trajectory = simulate_scene(params, scene, PhysicsParameters(), config, count)
         report = trajectory_report(trajectory, scene)
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
         reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})

@@ -35,6 +35,7 @@ _CLIP = "cmu_016_22"  # of the training split, so that the choice has not seen t
 _GARMENTS = ("tshirt", "dress")
 _FRAMES = 60
 _EVERY = 3  # frames between those whose excess is measured
+_TRUTH_ITERATIONS = 100  # of the rollouts that supply the states
 _TIMED_FRAMES = 20
 _TIMED_ITERATIONS = (10, 60)
 _TURNS = 9  # timings of each, in turns; medians count
@@ -103,8 +104,10 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
         names: Of networks; SOLVER is the solver alone.
         scenes: Of one size; the first is timed.
     """
-    near_optimum = SimConfig(simulator="physics")
-    truths = [simulate_scene(None, scene, PhysicsParameters(), near_optimum) for scene in scenes]
+    _, solver = simulator_of(SOLVER)
+    truths = [
+        simulate_scene(None, scene, PhysicsParameters(), solver, _TRUTH_ITERATIONS) for scene in scenes
+    ]
     measured = {
         name: [_measure_excess(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
         for name in names
@@ -112,7 +115,7 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
     optima = [
         np.min([ends.optimum for ends in same], axis=0) for same in zip(*measured.values(), strict=True)
     ]
-    runs = {(name, count): simulator_of(name, count) for name in names for count in _TIMED_ITERATIONS}
+    runs = {(name, count): (*simulator_of(name), count) for name in names for count in _TIMED_ITERATIONS}
     times = {run: float(np.median(values)) for run, values in time_frames(runs, scenes[0]).items()}
     num_vertices = int(np.sum(scenes[0].garment.vertex_mask))
     return [
@@ -178,12 +181,12 @@ def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tupl
 
 
 def time_frames(
-    runs: Mapping[Name, tuple[Any, SimConfig]], scene: Scene, turns: int = _TURNS
+    runs: Mapping[Name, tuple[Any, SimConfig, int | None]], scene: Scene, turns: int = _TURNS
 ) -> dict[Name, list[float]]:
     """Return milliseconds per frame of rollouts, one number per turn.
 
     Args:
-        runs: Weights and configurations by name; all are rolled out in turns.
+        runs: Weights, configuration and iterations by name, see `simulate_scene`; all are rolled out in turns.
         scene: Its first frames are simulated.
         turns: Rollouts of each.
     """
@@ -194,8 +197,11 @@ def time_frames(
         num_frames=frames,
     )
     parts = {
-        name: (partial(simulate_scene, config=config), (params, short, PhysicsParameters()))
-        for name, (params, config) in runs.items()
+        name: (
+            partial(simulate_scene, config=config, iterations=iterations),
+            (params, short, PhysicsParameters()),
+        )
+        for name, (params, config, iterations) in runs.items()
     }
     return {
         name: [whole / (frames - 1) for whole in values]

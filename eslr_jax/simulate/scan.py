@@ -43,6 +43,7 @@ def scan_frames(
     length: int,
     parameters: PhysicsParameters,
     config: SimConfig,
+    iterations: Int[Array, ""] | None = None,
 ) -> tuple[ClothState, Frames]:
     """Simulate `length` frames from `state`; pure, and fit for jit, vmap and grad.
 
@@ -54,6 +55,7 @@ def scan_frames(
         length: Number of frames; static.
         parameters: Physical constants; traced.
         config: Choices that shape the compiled step; static.
+        iterations: See `simulate_scene`.
     """
 
     def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
@@ -61,7 +63,7 @@ def scan_frames(
             scene.garment, state, frame, scene.surface, scene.timestep, parameters, config
         )
         report: StepReport
-        state, report = step(params, scene.garment, scene.material, problem, state, config)
+        state, report = step(params, scene.garment, scene.material, problem, state, config, iterations)
         return state, Frames(
             state.position, state.velocity, report.residual, report.iterations, report.needed_capacity
         )
@@ -70,7 +72,13 @@ def scan_frames(
 
 
 @partial(jax.jit, static_argnames="config")
-def simulate_scene(params: Any, scene: Scene, parameters: PhysicsParameters, config: SimConfig) -> Trajectory:
+def simulate_scene(
+    params: Any,
+    scene: Scene,
+    parameters: PhysicsParameters,
+    config: SimConfig,
+    iterations: Int[Array, ""] | int | None = None,
+) -> Trajectory:
     """Simulate every frame of a scene.
 
     Args:
@@ -78,12 +86,14 @@ def simulate_scene(params: Any, scene: Scene, parameters: PhysicsParameters, con
         scene: Garment, fabric, start, and the outside world frame by frame.
         parameters: Physical constants; traced.
         config: Choices that shape the compiled step; static.
+        iterations: Of L-BFGS per frame, in place of the configuration's; traced, so that rollouts which differ
+            in nothing else share a program.
 
     Returns:
         Positions and velocities of all frames, frame 0 being the scene's start.
     """
     inputs, length = frame_inputs(scene), scene.num_frames - 1
-    end, frames = scan_frames(params, scene, scene.start, inputs, length, parameters, config)
+    end, frames = scan_frames(params, scene, scene.start, inputs, length, parameters, config, iterations)
     return join_frames(scene.start, frames, end)
 
 

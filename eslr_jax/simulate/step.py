@@ -129,6 +129,7 @@ def step(
     problem: FrameProblem,
     state: ClothState,
     config: SimConfig,
+    iterations: Int[Array, ""] | None = None,
 ) -> tuple[ClothState, StepReport]:
     """Advance the cloth by one frame.
 
@@ -139,21 +140,22 @@ def step(
         problem: The frame's minimisation problem, which holds contacts and pins.
         state: Cloth at t.
         config: Choice of simulator; static.
+        iterations: Of L-BFGS, in place of the configuration's; traced, so that all numbers share a program.
     """
     status = jnp.int32(Status.OK)
     if config.simulator == "physics":
-        start, iterations = solver_start(problem, garment, material), config.solver_iterations
+        start, most = solver_start(problem, garment, material), config.solver_iterations
     else:
         assert config.model is not None
         start, status = network_step(params, garment, material, problem, state, config.model)
-        iterations = config.corrector_steps
-    if iterations:
+        most = config.corrector_steps
+    if most or iterations is not None:
         minimum = solve(
             problem,
             garment,
             material,
             start,
-            iterations=iterations,
+            iterations=most if iterations is None else iterations,
             memory=config.solver_memory,
             tolerance=config.tolerance,
         )

@@ -21,16 +21,16 @@ def main() -> None:
     chosen = arguments(__doc__)
     splits = load_splits()
     garments, clips = splits["garments"]["unseen"], splits["motions"]["test"][:3]
-    modes = MODES
+    modes, others = MODES, ("mgn-small-6k", OPTIMUM)
     if chosen.smoke:
-        garments, clips, modes = garments[:1], clips[:1], MODES[:1]
+        garments, clips, modes, others = garments[:1], clips[:1], MODES[:1], others[1:]
     model = default_model()
     sizes = {"vertices": chosen.vertices, "frames": chosen.frames}
     measured = {
         f"{model}, {mode}": table((model,), garments, clips, embedding_mode=mode, **sizes)[model]
         for mode in modes
     }
-    measured |= table(("mgn-small-6k", OPTIMUM), garments, clips, **sizes)
+    measured |= table(others, garments, clips, **sizes)
     result = {"clips": clips, **sizes, "garments": measured, "mean": mean_over_garments(measured)}
     write(result, chosen.out / "unseen_garments.json")
 
