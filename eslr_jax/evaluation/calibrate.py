@@ -105,9 +105,7 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
         scenes: Of one size; the first is timed.
     """
     _, solver = simulator_of(SOLVER)
-    truths = [
-        simulate_scene(None, scene, PhysicsParameters(), solver, _TRUTH_ITERATIONS) for scene in scenes
-    ]
+    truths = [simulate_scene(None, scene, PhysicsParameters(), solver, _TRUTH_ITERATIONS) for scene in scenes]
     measured = {
         name: [_measure_excess(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
         for name in names
