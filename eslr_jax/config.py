@@ -21,6 +21,7 @@ class ModelConfig:
 
     message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
     smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
+    edge_latents: bool = True  # False: vertices are smoothed and send no messages, see models.smoothing
     attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
     latent_size: int = 128  # HOOD
     hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
@@ -71,6 +72,10 @@ class ModelConfig:
         if self.passes > 1 and self.output == "acceleration":
             raise ValueError(
                 'passes > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
+            )
+        if not self.edge_latents and self.features != "gradient":
+            raise ValueError(
+                'edge_latents = false needs features = "gradient", which tell a vertex its force'
             )
         if self.output in ("descent", "subspace") and self.features != "gradient":
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
@@ -126,6 +131,9 @@ class TrainConfig:
     final_learning_rate: float = 1e-5  # end of the cosine
     warmup: int = 100  # iterations of linear warm-up
     clip_norm: float = 1.0  # of the global gradient (HOOD)
+    # Train a start for the solver: with so many L-BFGS iterations behind the network a frame's optimum is found,
+    # from which excess and distance are measured, and the trajectory goes on. 0 trains a network of its own.
+    corrector_steps: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment
     horizon: int = 60  # longest trajectory [frames]
@@ -163,6 +171,8 @@ class TrainConfig:
         for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.corrector_steps < 0 or (self.corrector_steps and self.energy_set == "hood"):
+            raise ValueError('corrector_steps must not be negative, and needs energy_set = "consistent"')
         for name in ("noise", "girth"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from eslr_jax.config import SimConfig
+from eslr_jax.contact.self_contact import CELL_CAPACITY, PAIRS_PER_VERTEX
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.geometry.padding import choose_bucket
 from eslr_jax.models.registry import check_params
@@ -24,6 +26,8 @@ from eslr_jax.simulate.batch import SCENES, simulate_scenes, stack_scenes
 from eslr_jax.simulate.scan import frame_inputs, join_frames, scan_frames, simulate_scene
 from eslr_jax.simulate.step import FrameInput
 from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
+
+_HEADROOM = 1.25  # of a buffer made larger: with it, cloth moves on a little differently and may need more
 
 
 def rollout(
@@ -55,8 +59,8 @@ def rollout(
             constant or the timestep is out of its physical range.
         CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
-        CapacityError: A buffer was too small; where it was that of world edges, the rollout was done anew with
-            a larger one instead.
+        CapacityError: A buffer was too small; where it was that of world edges or of self-contact, the rollout
+            was done anew with a larger one instead.
         MotionError: The motion is too short, or too fast to follow.
     """
     config, parameters = config or SimConfig(simulator="physics"), parameters or PhysicsParameters()
@@ -64,24 +68,34 @@ def rollout(
     scene = prepare_scene(garment, poses, material=material, options=options)
     check_scene(scene, parameters)
     trajectory = simulate_scene(params, scene, parameters, config)
-    while (larger := more_world_edges(trajectory, config)) is not None:
+    while (larger := more_room(trajectory, config)) is not None:
         config = larger
         trajectory = simulate_scene(params, scene, parameters, config)
     raise_for_status(trajectory)
     return trajectory
 
 
-def more_world_edges(trajectory: Trajectory, config: SimConfig) -> SimConfig | None:
-    """Return a configuration with twice the room for world edges where a rollout ran out of it, else None.
+def more_room(trajectory: Trajectory, config: SimConfig) -> SimConfig | None:
+    """Return a configuration with more room for what a rollout had too little of, else None.
 
-    Doubling ends: a row for every vertex always suffices.
+    World edges get twice as much: doubling ends, as a row for every vertex always suffices. Self-contact gets
+    what its fullest frame asked for and a quarter more. Other buffers can't be enlarged.
     """
-    if Status.WORLD_EDGE_OVERFLOW not in Status(int(jax.device_get(trajectory.status))):
-        return None
-    assert config.model is not None
-    assert config.model.world_edge_capacity is not None
-    model = dataclasses.replace(config.model, world_edge_capacity=2 * config.model.world_edge_capacity)
-    return dataclasses.replace(config, model=model)
+    status = Status(int(jax.device_get(trajectory.status)))
+    changes: dict[str, Any] = {}
+    if Status.WORLD_EDGE_OVERFLOW in status:
+        assert config.model is not None
+        assert config.model.world_edge_capacity is not None
+        capacity = 2 * config.model.world_edge_capacity
+        changes["model"] = dataclasses.replace(config.model, world_edge_capacity=capacity)
+    if Status.SELF_CONTACT_OVERFLOW in status and trajectory.needed_capacity is not None:
+        pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.needed_capacity), axis=0))
+        num_vertices = trajectory.positions.shape[1]
+        if pairs > (config.self_contact_capacity or PAIRS_PER_VERTEX * num_vertices):
+            changes["self_contact_capacity"] = math.ceil(_HEADROOM * pairs)
+        if faces > (config.self_contact_cell_capacity or CELL_CAPACITY):
+            changes["self_contact_cell_capacity"] = math.ceil(_HEADROOM * faces)
+    return dataclasses.replace(config, **changes) if changes else None
 
 
 def rollout_batch(

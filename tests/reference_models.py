@@ -152,6 +152,12 @@ def plain_network(config, params, graph, garment, xp=np):
     """Return the raw output of the network; everything in the floating type of its inputs."""
     weights, statistics = params["params"], params["statistics"]
     nodes, edges = dict(graph.nodes), dict(graph.edges)
+    if not config.edge_latents:
+        encoded = plain_encoded_vertices(nodes, edges, graph, weights, xp)
+        features = encoded
+        for layer in range(config.message_passing_steps):
+            features = plain_smoothing(features, garment, layer_weights(weights["layers"], layer), config, xp)
+        return plain_decoder(features, encoded, params, garment, config, xp)
     encoders = {name: weights[f"{name}_encoder"] for name in ("garment", "mesh", "world")}
     encoders["world_reverse"] = encoders["world"]
     if config.features == "hood":
@@ -170,7 +176,37 @@ def plain_network(config, params, graph, garment, xp=np):
     encoded = latents["garment"]
     for layer in range(config.message_passing_steps):
         latents = plain_layer(latents, graph, layer_weights(weights["layers"], layer), config, xp)
-    features = latents["garment"]
+    return plain_decoder(latents["garment"], encoded, params, garment, config, xp)
+
+
+def plain_encoded_vertices(nodes, edges, graph, weights, xp):
+    """Return vertex latents from rows that hold the vertex's, its body point's and its world edge's features."""
+    rows = [nodes["garment"]]
+    for features in (nodes["body"], edges["world"]) if "world" in edges else ():
+        padded = xp.concatenate([features, xp.zeros_like(features[:1])])
+        slot = graph.globals["world_slot"]
+        has_row = graph.globals["world_mask"][xp.minimum(slot, len(features) - 1)] & (slot < len(features))
+        rows.append(xp.where(has_row[:, None], padded[slot], 0.0))
+    joined = xp.concatenate(rows, axis=1)
+    missing = weights["encoder"]["kernel_0"].shape[0] - joined.shape[1]
+    joined = xp.concatenate([joined, xp.zeros((len(joined), missing), joined.dtype)], axis=1)
+    return plain_mlp(joined, weights["encoder"], xp)
+
+
+def plain_smoothing(v, garment, weights, config, xp):
+    """One layer: every smoothing beside the latents themselves."""
+    rows, smoothed = [v], v
+    mask = garment.neighbor_mask[..., None]
+    for _ in range(config.smoothing_steps):
+        total = xp.sum(xp.where(mask, smoothed[garment.neighbors], 0.0), axis=1)
+        smoothed = total / xp.maximum(xp.sum(mask, axis=1), 1)
+        rows.append(smoothed)
+    return v + plain_mlp(xp.concatenate(rows, axis=1), weights["vertex_mlp"], xp)
+
+
+def plain_decoder(features, encoded, params, garment, config, xp):
+    """Attention beside the layers, and the decoder on both."""
+    weights = params["params"]
     if config.attention_blocks:
         x = encoded
         for block in range(config.attention_blocks):

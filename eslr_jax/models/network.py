@@ -10,14 +10,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import flax.linen as nn
-import jax
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.config import ModelConfig
-from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.build import feature_sizes
 from eslr_jax.graph.normalizer import Normalizer, normalize
@@ -26,17 +22,13 @@ from eslr_jax.graph.operators import (
     WorldTables,
     mesh_tables,
     sum_receivers,
-    world_tables,
 )
-from eslr_jax.models.attention import orthogonal_projection
+from eslr_jax.models.branches import TwoBranches, graph_world_tables, stack
 from eslr_jax.models.dense import kernel_spread
-from eslr_jax.models.gsa import GsaBlock
 from eslr_jax.models.lsdmp import Latents, LsdmpLayer
 from eslr_jax.models.mlp import MLP
 from eslr_jax.types import Garment
 
-CORRECTION_GAIN = 0.02  # a new network then hardly changes the guess that it corrects
-OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5, "subspace": 5}  # a vector, and two gates
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 Statistics = dict[str, Normalizer]
@@ -54,10 +46,8 @@ class Encoded(NamedTuple):
     world_tables: WorldTables | None
 
 
-class EncodeProcessDecode(nn.Module):
+class EncodeProcessDecode(TwoBranches):
     """The whole network, from a graph's features to a vector, and gates, per vertex."""
-
-    config: ModelConfig
 
     def setup(self) -> None:
         """Declare encoders, stacks and decoder."""
@@ -77,19 +67,8 @@ class EncodeProcessDecode(nn.Module):
             self.body_encoder = encoder(sizes["body"])
         self.mesh_encoder = encoder(sizes["mesh"])
         self.world_encoder = encoder(sizes["world"])
-        self.layers = _stack(LsdmpLayer, config, config.message_passing_steps)
-        if config.attention_blocks:
-            self.blocks = _stack(GsaBlock, config, config.attention_blocks)
-            self.projection = self.variable("constants", "projection", _projection, config)
-        self.decoder = MLP(
-            2 * size if config.attention_blocks else size,
-            size,
-            OUTPUT_SIZE[config.output],
-            config.hidden_layers,
-            norm=False,
-            output_gain=1.0 if config.output == "acceleration" else CORRECTION_GAIN,
-            precision=config.precision,
-        )
+        self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
+        self.declare_decoder()
 
     def __call__(
         self, graph: jraph.GraphsTuple, garment: Garment, statistics: Statistics | None = None
@@ -125,7 +104,7 @@ class EncodeProcessDecode(nn.Module):
                 else None
             ),
             mesh_tables=mesh_tables(garment, dtype),
-            world_tables=_world_tables(graph, dtype) if has_body else None,
+            world_tables=graph_world_tables(graph, dtype) if has_body else None,
         )
 
     def encode_pass(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
@@ -149,7 +128,7 @@ class EncodeProcessDecode(nn.Module):
 
     def process(self, encoded: Encoded, garment: Garment) -> Float[Array, "vertices outputs"]:
         """Finish the encoders, run both stacks and decode."""
-        config, has_body = self.config, encoded.world is not None
+        has_body = encoded.world is not None
         vertices = self.garment_encoder.finish(encoded.garment)
         mesh = self.mesh_encoder.finish(encoded.mesh)
         latents = Latents(
@@ -165,13 +144,7 @@ class EncodeProcessDecode(nn.Module):
             ),
         )
         latents, _ = self.layers(latents, (encoded.mesh_tables, encoded.world_tables))
-        hidden = self.decoder.start(latents.garment, 0, bias=True)
-        if config.attention_blocks:
-            _check_embedding(config, garment)
-            inputs = (garment.geodesic_embedding, garment.vertex_mask, self.projection.value)
-            attended, _ = self.blocks(vertices, inputs)
-            hidden = hidden + self.decoder.start(attended, config.latent_size)
-        return self.decoder.finish(hidden)
+        return self.decode(latents.garment, vertices, garment)
 
     def normalized(
         self, graph: jraph.GraphsTuple, statistics: Statistics | None
@@ -206,48 +179,3 @@ class EncodeProcessDecode(nn.Module):
             )
 
         return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in graph.nodes.items()}
-
-
-def _stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Module:
-    """Return `length` copies of a module with their own weights, compiled once.
-
-    Of a layer, the backward pass keeps everything ("none" is recomputed), the results of its matrix products
-    ("products"), or its inputs alone ("layers": a third of the memory, for a quarter more time).
-    """
-    if config.remat != "none":
-        keeps = jax.checkpoint_policies.dots_saveable if config.remat == "products" else None
-        module = nn.remat(module, prevent_cse=False, policy=keeps)
-    scanned = nn.scan(
-        module,
-        variable_axes={"params": 0},
-        split_rngs={"params": True},
-        in_axes=nn.broadcast,
-        length=length,
-    )
-    return scanned(config)
-
-
-def _check_embedding(config: ModelConfig, garment: Garment) -> None:
-    """Compare the garment's geodesic embedding with the one that the network expects.
-
-    Raises:
-        ConfigError: They have different numbers of coordinates.
-    """
-    size = garment.geodesic_embedding.shape[1]
-    if size != config.embedding_size:
-        raise ConfigError(
-            f"the garment has {size} geodesic coordinates and the model embedding_size = "
-            f"{config.embedding_size}; prepare the garment with that embedding_size"
-        )
-
-
-def _projection(config: ModelConfig) -> Float[Array, "features size"]:
-    """Return the random directions of the attention, the same in every block."""
-    directions = orthogonal_projection(config.attention_features, config.attention_size, config.seed)
-    return jnp.asarray(directions, jnp.float32)
-
-
-def _world_tables(graph: jraph.GraphsTuple, dtype) -> WorldTables:
-    """Return the tables of a graph's world edges."""
-    entries = graph.globals
-    return world_tables(entries["world_slot"], graph.receivers["world"], entries["world_mask"], dtype)

@@ -21,6 +21,7 @@ from eslr_jax.errors import CheckpointError
 from eslr_jax.graph import features, normalizer
 from eslr_jax.graph.build import feature_sizes
 from eslr_jax.models.network import Encoded, EncodeProcessDecode
+from eslr_jax.models.smoothing import EncodedVertices, SmoothingNetwork
 from eslr_jax.types import Garment
 
 Params = dict[str, Any]
@@ -53,6 +54,10 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
 
 MEDIUM = dataclasses.replace(SMALL, message_passing_steps=2, latent_size=64, attention_size=64, passes=4)
 DEEP = dataclasses.replace(MEDIUM, message_passing_steps=6, attention_blocks=2, passes=1, remat="products")
+# One pass as a start for the solver: it costs three to four of its iterations and saves more.
+SMOOTH = dataclasses.replace(
+    _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", passes=1
+)
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
     "eslr-10": dataclasses.replace(PAPER, message_passing_steps=10, attention_blocks=3),
@@ -64,11 +69,17 @@ MODELS: dict[str, ModelConfig] = {
     "lsdmp-small": _without_attention(SMALL),
     "gsa-small": _without_smoothing(SMALL),
     "mgn-small": _without_attention(_without_smoothing(SMALL)),
+    "smooth-small": SMOOTH,
     "eslr-medium": MEDIUM,
     "mgn-medium": _without_attention(_without_smoothing(MEDIUM)),
     "eslr-deep": DEEP,
     "mgn-deep": _without_attention(_without_smoothing(DEEP)),
 }
+
+
+def make_network(config: ModelConfig) -> EncodeProcessDecode | SmoothingNetwork:
+    """Return the module that a configuration describes."""
+    return EncodeProcessDecode(config) if config.edge_latents else SmoothingNetwork(config)
 
 
 def init_model(config: ModelConfig, seed: int = 0) -> Params:
@@ -80,7 +91,7 @@ def init_model(config: ModelConfig, seed: int = 0) -> Params:
     """
     graph, garment = _example(config)
     statistics = _new_statistics(config)
-    module = EncodeProcessDecode(config)
+    module = make_network(config)
     weights = jax.jit(lambda key: module.init(key, graph, garment, statistics))(jax.random.key(0))
     generator = np.random.default_rng(seed)
 
@@ -103,10 +114,12 @@ def apply_model(
         graph: Of `build_graph` with the same config.
         garment: The same garment.
     """
-    return EncodeProcessDecode(config).apply(_variables(params), graph, garment, params["statistics"])
+    return make_network(config).apply(_variables(params), graph, garment, params["statistics"])
 
 
-def encode_frame(config: ModelConfig, params: Params, frame: jraph.GraphsTuple, garment: Garment) -> Encoded:
+def encode_frame(
+    config: ModelConfig, params: Params, frame: jraph.GraphsTuple, garment: Garment
+) -> Encoded | EncodedVertices:
     """Do once per frame what does not change between its passes.
 
     Args:
@@ -115,13 +128,13 @@ def encode_frame(config: ModelConfig, params: Params, frame: jraph.GraphsTuple, 
         frame: Of `build_frame_graph`.
         garment: The same garment.
     """
-    return EncodeProcessDecode(config).apply(_variables(params), frame, garment, method="encode_frame")
+    return make_network(config).apply(_variables(params), frame, garment, method="encode_frame")
 
 
 def apply_pass(
     config: ModelConfig,
     params: Params,
-    encoded: Encoded,
+    encoded: Encoded | EncodedVertices,
     changing: jraph.GraphsTuple,
     garment: Garment,
 ) -> Float[Array, "vertices outputs"]:
@@ -135,10 +148,10 @@ def apply_pass(
         garment: The same garment.
     """
 
-    def run(module: EncodeProcessDecode):
+    def run(module: EncodeProcessDecode | SmoothingNetwork):
         return module.process(module.encode_pass(encoded, changing), garment)
 
-    return EncodeProcessDecode(config).apply(_variables(params), method=run)
+    return make_network(config).apply(_variables(params), method=run)
 
 
 def scale_output(
@@ -173,7 +186,7 @@ def measure_statistics(
     """
     measured = {}
     if config.features == "hood":
-        nodes = EncodeProcessDecode(config).apply(_variables(params), graph, method="with_types")
+        nodes = make_network(config).apply(_variables(params), graph, method="with_types")
         nodes = jax.lax.stop_gradient(nodes)
         masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
         masks.update(dict.fromkeys(("body", "world", "world_reverse"), graph.globals.get("world_mask")))

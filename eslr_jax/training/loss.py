@@ -12,12 +12,16 @@ from jaxtyping import Array, Float
 from eslr_jax.config import TrainConfig
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.potential import PotentialTerms, potential_terms
-from eslr_jax.physics.problem import FrameProblem, start_guess
+from eslr_jax.physics.problem import FrameProblem, pin, start_guess
 from eslr_jax.simulate.network import correction_passes, graph_inputs, predict_acceleration
+from eslr_jax.simulate.step import solve
 from eslr_jax.types import ClothState, Garment, Material
 
 _FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by this
 _MIN_EXCESS = 1e-2  # of a pass, as a share of the first one's: the optimum itself is not known better
+_MIN_DROP = 1e-7  # [J] of a frame in which nothing happens
+_MIN_DISTANCE = 1e-5  # [m] likewise, root of the sum over vertices
+_MEMORY = 8  # of L-BFGS, as in SimConfig
 
 
 EnergyTerms = Callable[[Array, FrameProblem, Garment, Material], PotentialTerms]
@@ -26,8 +30,8 @@ EnergyTerms = Callable[[Array, FrameProblem, Garment, Material], PotentialTerms]
 class LossReport(NamedTuple):
     """What one evaluation of the loss shows."""
 
-    answer: Float[Array, "vertices 3"]  # positions at t + 1 [m]
-    terms: PotentialTerms  # at the answer [J]
+    answer: Float[Array, "vertices 3"]  # positions at t + 1 [m], from which the trajectory goes on
+    terms: PotentialTerms  # at the network's answer [J]
     start: Float[Array, ""]  # potential at the pushed-out inertial guess [J]
 
 
@@ -62,14 +66,57 @@ def physics_loss(
     energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
     scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
     start = sum(terms_of(start_guess(problem, garment), problem, garment, material))
-    if config.pass_weights == "last":
+    onward = answers[-1]
+    if config.corrector_steps:
+        minimum = solve(
+            problem,
+            garment,
+            material,
+            jax.lax.stop_gradient(answers[-1]),
+            iterations=config.corrector_steps,
+            memory=_MEMORY,
+            tolerance=0.0,
+        )
+        optimum = pin(problem, garment, minimum.position)
+        loss = _mean_start_error(answers, energies, optimum, minimum.value, problem, garment, start)
+        onward = optimum
+    elif config.pass_weights == "last":
         loss = energies[-1] / scale
     elif config.pass_weights == "equal":
         loss = jnp.mean(energies) / scale
     else:
         loss = _mean_contraction(jnp.concatenate([jnp.reshape(start, 1), energies]))
     last = PotentialTerms(*(jnp.broadcast_to(term, answers.shape[:1])[-1] for term in terms))
-    return loss, LossReport(answers[-1], last, start)  # type: ignore[arg-type]
+    return loss, LossReport(onward, last, start)  # type: ignore[arg-type]
+
+
+def _mean_start_error(
+    answers: Float[Array, "passes vertices 3"],
+    energies: Float[Array, " passes"],
+    optimum: Float[Array, "vertices 3"],
+    least: Float[Array, ""],
+    problem: FrameProblem,
+    garment: Garment,
+    start: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Return how far answers are from the optimum: mean logarithm of the shares of excess and squared distance.
+
+    Shares are of what the pushed-out guess has. The excess alone is mostly stretch, which the solver's first
+    iterations remove; what takes it many is where distances are long and energies small.
+    """
+
+    def squared_distance(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
+        offset = jnp.where(garment.vertex_mask[:, None], position - optimum, 0.0)
+        return jnp.sum(offset * offset)
+
+    def log_share(left: Array, whole: Array) -> Array:
+        return jnp.log(jnp.maximum(left / whole, 0.0) + _MIN_EXCESS)
+
+    fixed = jax.lax.stop_gradient
+    drop = fixed(jnp.maximum(start - least, _MIN_DROP))
+    distance = fixed(jnp.maximum(squared_distance(start_guess(problem, garment)), _MIN_DISTANCE**2))
+    excess, apart = energies - fixed(least), jax.vmap(squared_distance)(answers)
+    return jnp.mean(0.5 * log_share(excess, drop) + 0.5 * log_share(apart, distance))
 
 
 def _mean_contraction(energies: Float[Array, " passes+1"]) -> Float[Array, ""]:

@@ -30,6 +30,14 @@ TINY = ModelConfig(
 GRADIENT = dataclasses.replace(
     MODELS["eslr-small"], message_passing_steps=2, latent_size=16, attention_size=8, attention_features=24
 )
+SMOOTHING = dataclasses.replace(
+    MODELS["smooth-small"],
+    message_passing_steps=2,
+    attention_blocks=1,
+    latent_size=16,
+    attention_size=8,
+    attention_features=24,
+)
 VARIANTS = {
     "paper": TINY,
     "gradient": GRADIENT,
@@ -41,6 +49,8 @@ VARIANTS = {
     "meshgraphnet": dataclasses.replace(TINY, smoothing_steps=0, attention_blocks=0),
     "capacity": dataclasses.replace(TINY, world_edge_capacity=46),
     "gradient-body-capacity": dataclasses.replace(GRADIENT, update_body=True, world_edge_capacity=46),
+    "smoothing": SMOOTHING,
+    "smoothing-capacity": dataclasses.replace(SMOOTHING, world_edge_capacity=46),
 }
 
 
@@ -77,7 +87,7 @@ def quick(names, *chosen):
     return [name if name in chosen else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
-@pytest.mark.parametrize("name", quick(VARIANTS, "paper", "gradient"))
+@pytest.mark.parametrize("name", quick(VARIANTS, "paper", "gradient", "smoothing"))
 def test_network_matches_numpy(name):
     config = VARIANTS[name]
     scene = make_scene(8, 6)
@@ -86,7 +96,7 @@ def test_network_matches_numpy(name):
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("name", ["paper", "gradient"])
+@pytest.mark.parametrize("name", ["paper", "gradient", "smoothing"])
 def test_optimised_network_without_a_body_matches_numpy(name):
     """With all of the compiler's passes, as a canary; and there is no world code to compile."""
     config = VARIANTS[name]
@@ -98,7 +108,7 @@ def test_optimised_network_without_a_body_matches_numpy(name):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("name", quick(["paper", "gradient", "capacity"], "paper"))
+@pytest.mark.parametrize("name", quick(["paper", "gradient", "capacity", "smoothing"], "paper"))
 def test_network_and_its_gradient_match_plain_code_in_float64(name):
     config = VARIANTS[name]
     scene = make_scene(8, 6)
@@ -153,8 +163,8 @@ def test_layer_matches_numpy_alone():
         np.testing.assert_allclose(getattr(actual, name), values, rtol=1e-4, atol=1e-4)
 
 
-def test_passes_over_an_encoded_frame_equal_the_whole_graph():
-    config = dataclasses.replace(GRADIENT, update_body=True)
+@pytest.mark.parametrize("config", [dataclasses.replace(GRADIENT, update_body=True), SMOOTHING])
+def test_passes_over_an_encoded_frame_equal_the_whole_graph(config):
     garment, material, inputs = make_scene(8, 6)
     params = scramble(init_model(config))
 
@@ -223,7 +233,7 @@ def permute_garment(garment, order):
     )
 
 
-@pytest.mark.parametrize("name", ["paper", "gradient"])
+@pytest.mark.parametrize("name", ["paper", "gradient", "smoothing"])
 def test_network_is_equivariant_to_vertex_order(name):
     config = VARIANTS[name]
     garment, material, inputs = make_scene(8, 6)
@@ -235,7 +245,7 @@ def test_network_is_equivariant_to_vertex_order(name):
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("name", ["paper", "gradient"])
+@pytest.mark.parametrize("name", ["paper", "gradient", "smoothing"])
 def test_padding_does_not_change_the_answer(name):
     config = VARIANTS[name]
     scene, padded = make_scene(8, 6), make_scene(8, 6, pad=True)

@@ -14,7 +14,7 @@ from eslr_jax.evaluation.hard_cases.build import icosphere, join_meshes, make_cl
 from eslr_jax.geometry.validate import validate_body
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.rollout import check_scene, raise_for_status, rollout
+from eslr_jax.rollout import check_scene, more_room, raise_for_status, rollout
 from eslr_jax.simulate.scan import simulate_scene
 
 
@@ -63,7 +63,7 @@ def test_pins_are_a_mask_or_indices_of_vertices_that_exist():
         level_sheet(is_pinned=np.zeros(36))
 
 
-def test_self_contact_that_overflows_names_the_capacities_needed():
+def test_self_contact_that_overflows_names_the_capacities_needed_and_gets_them():
     lower = sheet(6, 6, (0.1, 0.1))
     mesh = join_meshes(lower, (lower[0] + np.array([0.0, 0.004, 0.0]), lower[1]))
     garment = make_cloth(mesh, {}, allow_components=True)
@@ -82,6 +82,15 @@ def test_self_contact_that_overflows_names_the_capacities_needed():
     pairs, faces = map(int, re.findall(r"_capacity to at least (\d+)", str(caught.value)))
     assert pairs > 5
     assert faces > 3
+    assert more_room(trajectory, SimConfig(simulator="physics", self_contact=True)) is None  # had room enough
+    while (
+        larger := more_room(trajectory, config)
+    ) is not None:  # cut short, a search doesn't know all it needs
+        config = larger
+        trajectory = fall(config, scene)
+    assert Status(int(trajectory.status)) == Status.OK
+    assert config.self_contact_capacity >= pairs
+    assert config.self_contact_cell_capacity >= faces
 
 
 @pytest.mark.parametrize("name", ["self_contact_capacity", "solver_iterations", "tolerance"])

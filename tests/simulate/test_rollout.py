@@ -11,7 +11,7 @@ from eslr_jax.evaluation.excess import measure_excess, trajectory_states
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.rollout import more_world_edges, raise_for_status, rollout, rollout_in_chunks
+from eslr_jax.rollout import more_room, raise_for_status, rollout, rollout_in_chunks
 from eslr_jax.scene import SceneOptions, prepare_scene
 from eslr_jax.simulate.scan import simulate_scene
 from eslr_jax.simulate.step import frame_problem
@@ -172,9 +172,9 @@ def test_too_few_world_edges_are_doubled_until_they_suffice(tshirt, walk, params
     scene = prepare_scene(tshirt, walk)
     short = simulate_scene(params, scene, PhysicsParameters(), few)
     assert Status.WORLD_EDGE_OVERFLOW in Status(int(short.status))
-    more = more_world_edges(short, few)
+    more = more_room(short, few)
     assert more.model.world_edge_capacity == 600
-    assert more_world_edges(learned, NETWORK) is None
+    assert more_room(learned, NETWORK) is None
     trajectory = rollout(params, tshirt, walk, config=few)
     assert int(trajectory.status) == 0
     np.testing.assert_allclose(trajectory.positions[:3], learned.positions[:3], atol=1e-4)

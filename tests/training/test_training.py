@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eslr_jax.assets import load_model
-from eslr_jax.config import TrainConfig
+from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.models.registry import MODELS
@@ -68,6 +68,19 @@ def test_run_leaves_metrics_and_a_model(finished):
     assert config == MODEL
     for loaded, trained in zip(jax.tree.leaves(params), jax.tree.leaves(state.params), strict=True):
         np.testing.assert_array_equal(loaded, trained)
+
+
+def test_a_start_for_the_solver_trains_from_optima(tmp_path):
+    """Excess and distance shrink, and trajectories go on from where the solver ends."""
+    model = dataclasses.replace(MODELS["smooth-small"], latent_size=16)
+    config = dataclasses.replace(CONFIG, model=model, iterations=60, corrector_steps=10, log_every=10)
+    state = train(config, tmp_path)
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert int(state.skipped) == 0
+    assert np.mean(losses[-2:]) < losses[0] - 0.03
+    assert not np.any(np.asarray(state.pools[0].is_done))
+    with pytest.raises(ConfigError, match="corrector_steps"):
+        from_dict(TrainConfig, {**to_dict(config), "energy_set": "hood"})
 
 
 def test_training_moves_the_weights(finished):

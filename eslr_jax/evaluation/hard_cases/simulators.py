@@ -14,6 +14,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.evaluation.colliders import Collider
 from eslr_jax.physics.problem import PhysicsParameters
+from eslr_jax.rollout import more_room
 from eslr_jax.simulate.scan import frame_inputs, join_frames, scan_frames
 from eslr_jax.types import ClothState, Scene, Trajectory
 
@@ -77,14 +78,24 @@ class Run:
 
 
 def simulate(params: Any, stress: StressScene, config: SimConfig) -> Trajectory:
-    """Simulate a scene with this package, a few frames at a time.
-
-    Scenes whose arrays have the same shapes share one compiled function, whatever their length.
+    """Simulate a scene with this package, again with larger buffers where they ran over, as `rollout` does.
 
     Args:
         params: Weights of the network; None for the physics simulator.
         stress: The scene.
         config: Which simulator, and how.
+    """
+    trajectory = _simulate(params, stress, config)
+    while (larger := more_room(trajectory, config)) is not None:
+        config = larger
+        trajectory = _simulate(params, stress, config)
+    return trajectory
+
+
+def _simulate(params: Any, stress: StressScene, config: SimConfig) -> Trajectory:
+    """Simulate a scene, a few frames at a time.
+
+    Scenes whose arrays have the same shapes share one compiled function, whatever their length.
     """
     scene = stress.scene
     total = scene.num_frames - 1
