@@ -197,7 +197,8 @@ def rollout_in_chunks(
         on_frames: Called with the frames done and the frames in all.
 
     Returns:
-        The trajectory, with its status unchecked, and its timing.
+        The trajectory, with its status unchecked, and its timing. It ends with the chunk in which something went
+        wrong; see `more_room` and `raise_for_status`.
 
     Raises:
         ConfigError: As for `rollout`.
@@ -225,9 +226,12 @@ def rollout_in_chunks(
         end, frames = jax.block_until_ready(compiled(params, constant, state, part(first), parameters))
         count = min(chunk, total - first)
         done.append(jax.tree.map(lambda leaf, count=count: leaf[:count], frames))
-        if count == chunk or int(end.first_bad_frame) <= total:
+        is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
+        if count == chunk or is_bad:
             state = end
         on_frames(first + count, total)
+        if is_bad:
+            break
     frame_ms = (time.perf_counter() - began) * 1e3 / (chunk * len(done))
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
     return join_frames(scene.start, joined, state), Timing(compile_s, frame_ms)

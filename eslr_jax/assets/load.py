@@ -42,6 +42,7 @@ from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
 DEFAULT_MOTION = "cmu_016_32"
+START_MODEL = "smooth-small"  # the network that was trained as a start for the solver
 Resolution = Literal["1k", "4k", "10k"]
 
 

@@ -54,16 +54,17 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
     Takes a few minutes on an otherwise idle machine. The result is kept with the compiled programs.
 
     Args:
-        models: Bundled networks to measure beside the solver; the default network if not given.
+        models: Bundled networks to measure beside the solver; if not given, the default network and the one that
+            was trained as a start for the solver.
         out: File to write to, instead of the one that `eslr simulate` reads.
     """
-    from eslr_jax.assets.load import default_model
+    from eslr_jax.assets.load import START_MODEL, default_model
     from eslr_jax.evaluation.calibrate import cache_path, write_calibration
     from eslr_jax.evaluation.calibrate import calibrate as run
 
     use_compile_cache()
     with stderr.status("measuring"):
-        measured = run(models or (default_model(),))
+        measured = run(models or (START_MODEL, default_model()))
     path = out or cache_path()
     write_calibration(measured, path)
     table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "excess after 20", box=None)

@@ -87,7 +87,7 @@ def simulate(
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import describe_fit
     from eslr_jax.io.garment import write_garment_npz
-    from eslr_jax.rollout import raise_for_status, rollout_in_chunks
+    from eslr_jax.rollout import more_room, raise_for_status, rollout_in_chunks
     from eslr_jax.scene import prepare_scene
 
     budget_ms, share = parse_budget(budget), parse_share(tolerance)
@@ -131,8 +131,12 @@ def simulate(
         tolerance=0.0 if choice is None else choice.tolerance,
         self_contact=self_contact,
     )
-    with progress("simulating", scene.num_frames - 1) as advance:
-        trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
+    larger: SimConfig | None = config
+    while larger is not None:
+        config = larger
+        with progress("simulating", scene.num_frames - 1) as advance:
+            trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
+        larger = more_room(trajectory, config)
     raise_for_status(trajectory)
     with stderr.status("measuring"):
         report = {

@@ -16,8 +16,8 @@ from eslr_jax.types import Garment
 
 TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
 # [m] within which layers see each other: they may approach by this much in a frame. At 0.02 the walls of a pleat
-# that closes at 1 m/s passed through each other unseen (hard case `layers`), at 0.03 they don't.
-SEARCH_RADIUS = 0.03
+# that closes at a metre a second passed through each other unseen (hard case `layers`).
+SEARCH_RADIUS = 0.04
 _NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to approach (ContourCraft)
 _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a hem there is nothing to hit
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs

@@ -13,7 +13,7 @@ from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
 from eslr_jax.types import tree_cast
 
-NEAR, RADIUS, COSINE = 0.01, 0.03, 0.8
+NEAR, RADIUS, COSINE = 0.01, 0.04, 0.8
 STIFFNESS, THICKNESS = 3.5e7, 3e-3
 _find = jax.jit(self_contact.find_self_contacts, static_argnames=("capacity", "cell_capacity"))
 
