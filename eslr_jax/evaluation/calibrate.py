@@ -114,14 +114,34 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
         np.min([ends.optimum for ends in same], axis=0) for same in zip(*measured.values(), strict=True)
     ]
     runs = {(name, count): (*simulator_of(name), count) for name in names for count in _TIMED_ITERATIONS}
-    times = {run: float(np.median(values)) for run, values in time_frames(runs, scenes[0]).items()}
+    fixed_ms, iteration_ms = fit_costs(time_frames(runs, scenes[0]))
     num_vertices = int(np.sum(scenes[0].garment.vertex_mask))
     return [
-        _describe(
-            name, excesses, optima, tuple(times[name, count] for count in _TIMED_ITERATIONS), num_vertices
-        )
+        Method(name, num_vertices, fixed_ms[name], iteration_ms, *_quantiles(name, excesses, optima))
         for name, excesses in measured.items()
     ]
+
+
+def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
+    """Return what every method takes per frame without iterations, and what an iteration takes [ms].
+
+    An iteration is the same behind every method, so all share one cost: a machine that changes its speed during
+    the measurement then favours none.
+
+    Args:
+        times: Milliseconds per frame, turn by turn, by method and number of iterations.
+    """
+    names = list(dict.fromkeys(name for name, _ in times))
+    low, high = _TIMED_ITERATIONS
+    slopes = [np.subtract(times[name, high], times[name, low]) / (high - low) for name in names]
+    iteration_ms = float(np.median(slopes))
+    return {
+        name: max(
+            float(np.median([np.array(times[name, count]) - count * iteration_ms for count in (low, high)])),
+            0.0,
+        )
+        for name in names
+    }, iteration_ms
 
 
 def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
@@ -142,25 +162,19 @@ def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
     )
 
 
-def _describe(
-    name: str, excesses: list[Excess], optima: list[np.ndarray], times: tuple[float, ...], num_vertices: int
-) -> Method:
-    """Return a method's errors over all scenes, and its cost from the times [ms] of `_TIMED_ITERATIONS`."""
+def _quantiles(
+    name: str, excesses: list[Excess], optima: list[np.ndarray]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the median and the 99 % quantile of a method's relative excess over all scenes, by iterations."""
     relative: dict[int, list[np.ndarray]] = {}
     for ends, optimum in zip(excesses, optima, strict=True):
         drop = np.maximum(ends.start - optimum, 1e-9)
         for count, energy in (ends.solver if name == SOLVER else ends.corrected).items():
             relative.setdefault(count, []).append(np.maximum(energy - optimum, 0.0) / drop)
     joined = {count: np.concatenate(parts) for count, parts in relative.items()}
-    low, high = _TIMED_ITERATIONS
-    iteration_ms = (times[1] - times[0]) / (high - low)
-    return Method(
-        name=name,
-        vertices=num_vertices,
-        fixed_ms=max(times[0] - low * iteration_ms, 0.0),
-        iteration_ms=iteration_ms,
-        median={str(count): float(np.median(values)) for count, values in joined.items()},
-        p99={str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
+    return (
+        {str(count): float(np.median(values)) for count, values in joined.items()},
+        {str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
     )
 
 

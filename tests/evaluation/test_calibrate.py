@@ -9,6 +9,7 @@ from eslr_jax.evaluation.calibrate import (
     Calibration,
     Method,
     choose,
+    fit_costs,
     read_calibration,
     write_calibration,
 )
@@ -45,6 +46,15 @@ def test_costs_grow_with_the_garment_from_the_nearest_size():
     calibration = Calibration("here", (PLAIN, LARGE))
     assert choose(calibration, 8000, budget_ms=100.0).iterations == 11  # 8 ms, and 8 ms an iteration
     assert choose(calibration, 500, budget_ms=10.0).iterations == 19
+
+
+def test_an_iteration_costs_the_same_behind_every_method():
+    """Two speeds of the machine, one per turn, and one disturbed timing."""
+    times = {("solver", 10): [7.0, 14.0, 7.0, 7.0], ("solver", 60): [22.0, 44.0, 22.0, 22.0]}
+    times |= {("net", 10): [9.0, 18.0, 9.0, 9.0], ("net", 60): [24.0, 48.0, 24.0, 90.0]}
+    fixed, iteration = fit_costs(times)
+    assert iteration == pytest.approx(0.3)
+    assert fixed == pytest.approx({"solver": 4.0, "net": 6.0})
 
 
 def test_what_is_out_of_reach_is_said():
