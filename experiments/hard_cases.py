@@ -2,10 +2,10 @@
 
     python experiments/hard_cases.py physics
     python experiments/hard_cases.py network --model eslr-small
-    python experiments/hard_cases.py corrected --model eslr-small --sheet
+    python experiments/hard_cases.py corrected --model smooth-small --sheet
     python experiments/hard_cases.py vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
 
-Writes `experiments/results/hard_cases_<simulator>.json` after every case and, with `--sheet`, a picture of all
+Writes `experiments/results/hard_cases_<simulator>.json` after every case (`_<model>` where it is another) and, with `--sheet`, a picture of all
 that ran beside it. Entries of an earlier file stay until their case is run anew.
 """
 
@@ -63,7 +63,8 @@ def main() -> None:
         name = f"{options.model}, {steps} corrector iterations" if steps else options.model
         simulator = network_simulator(*load_model(options.model), name=name, corrector_steps=steps)
 
-    path = RESULTS / f"hard_cases_{options.simulator}.json"
+    other = f"_{options.model}" if options.model != parser.get_default("model") else ""
+    path = RESULTS / f"hard_cases_{options.simulator}{other}.json"
 
     def keep(name, outcome, seconds):
         result = summary(simulator, [outcome])

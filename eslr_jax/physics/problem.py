@@ -138,7 +138,17 @@ def start_guess(problem: FrameProblem, garment: Garment) -> Float[Array, "vertic
 
     With self-contact its layers are pushed apart as well, and its faces off the body's tips.
     """
-    position = push_out(problem, garment, problem.inertial_guess)
+    return separate(problem, garment, push_out(problem, garment, problem.inertial_guess))
+
+
+def separate(
+    problem: FrameProblem, garment: Garment, position: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
+    """Push layers apart and faces off the body's tips, as far as the scene has either.
+
+    Like the body's, their barriers have no curvature at first touch: from deep inside, an iteration of the solver
+    only halves the depth.
+    """
     parameters = problem.parameters
     if problem.tips is not None:
         position = push_apart(position, problem.tips, parameters.collision_thickness, problem.next_body)

@@ -22,7 +22,7 @@ from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.lbfgs import Minimum, minimize
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.preconditioner import stiffness
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, start_guess
+from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, separate, start_guess
 from eslr_jax.physics.start import solver_start
 from eslr_jax.simulate.network import network_step
 from eslr_jax.types import BodySurface, ClothState, Garment, Material
@@ -148,6 +148,7 @@ def step(
     else:
         assert config.model is not None
         start, status = network_step(params, garment, material, problem, state, config.model)
+        start = separate(problem, garment, start)
         most = config.corrector_steps
     if most or iterations is not None:
         minimum = solve(
