@@ -5,8 +5,9 @@
     python experiments/hard_cases.py corrected --model smooth-small --sheet
     python experiments/hard_cases.py vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
 
-Writes `experiments/results/hard_cases_<simulator>.json` after every case (`_<model>` where it is another) and, with `--sheet`, a picture of all
-that ran beside it. Entries of an earlier file stay until their case is run anew.
+Writes `experiments/results/hard_cases_<simulator>.json` after every case (`_<model>` where it is not the default
+network) and, with `--sheet`, a picture of all that ran beside it. Entries of an earlier file stay until their
+case is run anew.
 """
 
 from __future__ import annotations

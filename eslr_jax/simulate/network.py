@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,15 @@ def predict_acceleration(
     return pin(problem, garment, inputs.position + velocity), graph.globals["status"]
 
 
+class Correction(NamedTuple):
+    """What passes over a frame's guess lead to."""
+
+    guess: Float[Array, "vertices 3"]  # where they start [m]
+    energy: Float[Array, ""]  # of the guess [J]
+    answers: Float[Array, "passes vertices 3"]  # [m]
+    status: Int[Array, ""]
+
+
 def correction_passes(
     params: Any,
     garment: Garment,
@@ -69,8 +78,8 @@ def correction_passes(
     config: ModelConfig,
     *,
     detach: bool = False,
-) -> tuple[Float[Array, "passes vertices 3"], Int[Array, ""]]:
-    """Correct the guess that the solver starts from too, pass by pass, and return every answer and status bits.
+) -> Correction:
+    """Correct the guess that the solver starts from too, pass by pass.
 
     Before each pass the potential's gradient, and the preconditioned step down it, are taken at the last
     answer.
@@ -110,10 +119,10 @@ def correction_passes(
             move = combine_directions(energy, inputs.guess, value, gradient, directions)
         answer = pin(problem, garment, inputs.guess + move)
         onward = jax.lax.stop_gradient(answer) if detach else answer
-        return next_pass(inputs, onward, gradient), answer
+        return next_pass(inputs, onward, gradient), (answer, value)
 
-    _, answers = jax.lax.scan(one_pass, inputs, None, length=config.passes)
-    return answers, graph.globals["status"]
+    _, (answers, values) = jax.lax.scan(one_pass, inputs, None, length=config.passes)
+    return Correction(guess, values[0], answers, graph.globals["status"])
 
 
 def descent_step(
@@ -159,6 +168,9 @@ def network_step(
 ) -> tuple[Float[Array, "vertices 3"], Int[Array, ""]]:
     """Return the network's positions at t + 1 [m] and status bits.
 
+    Where its passes end higher in the potential than they start, as in free fall, where the guess is the answer,
+    the guess stays: a start for the solver is never worse than the solver's own.
+
     Args:
         params: Weights.
         garment: Rest mesh.
@@ -170,5 +182,9 @@ def network_step(
     inputs = graph_inputs(problem, garment, material, state)
     if config.output == "acceleration":
         return predict_acceleration(params, garment, problem, inputs, material, config)
-    answers, status = correction_passes(params, garment, material, problem, inputs, config)
-    return answers[-1], status
+    correction = correction_passes(params, garment, material, problem, inputs, config)
+    answer = correction.answers[-1]
+    if config.output != "subspace":  # which never climbs
+        is_lower = potential(answer, problem, garment, material) < correction.energy
+        answer = jnp.where(is_lower, answer, correction.guess)
+    return answer, correction.status

@@ -61,7 +61,7 @@ def physics_loss(
         answer, _ = predict_acceleration(params, garment, problem, inputs, material, model)
         answers = answer[None]
     else:
-        answers, _ = correction_passes(params, garment, material, problem, inputs, model, detach=True)
+        answers = correction_passes(params, garment, material, problem, inputs, model, detach=True).answers
     terms = jax.vmap(terms_of, in_axes=(0, None, None, None))(answers, problem, garment, material)
     energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
     scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
