@@ -2,8 +2,8 @@
 
     python experiments/paper/new_motion.py [--smoke]
 
-The paper takes a Mixamo character; here it is every third clip of DeepMimic, retargeted to the bundled body: seven,
-a backflip, a roll and getting up from the ground among them.
+The paper takes a Mixamo character; here it is every third clip of DeepMimic, retargeted to the bundled body:
+seven, a backflip, a roll and getting up from the ground among them.
 """
 
 from __future__ import annotations
