@@ -21,7 +21,6 @@ from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
 _OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
-_MEMORY = 8
 
 
 class Excess(NamedTuple):
@@ -102,9 +101,7 @@ def measure_excess(
         def descend(task):
             origin, count = task
             place = stacked[origin]
-            return solve(
-                problem, garment, material, place, iterations=count, memory=_MEMORY, tolerance=0.0
-            ).value
+            return solve(problem, garment, material, place, iterations=count).value
 
         # In turn, not unrolled: the solver is compiled once.
         values = jax.lax.map(descend, (jnp.array(origins), jnp.array(counts)))

@@ -221,9 +221,7 @@ def excess_shares(
         garment: Rest mesh.
         material: Fabric.
     """
-    minimum = solve(
-        problem, garment, material, position, iterations=_ITERATIONS, memory=8, tolerance=_TOLERANCE
-    )
+    minimum = solve(problem, garment, material, position, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     way = position - minimum.position
     places, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
 

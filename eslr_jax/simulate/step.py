@@ -102,8 +102,8 @@ def solve(
     start: Float[Array, "vertices 3"],
     *,
     iterations: int | Int[Array, ""],
-    memory: int,
-    tolerance: float,
+    memory: int = SimConfig.solver_memory,
+    tolerance: float = 0.0,
 ) -> Minimum:
     """Minimise the frame's potential from `start` by L-BFGS; see `SimConfig.tolerance`."""
 

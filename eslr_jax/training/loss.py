@@ -21,7 +21,6 @@ _FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by 
 _MIN_EXCESS = 1e-2  # of a pass, as a share of the first one's: the optimum itself is not known better
 _MIN_DROP = 1e-7  # [J] of a frame in which nothing happens
 _MIN_DISTANCE = 1e-5  # [m] likewise, root of the sum over vertices
-_MEMORY = 8  # of L-BFGS, as in SimConfig
 
 
 EnergyTerms = Callable[[Array, FrameProblem, Garment, Material], PotentialTerms]
@@ -65,21 +64,14 @@ def physics_loss(
     terms = jax.vmap(terms_of, in_axes=(0, None, None, None))(answers, problem, garment, material)
     energies = jnp.sum(jnp.stack([jnp.broadcast_to(term, answers.shape[:1]) for term in terms]), axis=0)
     scale = _FALL * problem.parameters.gravity * jnp.sum(vertex_masses(garment, material))
-    start = sum(terms_of(start_guess(problem, garment), problem, garment, material))
+    guess = start_guess(problem, garment)
+    start = sum(terms_of(guess, problem, garment, material))
     onward = answers[-1]
     if config.corrector_steps:
-        minimum = solve(
-            problem,
-            garment,
-            material,
-            jax.lax.stop_gradient(answers[-1]),
-            iterations=config.corrector_steps,
-            memory=_MEMORY,
-            tolerance=0.0,
-        )
-        optimum = pin(problem, garment, minimum.position)
-        loss = _mean_start_error(answers, energies, optimum, minimum.value, problem, garment, start)
-        onward = optimum
+        fixed = jax.lax.stop_gradient(answers[-1])
+        minimum = solve(problem, garment, material, fixed, iterations=config.corrector_steps)
+        onward = pin(problem, garment, minimum.position)
+        loss = _mean_start_error(answers, energies, onward, minimum.value, guess, start, garment)
     elif config.pass_weights == "last":
         loss = energies[-1] / scale
     elif config.pass_weights == "equal":
@@ -95,9 +87,9 @@ def _mean_start_error(
     energies: Float[Array, " passes"],
     optimum: Float[Array, "vertices 3"],
     least: Float[Array, ""],
-    problem: FrameProblem,
-    garment: Garment,
+    guess: Float[Array, "vertices 3"],
     start: Float[Array, ""],
+    garment: Garment,
 ) -> Float[Array, ""]:
     """Return how far answers are from the optimum: mean logarithm of the shares of excess and squared distance.
 
@@ -112,10 +104,9 @@ def _mean_start_error(
     def log_share(left: Array, whole: Array) -> Array:
         return jnp.log(jnp.maximum(left / whole, 0.0) + _MIN_EXCESS)
 
-    fixed = jax.lax.stop_gradient
-    drop = fixed(jnp.maximum(start - least, _MIN_DROP))
-    distance = fixed(jnp.maximum(squared_distance(start_guess(problem, garment)), _MIN_DISTANCE**2))
-    excess, apart = energies - fixed(least), jax.vmap(squared_distance)(answers)
+    drop = jnp.maximum(start - least, _MIN_DROP)
+    distance = jnp.maximum(squared_distance(guess), _MIN_DISTANCE**2)
+    excess, apart = energies - least, jax.vmap(squared_distance)(answers)
     return jnp.mean(0.5 * log_share(excess, drop) + 0.5 * log_share(apart, distance))
 
 

@@ -83,9 +83,8 @@ def test_self_contact_that_overflows_names_the_capacities_needed_and_gets_them()
     assert pairs > 5
     assert faces > 3
     assert more_room(trajectory, SimConfig(simulator="physics", self_contact=True)) is None  # had room enough
-    while (
-        larger := more_room(trajectory, config)
-    ) is not None:  # cut short, a search doesn't know all it needs
+    # Cut short, a search does not know all that it needs.
+    while (larger := more_room(trajectory, config)) is not None:
         config = larger
         trajectory = fall(config, scene)
     assert Status(int(trajectory.status)) == Status.OK
