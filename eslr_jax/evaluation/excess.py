@@ -12,11 +12,13 @@ from jaxtyping import Array, Float
 
 from eslr_jax.config import SimConfig
 from eslr_jax.io.trajectory import TrajectoryFile
+from eslr_jax.physics.lbfgs import lower_point
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
+from eslr_jax.physics.start import solver_start
 from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from eslr_jax.simulate.step import FrameInput, evaluate, frame_problem, solve
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
@@ -29,7 +31,7 @@ class Excess(NamedTuple):
     start: Float[Array, " frames"]  # at the pushed-out inertial guess
     optimum: Float[Array, " frames"]
     answer: Float[Array, " frames"]  # what the trajectory itself did
-    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from that start
+    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from where the solver starts
     corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
 
 
@@ -84,27 +86,32 @@ def measure_excess(
     garment, material = scene.garment, scene.material
 
     counts = [*iterations, _OPTIMUM_ITERATIONS]
-    origins = [0] * len(counts)  # 0: from the start, 1: from the model's answer
+    rows = [0] * len(counts)  # 0: from the start, 1: from the model's answer
     if params is not None:
         counts += [*corrector_steps, _OPTIMUM_ITERATIONS]
-        origins += [1] * (len(counts) - len(origins))
+        rows += [1] * (len(counts) - len(rows))
 
     def measure(frame):
         state, inputs, answer = frame
         problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-        places = [start_guess(problem, garment)]
+        # Where the solver starts, and the point from which that was reached: its own start is both.
+        own = evaluate(solver_start(problem, garment, material), problem, garment, material)
+        starts = [(own, own)]
         if params is not None:
             assert config.model is not None
-            places.append(network_step(params, garment, material, problem, state, config.model)[0])
-        stacked = jnp.stack(places)
+            predicted = network_step(params, garment, material, problem, state, config.model)
+            reached = evaluate(predicted.position, problem, garment, material)
+            earlier = predicted.earlier or reached
+            starts.append((lower_point(reached, earlier), earlier))
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
         def descend(task):
-            origin, count = task
-            place = stacked[origin]
-            return solve(problem, garment, material, place, iterations=count).value
+            row, count = task
+            start, earlier = jax.tree.map(lambda rows: rows[row], stacked)
+            return solve(problem, garment, material, start, iterations=count, earlier=earlier).value
 
         # In turn, not unrolled: the solver is compiled once.
-        values = jax.lax.map(descend, (jnp.array(origins), jnp.array(counts)))
+        values = jax.lax.map(descend, (jnp.array(rows), jnp.array(counts)))
         split = len(iterations)
         solver = dict(zip(iterations, values[:split], strict=True))
         optimum, corrected = values[split], {}
@@ -112,10 +119,11 @@ def measure_excess(
             corrected = dict(zip(corrector_steps, values[split + 1 : -1], strict=True))
             # The network may start in the basin of a deeper minimum than the solver finds.
             optimum = jnp.minimum(optimum, values[-1])
-        start, answered = jax.lax.map(
-            lambda x: potential(x, problem, garment, material), jnp.stack([places[0], answer])
+        guess, answered = jax.lax.map(
+            lambda x: potential(x, problem, garment, material),
+            jnp.stack([start_guess(problem, garment), answer]),
         )
-        return Excess(start, optimum, answered, solver, corrected)
+        return Excess(guess, optimum, answered, solver, corrected)
 
     return jax.lax.map(measure, taken)
 

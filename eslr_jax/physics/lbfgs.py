@@ -16,6 +16,14 @@ _MAX_HALVINGS = 10
 _CAUTION = 400.0  # soft directions are underestimated: 99 % of frames keep what is asked, 83 % at 40
 
 
+class Point(NamedTuple):
+    """A place, and the energy there."""
+
+    position: Float[Array, "*shape"]  # [m]
+    value: Float[Array, ""]  # [J]
+    gradient: Float[Array, "*shape"]  # [N]
+
+
 class Minimum(NamedTuple):
     """Where a minimisation stopped."""
 
@@ -60,7 +68,7 @@ def _direction(state: _State, inverse: Inverse) -> Float[Array, " n"]:
 
 def minimize(
     function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
-    start: Float[Array, "vertices 3"],
+    start: Float[Array, "vertices 3"] | Point,
     diagonal: Float[Array, " vertices"] | Stiffness,
     *,
     iterations: int | Int[Array, ""],
@@ -68,12 +76,13 @@ def minimize(
     residual_tolerance: Float[Array, ""] | float = 0.0,
     excess_tolerance: Float[Array, ""] | float = 0.0,
     reference_value: Float[Array, ""] | None = None,
+    earlier: Point | None = None,
 ) -> Minimum:
     """Minimise `function` from `start`.
 
     Args:
         function: Energy [J] of positions; differentiable.
-        start: Initial positions [m].
+        start: Initial positions [m], or a point where the energy is known.
         diagonal: The initial Hessian of the recursion up to a scale: positive stiffness per vertex [N/m], or
             with springs between neighbours, which costs a quarter more per iteration and needs two to three
             times fewer of them.
@@ -84,11 +93,14 @@ def minimize(
             since `reference_value`. The estimate is half the Newton decrement, g . H^-1 g / 2, with the
             recursion's own H^-1, times `_CAUTION`.
         reference_value: Energy [J] from which the gain counts; that of `start` by default.
+        earlier: A point from which somebody else came to `start`: the way is the history's first pair.
 
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
-    shape = start.shape
-    inverse = _make_inverse(diagonal, start)
+    if not isinstance(start, Point):
+        start = Point(start, *jax.value_and_grad(function)(start))
+    shape = start.position.shape
+    inverse = _make_inverse(diagonal, start.position)
     value_and_gradient = jax.value_and_grad(lambda x: function(x.reshape(shape)))
 
     def is_running(state: _State) -> Array:
@@ -100,36 +112,23 @@ def minimize(
         direction = _direction(state, inverse)
         slope = jnp.dot(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
-        step, change = x - state.x, gradient - state.gradient
-        curvature = jnp.dot(step, change)
-        is_useful = curvature > 1e-10 * jnp.sqrt(jnp.dot(step, step) * jnp.dot(change, change))
-        inverse_curvature = jnp.where(is_useful, 1.0 / jnp.where(is_useful, curvature, 1.0), 0.0)
-        weighted = jnp.dot(change, inverse(change))
-        head = (state.head + 1) % memory
         # Where no step along the direction leads down, the history is dropped and tried without.
-        curvatures = jnp.where(is_lower, state.curvatures.at[head].set(inverse_curvature), 0.0)
-        return _State(
-            x=x,
-            value=value,
-            gradient=gradient,
-            steps=state.steps.at[head].set(step),
-            changes=state.changes.at[head].set(change),
-            curvatures=curvatures,
-            head=head,
-            scale=jnp.where(is_useful, curvature / jnp.where(weighted > 0, weighted, 1.0), state.scale),
+        curvatures = jnp.where(is_lower, state.curvatures, 0.0)
+        moved = _advance(state._replace(curvatures=curvatures), Point(x, value, gradient), inverse)
+        return moved._replace(
             decrement=-0.5 * slope,
             iterations=state.iterations + 1,
             is_stuck=~is_lower & jnp.all(state.curvatures == 0),
         )
 
-    x = start.reshape(-1)
-    value, gradient = value_and_gradient(x)
-    reference = value if reference_value is None else reference_value
+    reference = start.value if reference_value is None else reference_value
+    first = _ravel(start)
+    x = first.position
     history = jnp.zeros((memory, x.size), x.dtype)
     initial = _State(
         x=x,
-        value=value,
-        gradient=gradient,
+        value=first.value,
+        gradient=first.gradient,
         steps=history,
         changes=history,
         curvatures=jnp.zeros(memory, x.dtype),
@@ -139,8 +138,43 @@ def minimize(
         iterations=jnp.zeros((), jnp.int32),
         is_stuck=jnp.zeros((), bool),
     )
+    if earlier is not None:
+        before = _ravel(earlier)
+        initial = _advance(initial._replace(x=before.position, gradient=before.gradient), first, inverse)
     final = jax.lax.while_loop(is_running, iterate, initial)
     return Minimum(final.x.reshape(shape), final.value, final.gradient.reshape(shape), final.iterations)
+
+
+def lower_point(reached: Point, earlier: Point) -> Point:
+    """Return the point reached, or the earlier one where that is lower, or the only finite one."""
+    is_lower = reached.value < earlier.value
+    return jax.tree.map(lambda new, old: jnp.where(is_lower, new, old), reached, earlier)
+
+
+def _ravel(point: Point) -> Point:
+    """Return a point whose position and gradient have one axis."""
+    return Point(point.position.reshape(-1), point.value, point.gradient.reshape(-1))
+
+
+def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
+    """Move to a point, and add the way there to the history, if it says anything about curvature."""
+    x, value, gradient = point
+    step, change = x - state.x, gradient - state.gradient
+    curvature = jnp.dot(step, change)
+    is_useful = curvature > 1e-10 * jnp.sqrt(jnp.dot(step, step) * jnp.dot(change, change))
+    inverse_curvature = jnp.where(is_useful, 1.0 / jnp.where(is_useful, curvature, 1.0), 0.0)
+    weighted = jnp.dot(change, inverse(change))
+    head = (state.head + 1) % state.steps.shape[0]
+    return state._replace(
+        x=x,
+        value=value,
+        gradient=gradient,
+        steps=state.steps.at[head].set(step),
+        changes=state.changes.at[head].set(change),
+        curvatures=state.curvatures.at[head].set(inverse_curvature),
+        head=head,
+        scale=jnp.where(is_useful, curvature / jnp.where(weighted > 0, weighted, 1.0), state.scale),
+    )
 
 
 def _make_inverse(

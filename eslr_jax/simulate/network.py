@@ -14,6 +14,7 @@ from eslr_jax.graph.inputs import GraphInputs, next_pass
 from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.lbfgs import Point
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
 from eslr_jax.physics.problem import FrameProblem, pin
@@ -63,9 +64,16 @@ def predict_acceleration(
 class Correction(NamedTuple):
     """What passes over a frame's guess lead to."""
 
-    guess: Float[Array, "vertices 3"]  # where they start [m]
-    energy: Float[Array, ""]  # of the guess [J]
+    starts: Point  # of every pass, stacked
     answers: Float[Array, "passes vertices 3"]  # [m]
+    status: Int[Array, ""]
+
+
+class NetworkAnswer(NamedTuple):
+    """What a network makes of a frame."""
+
+    position: Float[Array, "vertices 3"]  # at t + 1 [m]
+    earlier: Point | None  # the lowest that a pass started from; None where no guess is corrected
     status: Int[Array, ""]
 
 
@@ -119,10 +127,10 @@ def correction_passes(
             move = combine_directions(energy, inputs.guess, value, gradient, directions)
         answer = pin(problem, garment, inputs.guess + move)
         onward = jax.lax.stop_gradient(answer) if detach else answer
-        return next_pass(inputs, onward, gradient), (answer, value)
+        return next_pass(inputs, onward, gradient), (answer, Point(inputs.guess, value, gradient))
 
-    _, (answers, values) = jax.lax.scan(one_pass, inputs, None, length=config.passes)
-    return Correction(guess, values[0], answers, graph.globals["status"])
+    _, (answers, starts) = jax.lax.scan(one_pass, inputs, None, length=config.passes)
+    return Correction(starts, answers, graph.globals["status"])
 
 
 def descent_step(
@@ -165,11 +173,8 @@ def network_step(
     problem: FrameProblem,
     state: ClothState,
     config: ModelConfig,
-) -> tuple[Float[Array, "vertices 3"], Int[Array, ""]]:
-    """Return the network's positions at t + 1 [m] and status bits.
-
-    Where its passes end higher in the potential than they start, as in free fall, where the guess is the answer,
-    the guess stays: a start for the solver is never worse than the solver's own.
+) -> NetworkAnswer:
+    """Return the network's answer to a frame, and from where its passes came.
 
     Args:
         params: Weights.
@@ -181,10 +186,8 @@ def network_step(
     """
     inputs = graph_inputs(problem, garment, material, state)
     if config.output == "acceleration":
-        return predict_acceleration(params, garment, problem, inputs, material, config)
-    correction = correction_passes(params, garment, material, problem, inputs, config)
-    answer = correction.answers[-1]
-    if config.output != "subspace":  # which never climbs
-        is_lower = potential(answer, problem, garment, material) < correction.energy
-        answer = jnp.where(is_lower, answer, correction.guess)
-    return answer, correction.status
+        position, status = predict_acceleration(params, garment, problem, inputs, material, config)
+        return NetworkAnswer(position, None, status)
+    starts, answers, status = correction_passes(params, garment, material, problem, inputs, config)
+    lowest = jnp.argmin(starts.value)
+    return NetworkAnswer(answers[-1], jax.tree.map(lambda rows: rows[lowest], starts), status)

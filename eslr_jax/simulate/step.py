@@ -19,7 +19,7 @@ from eslr_jax.contact.self_contact import (
 from eslr_jax.errors import Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.lbfgs import Minimum, minimize
+from eslr_jax.physics.lbfgs import Minimum, Point, lower_point, minimize
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, separate, start_guess
@@ -99,13 +99,14 @@ def solve(
     problem: FrameProblem,
     garment: Garment,
     material: Material,
-    start: Float[Array, "vertices 3"],
+    start: Float[Array, "vertices 3"] | Point,
     *,
     iterations: int | Int[Array, ""],
     memory: int = SimConfig.solver_memory,
     tolerance: float = 0.0,
+    earlier: Point | None = None,
 ) -> Minimum:
-    """Minimise the frame's potential from `start` by L-BFGS; see `SimConfig.tolerance`."""
+    """Minimise the frame's potential from `start` by L-BFGS; see `minimize` and `SimConfig.tolerance`."""
 
     def energy(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
         return potential(position, problem, garment, material)
@@ -113,13 +114,21 @@ def solve(
     return minimize(
         energy,
         start,
-        stiffness(problem, garment, material, start),
+        stiffness(problem, garment, material, start.position if isinstance(start, Point) else start),
         iterations=iterations,
         memory=memory,
         excess_tolerance=tolerance,
         # Whatever it starts from, a frame's gain counts from the best guess that costs nothing.
         reference_value=energy(start_guess(problem, garment)) if tolerance else None,
+        earlier=earlier,
     )
+
+
+def evaluate(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+) -> Point:
+    """Return positions with the frame's potential and its gradient there."""
+    return Point(position, *jax.value_and_grad(potential)(position, problem, garment, material))
 
 
 def step(
@@ -142,27 +151,30 @@ def step(
         config: Choice of simulator; static.
         iterations: Of L-BFGS, in place of the configuration's; traced, so that all numbers share a program.
     """
-    status = jnp.int32(Status.OK)
+    status, earlier = jnp.int32(Status.OK), None
     if config.simulator == "physics":
         start, most = solver_start(problem, garment, material), config.solver_iterations
     else:
         assert config.model is not None
-        start, status = network_step(params, garment, material, problem, state, config.model)
-        start = separate(problem, garment, start)
+        answer = network_step(params, garment, material, problem, state, config.model)
+        start, earlier, status = separate(problem, garment, answer.position), answer.earlier, answer.status
         most = config.corrector_steps
+    point = evaluate(start, problem, garment, material)
+    if earlier is not None:  # the solver never starts higher than without the network
+        point = lower_point(point, earlier)
     if most or iterations is not None:
         minimum = solve(
             problem,
             garment,
             material,
-            start,
+            point,
             iterations=most if iterations is None else iterations,
             memory=config.solver_memory,
             tolerance=config.tolerance,
+            earlier=earlier,
         )
     else:  # no loop: the network alone can be differentiated through time
-        value, gradient = jax.value_and_grad(potential)(start, problem, garment, material)
-        minimum = Minimum(start, value, gradient, jnp.int32(0))
+        minimum = Minimum(*point, iterations=jnp.int32(0))
     position = pin(problem, garment, minimum.position)
     weight = problem.parameters.gravity * safe_norm(vertex_masses(garment, material))
     report = StepReport(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from physics_cases import make_case, make_garment, make_sheet, pad_case
 
-from eslr_jax.physics.lbfgs import minimize
+from eslr_jax.physics.lbfgs import Point, lower_point, minimize
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import hessian_diagonal, solve_stiffness, stiffness
@@ -95,6 +95,32 @@ def test_the_value_never_rises_and_nonfinite_trials_are_refused():
     assert np.all(np.isfinite(values))
     assert np.all(np.diff(values) <= 1e-6)
     assert values[-1] < 1e-6
+
+
+def test_the_way_from_an_earlier_point_is_the_first_pair():
+    """Where the Hessian is a multiple of the preconditioner, one pair says which, and one step ends it."""
+    center = jnp.arange(6.0).reshape(2, 3)
+
+    def function(x):
+        return 1.5 * jnp.sum((x - center) ** 2)
+
+    def point(x):
+        return Point(x, *jax.value_and_grad(function)(x))
+
+    near, far = center + 1.0, center - 2.0
+    run = partial(minimize, function, diagonal=jnp.ones(2))
+    found = run(near, iterations=1, earlier=point(far))
+    np.testing.assert_allclose(found.position, center, atol=1e-6)
+    assert float(run(near, iterations=1).value) > 0.1, "the test must be able to fail"
+    same = run(point(near), iterations=3, earlier=point(near))
+    np.testing.assert_array_equal(same.position, run(near, iterations=3).position)
+
+
+def test_the_lower_of_two_points_is_the_finite_one():
+    low, high, none = (Point(jnp.full(3, x), jnp.float32(x), jnp.full(3, x)) for x in (1.0, 2.0, jnp.nan))
+    for reached in (high, none):
+        np.testing.assert_array_equal(lower_point(reached, low).position, 1.0)
+    np.testing.assert_array_equal(lower_point(low, high).gradient, 1.0)
 
 
 def test_a_nonfinite_start_is_returned_as_it_is():
