@@ -53,6 +53,35 @@ def replace_positions(simulator, change):
     return Simulator("changed", simulate)
 
 
+def swing(turn):
+    """A simulator that turns a curtain about its upper rim, before the limb comes, by a share of a full turn."""
+
+    def simulate(stress):
+        start = np.asarray(stress.scene.start.position, np.float64)
+        frames = np.arange(stress.scene.num_frames)
+        angle = 2 * np.pi * turn * np.minimum(frames / 8, 1)[:, None]
+        hanging = 0.2 - start[:, 1]  # below the rim, which is 20 cm above the limb's axis
+        positions = np.stack(
+            [
+                np.broadcast_to(start[:, 0], (len(frames), len(start))),
+                0.2 - hanging * np.cos(angle),
+                start[:, 2] + hanging * np.sin(angle),
+            ],
+            axis=-1,
+        )
+        still = ballistic().simulate(stress)
+        return dataclasses.replace(still, positions=jnp.asarray(positions, jnp.float32))
+
+    return Simulator("swinging", simulate)
+
+
+def test_a_limb_goes_through_a_curtain_that_stays_and_not_through_one_that_swings_over_it():
+    for turn, expected in ((0.0, 100.0), (0.42, 0.0)):
+        rows = {row["measure"]: row["value"] for row in run_case("fast_limb", swing(turn))}
+        for speed in (4, 8):  # slower ones do not get as far
+            assert rows[f"curtain, {speed} m/s: cloth the limb went through, untold [%]"] == expected
+
+
 def test_there_are_fifteen_with_a_reason_each():
     assert len(CASES) == 15
     assert all(case.reason and len(case.reason) < 120 for case in CASES.values())

@@ -282,20 +282,37 @@ def _build_fast_limb(options: dict[str, Any]) -> Scenes:
     return scenes
 
 
-def _windings(run: Run, lines: np.ndarray) -> np.ndarray:
-    """Return by how much lines of vertices turn about the limb's axis at the end, in turns.
+def _angles(run: Run, lines: np.ndarray) -> np.ndarray:
+    """Return under what angle the limb's axis sees lines of vertices, in turns, shape [frames, lines, vertices].
 
     Args:
-        run: Of a scene with one limb.
+        run: Of a scene with one limb along x.
         lines: Vertices of each line, shape [lines, vertices].
     """
     assert run.stress is not None
     assert run.stress.colliders is not None
-    limb = run.stress.colliders(len(run.positions) - 1)[0]
-    assert isinstance(limb, Capsule)
-    offset = run.positions[-1][lines] - limb.start
-    angle = np.unwrap(np.arctan2(offset[..., 2], offset[..., 1]), axis=1)
-    return (angle[:, -1] - angle[:, 0]) / (2 * np.pi)
+    limbs = [run.stress.colliders(frame)[0] for frame in range(len(run.positions))]
+    axis = np.array([limb.start for limb in limbs if isinstance(limb, Capsule)])
+    offset = run.positions[:, lines] - axis[:, None, None]
+    return np.arctan2(offset[..., 2], offset[..., 1]) / (2 * np.pi)
+
+
+def _windings(angles: np.ndarray) -> np.ndarray:
+    """Return by how much lines turn about the axis, from their first vertex to their last, in turns."""
+    unwrapped = np.unwrap(angles, period=1, axis=-1)
+    return unwrapped[..., -1] - unwrapped[..., 0]
+
+
+def _crossings(angles: np.ndarray) -> np.ndarray:
+    """Return how often the axis went through lines, vertices moving straight from frame to frame.
+
+    Along a line the angle grows by as much as its ends have turned since the start; each time that the axis goes
+    through it, by a whole turn more or less. Cloth that swings over or under the limb is not gone through.
+    """
+    ends = np.unwrap(angles[..., [0, -1]], period=1, axis=0)
+    turned = (ends - ends[0])[-1]
+    winding = _windings(angles)
+    return np.round(winding[-1] - winding[0] - (turned[:, 1] - turned[:, 0]))
 
 
 def _measure_fast_limb(runs: Runs) -> list[Measure]:
@@ -320,9 +337,9 @@ def _measure_fast_limb(runs: Runs) -> list[Measure]:
         ]
         if is_sleeve:
             closed = np.concatenate([ring, ring[:, :1]], axis=1)
-            lost = float(np.mean(np.abs(_windings(run, closed)) < 0.5))
-        else:  # from the bottom up the curtain passes the limb on the far side
-            lost = float(np.mean(_windings(run, columns) > 0))
+            lost = float(np.mean(np.abs(_windings(_angles(run, closed)[-1])) < 0.5))
+        else:
+            lost = float(np.mean(_crossings(_angles(run, columns)) != 0))
         is_told = Status.BODY_TOO_FAST in run.status
         measures.append(
             Measure(f"{label}: cloth the limb went through, untold [%]", 100 * lost * (not is_told), 0)
