@@ -125,22 +125,24 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
 def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
     """Return what every method takes per frame without iterations, and what an iteration takes [ms].
 
-    An iteration is the same behind every method, so all share one cost: a machine that changes its speed during
-    the measurement then favours none.
+    An iteration is the same behind every method, so all share one cost, and methods are compared within turns: a
+    machine that changes its speed during the measurement then favours none.
 
     Args:
-        times: Milliseconds per frame, turn by turn, by method and number of iterations.
+        times: Milliseconds per frame, turn by turn, by method and number of iterations; the others' fixed parts
+            are that of the first, and what they take longer than it.
     """
     names = list(dict.fromkeys(name for name, _ in times))
     low, high = _TIMED_ITERATIONS
     slopes = [np.subtract(times[name, high], times[name, low]) / (high - low) for name in names]
     iteration_ms = float(np.median(slopes))
-    return {
-        name: max(
-            float(np.median([np.array(times[name, count]) - count * iteration_ms for count in (low, high)])),
-            0.0,
-        )
+    rests = {
+        name: np.array([np.subtract(times[name, count], count * iteration_ms) for count in (low, high)])
         for name in names
+    }
+    first = rests[names[0]]
+    return {
+        name: max(float(np.median(first) + np.median(rest - first)), 0.0) for name, rest in rests.items()
     }, iteration_ms
 
 

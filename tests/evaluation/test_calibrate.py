@@ -1,5 +1,6 @@
 """What is chosen for a budget or a tolerance, from measurements that are given."""
 
+import numpy as np
 import pytest
 
 from eslr_jax.cli.budget import parse_budget, parse_share
@@ -55,6 +56,16 @@ def test_an_iteration_costs_the_same_behind_every_method():
     fixed, iteration = fit_costs(times)
     assert iteration == pytest.approx(0.3)
     assert fixed == pytest.approx({"solver": 4.0, "net": 6.0})
+
+
+def test_methods_are_compared_within_turns():
+    """Turns that take longer for all, and one in which the first method alone was disturbed."""
+    added = np.array([0.0, 3.0, 0.0, 5.0, 8.0])
+    disturbed = np.array([9.0, 3.0, 0.0, 5.0, 8.0])
+    times = {("solver", 10): 7.0 + disturbed, ("solver", 60): 22.0 + disturbed}
+    times |= {("net", 10): 9.0 + added, ("net", 60): 24.0 + added}
+    fixed, _ = fit_costs({run: list(values) for run, values in times.items()})
+    assert fixed["net"] - fixed["solver"] == pytest.approx(2.0)
 
 
 def test_what_is_out_of_reach_is_said():
