@@ -146,8 +146,8 @@ def minimize(
 
 
 def lower_point(reached: Point, earlier: Point) -> Point:
-    """Return the point reached, or the earlier one where that is lower, or the only finite one."""
-    is_lower = reached.value < earlier.value
+    """Return the lower of two points; the earlier one where they are level, the other where one is no number."""
+    is_lower = (reached.value < earlier.value) | jnp.isnan(earlier.value)
     return jax.tree.map(lambda new, old: jnp.where(is_lower, new, old), reached, earlier)
 
 

@@ -189,5 +189,5 @@ def network_step(
         position, status = predict_acceleration(params, garment, problem, inputs, material, config)
         return NetworkAnswer(position, None, status)
     starts, answers, status = correction_passes(params, garment, material, problem, inputs, config)
-    lowest = jnp.argmin(starts.value)
+    lowest = jnp.nanargmin(starts.value)
     return NetworkAnswer(answers[-1], jax.tree.map(lambda rows: rows[lowest], starts), status)

@@ -118,9 +118,9 @@ def test_the_way_from_an_earlier_point_is_the_first_pair():
 
 def test_the_lower_of_two_points_is_the_finite_one():
     low, high, none = (Point(jnp.full(3, x), jnp.float32(x), jnp.full(3, x)) for x in (1.0, 2.0, jnp.nan))
-    for reached in (high, none):
-        np.testing.assert_array_equal(lower_point(reached, low).position, 1.0)
-    np.testing.assert_array_equal(lower_point(low, high).gradient, 1.0)
+    for other in (high, none):
+        np.testing.assert_array_equal(lower_point(other, low).position, 1.0)
+        np.testing.assert_array_equal(lower_point(low, other).gradient, 1.0)
 
 
 def test_a_nonfinite_start_is_returned_as_it_is():
