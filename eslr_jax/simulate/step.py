@@ -157,7 +157,8 @@ def step(
     else:
         assert config.model is not None
         answer = network_step(params, garment, material, problem, state, config.model)
-        start, earlier, status = separate(problem, garment, answer.position), answer.earlier, answer.status
+        start, earlier = separate(problem, garment, answer.position), answer.earlier
+        status = answer.status | _finiteness(answer.position)  # a solver that starts elsewhere would hide it
         most = config.corrector_steps
     point = evaluate(start, problem, garment, material)
     if earlier is not None:  # the solver never starts higher than without the network
@@ -190,6 +191,11 @@ def _needed_capacity(pairs: FacePairs | None) -> Int[Array, " capacities"] | Non
     return None if pairs is None else jnp.stack([pairs.count, pairs.listed])
 
 
+def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:
+    """Return the status bits of positions."""
+    return jnp.where(jnp.all(jnp.isfinite(position)), int(Status.OK), int(Status.NON_FINITE))
+
+
 def next_state(
     position: Float[Array, "vertices 3"],
     problem: FrameProblem,
@@ -208,8 +214,7 @@ def next_state(
     for pairs in (problem.self_contacts, problem.tips):
         if pairs is not None:
             status = status | pairs.status
-    is_finite = jnp.all(jnp.isfinite(position))
-    status = state.status | status | jnp.where(is_finite, int(Status.OK), int(Status.NON_FINITE))
+    status = state.status | status | _finiteness(position)
     return ClothState(
         position=position,
         velocity=(position - problem.position) / problem.timestep,
