@@ -12,16 +12,14 @@ from jaxtyping import Array, Float
 
 from eslr_jax.config import SimConfig
 from eslr_jax.io.trajectory import TrajectoryFile
-from eslr_jax.physics.lbfgs import lower_point
 from eslr_jax.physics.potential import next_friction_load, potential
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
-from eslr_jax.physics.start import solver_start
-from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import FrameInput, evaluate, frame_problem, solve
+from eslr_jax.simulate.step import FrameInput, frame_problem, solve, start_point
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
+_SOLVER = SimConfig(simulator="physics")
 _OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
 
 
@@ -94,16 +92,12 @@ def measure_excess(
     def measure(frame):
         state, inputs, answer = frame
         problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-        # Where the solver starts, and the point from which that was reached: its own start is both.
-        own = evaluate(solver_start(problem, garment, material), problem, garment, material)
-        starts = [(own, own)]
+        starts = [start_point(None, garment, material, problem, state, _SOLVER)]
         if params is not None:
-            assert config.model is not None
-            predicted = network_step(params, garment, material, problem, state, config.model)
-            reached = evaluate(predicted.position, problem, garment, material)
-            earlier = predicted.earlier or reached
-            starts.append((lower_point(reached, earlier), earlier))
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+            starts.append(start_point(params, garment, material, problem, state, config))
+        # A start that nobody came to is its own earlier point.
+        pairs = [(start.point, start.earlier or start.point) for start in starts]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
 
         def descend(task):
             row, count = task

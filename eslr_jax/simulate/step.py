@@ -131,6 +131,38 @@ def evaluate(
     return Point(position, *jax.value_and_grad(potential)(position, problem, garment, material))
 
 
+class Start(NamedTuple):
+    """Where the solver starts a frame."""
+
+    point: Point
+    earlier: Point | None  # from which a network came, see `minimize`; None for the solver's own start
+    status: Int[Array, ""]
+
+
+def start_point(
+    params: Any,
+    garment: Garment,
+    material: Material,
+    problem: FrameProblem,
+    state: ClothState,
+    config: SimConfig,
+) -> Start:
+    """Return the solver's own start, or a network's answer where that is no higher than what it came from.
+
+    The arguments are those of `step`.
+    """
+    if config.simulator == "physics":
+        own = solver_start(problem, garment, material)
+        return Start(evaluate(own, problem, garment, material), None, jnp.int32(Status.OK))
+    assert config.model is not None
+    answer = network_step(params, garment, material, problem, state, config.model)
+    point = evaluate(separate(problem, garment, answer.position), problem, garment, material)
+    if answer.earlier is not None:
+        point = lower_point(point, answer.earlier)
+    # A solver that starts elsewhere would hide an answer that is no number.
+    return Start(point, answer.earlier, answer.status | _finiteness(answer.position))
+
+
 def step(
     params: Any,
     garment: Garment,
@@ -151,18 +183,8 @@ def step(
         config: Choice of simulator; static.
         iterations: Of L-BFGS, in place of the configuration's; traced, so that all numbers share a program.
     """
-    status, earlier = jnp.int32(Status.OK), None
-    if config.simulator == "physics":
-        start, most = solver_start(problem, garment, material), config.solver_iterations
-    else:
-        assert config.model is not None
-        answer = network_step(params, garment, material, problem, state, config.model)
-        start, earlier = separate(problem, garment, answer.position), answer.earlier
-        status = answer.status | _finiteness(answer.position)  # a solver that starts elsewhere would hide it
-        most = config.corrector_steps
-    point = evaluate(start, problem, garment, material)
-    if earlier is not None:  # the solver never starts higher than without the network
-        point = lower_point(point, earlier)
+    point, earlier, status = start_point(params, garment, material, problem, state, config)
+    most = config.solver_iterations if config.simulator == "physics" else config.corrector_steps
     if most or iterations is not None:
         minimum = solve(
             problem,

@@ -56,12 +56,11 @@ def replace_positions(simulator, change):
 def swing(turn):
     """A simulator that turns a curtain about its upper rim, before the limb comes, by a share of a full turn."""
 
-    def simulate(stress):
-        start = np.asarray(stress.scene.start.position, np.float64)
-        frames = np.arange(stress.scene.num_frames)
+    def turned(positions):
+        start, frames = np.asarray(positions[0], np.float64), np.arange(len(positions))
         angle = 2 * np.pi * turn * np.minimum(frames / 8, 1)[:, None]
         hanging = 0.2 - start[:, 1]  # below the rim, which is 20 cm above the limb's axis
-        positions = np.stack(
+        path = np.stack(
             [
                 np.broadcast_to(start[:, 0], (len(frames), len(start))),
                 0.2 - hanging * np.cos(angle),
@@ -69,10 +68,9 @@ def swing(turn):
             ],
             axis=-1,
         )
-        still = ballistic().simulate(stress)
-        return dataclasses.replace(still, positions=jnp.asarray(positions, jnp.float32))
+        return jnp.asarray(path, jnp.float32)
 
-    return Simulator("swinging", simulate)
+    return replace_positions(ballistic(), turned)
 
 
 def test_a_limb_goes_through_a_curtain_that_stays_and_not_through_one_that_swings_over_it():
