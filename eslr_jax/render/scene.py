@@ -123,9 +123,11 @@ def _build_scene(
         "sky": {"type": "constant", "radiance": _rgb(_SKY_RADIANCE), "sampling_weight": _SKY_SHARE},
         "floor": _floor(mitsuba, camera.target, ground_height),
     }
-    description |= {lamp.name: _lamp(mitsuba, lamp, camera.target, light_angle) for lamp in _LAMPS}
+    # Mitsuba orders shapes that it makes from nested descriptions by chance, and samples lights in that order:
+    # made one by one they stay in ours, and the grain repeats from run to run.
+    lamps = {lamp.name: _lamp(mitsuba, lamp, camera.target, light_angle) for lamp in _LAMPS}
+    description |= {name: mitsuba.load_dict(lamp) for name, lamp in lamps.items()}
     description |= {surface.name: _mesh(mitsuba, surface) for surface in surfaces}
-    # Loaded in parallel, lights would come in any order, and the grain would change from run to run.
     return mitsuba.load_dict(description, parallel=False)
 
 

@@ -55,8 +55,7 @@ def test_render_frame_repeats_and_needs_no_body(scene):
     pytest.importorskip("mitsuba")
     arguments = first_frame(scene) | {"body_positions": None, "body_faces": None}
     first, second = (render_frame(**arguments, **SMALL).astype(int) for _ in range(2))
-    # On a busy machine the order of the lights can change, and with it single samples, not the picture.
-    assert np.abs(first - second).mean() < 2.0
+    assert np.abs(first - second).max() <= 1  # threads add up a pixel's samples in any order
 
 
 def test_render_frame_paints_vertex_colors(scene):
