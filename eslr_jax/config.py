@@ -114,6 +114,11 @@ class SimConfig:
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1, or null for the default, got {value}")
 
+    @property
+    def iterations(self) -> int:
+        """L-BFGS iterations per frame: of the physics simulator, or behind the network."""
+        return self.solver_iterations if self.simulator == "physics" else self.corrector_steps
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Array, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.self_contact import CELL_CAPACITY, PAIRS_PER_VERTEX
@@ -184,6 +185,7 @@ def rollout_in_chunks(
     config: SimConfig,
     parameters: PhysicsParameters | None = None,
     chunk: int = 10,
+    pace: Callable[[int, float], int] | None = None,
     on_frames: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Trajectory, Timing]:
     """Simulate a prepared scene a few frames at a time, to show progress and to time compilation apart.
@@ -194,6 +196,8 @@ def rollout_in_chunks(
         config: Which simulator, and how.
         parameters: Physical constants.
         chunk: Frames per call of the compiled scan.
+        pace: Called after every chunk with its iterations per frame and the milliseconds that a frame took;
+            returns the iterations of the next. By default all take the configuration's.
         on_frames: Called with the frames done and the frames in all.
 
     Returns:
@@ -217,13 +221,26 @@ def rollout_in_chunks(
         return jax.tree.map(lambda leaf: leaf[frames], inputs)
 
     scan = jax.jit(scan_frames, static_argnames=("length", "config"))
+    iterations = config.iterations
+
+    def traced() -> Int[Array, ""] | None:
+        return None if pace is None else jnp.int32(iterations)  # all numbers share a program
+
     began = time.perf_counter()
-    compiled = scan.lower(params, constant, scene.start, part(0), chunk, parameters, config).compile()
+    compiled = scan.lower(
+        params, constant, scene.start, part(0), chunk, parameters, config, traced()
+    ).compile()
     compile_s = time.perf_counter() - began
-    state, done = scene.start, []
-    began = time.perf_counter()
+    state, done, seconds = scene.start, [], 0.0
     for first in range(0, total, chunk):
-        end, frames = jax.block_until_ready(compiled(params, constant, state, part(first), parameters))
+        began = time.perf_counter()
+        end, frames = jax.block_until_ready(
+            compiled(params, constant, state, part(first), parameters, traced())
+        )
+        took = time.perf_counter() - began
+        seconds += took
+        if pace is not None:
+            iterations = pace(iterations, took * 1e3 / chunk)
         count = min(chunk, total - first)
         done.append(jax.tree.map(lambda leaf, count=count: leaf[:count], frames))
         is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
@@ -232,7 +249,7 @@ def rollout_in_chunks(
         on_frames(first + count, total)
         if is_bad:
             break
-    frame_ms = (time.perf_counter() - began) * 1e3 / (chunk * len(done))
+    frame_ms = seconds * 1e3 / (chunk * len(done))
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
     return join_frames(scene.start, joined, state), Timing(compile_s, frame_ms)
 

@@ -82,7 +82,7 @@ def simulate(
     from eslr_jax.assets import load_garment_file, load_model, prepare_stored
     from eslr_jax.assets.load import default_model
     from eslr_jax.config import SimConfig
-    from eslr_jax.evaluation.calibrate import SOLVER, choose, read_calibration
+    from eslr_jax.evaluation.calibrate import SOLVER, choose, keep_budget, read_calibration
     from eslr_jax.evaluation.report import environment, trajectory_report
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import describe_fit
@@ -131,11 +131,12 @@ def simulate(
         tolerance=0.0 if choice is None else choice.tolerance,
         self_contact=self_contact,
     )
+    pace = None if choice is None or budget_ms is None else keep_budget(choice, budget_ms)
     larger: SimConfig | None = config
     while larger is not None:
         config = larger
         with progress("simulating", scene.num_frames - 1) as advance:
-            trajectory, timing = rollout_in_chunks(params, scene, config=config, on_frames=advance)
+            trajectory, timing = rollout_in_chunks(params, scene, config=config, pace=pace, on_frames=advance)
         larger = more_room(trajectory, config)
     raise_for_status(trajectory)
     with stderr.status("measuring"):

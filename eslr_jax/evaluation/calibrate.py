@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,8 @@ class Choice:
     method: str
     iterations: int
     tolerance: float  # for SimConfig; zero where a budget was given
+    fixed_ms: float  # of the method, scaled to the garment
+    iteration_ms: float
     expected_ms: float
     expected_excess: float  # median, relative to the frame's drop
     reason: str
@@ -284,6 +286,8 @@ def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
         method=method.name,
         iterations=count,
         tolerance=0.0,
+        fixed_ms=method.fixed_ms,
+        iteration_ms=method.iteration_ms,
         expected_ms=method.fixed_ms + count * method.iteration_ms,
         expected_excess=excess,
         reason=f"least excess within {budget_ms:g} ms" + (f" (others: {others})" if others else ""),
@@ -310,11 +314,37 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
         method=method.name,
         iterations=_MOST_ITERATIONS,
         tolerance=tolerance,
+        fixed_ms=method.fixed_ms,
+        iteration_ms=method.iteration_ms,
         expected_ms=cost,
         expected_excess=interpolate_excess(method.median, count),
         reason=f"fastest below {tolerance:.2%} on 99 % of frames"
         + (f" (others: {others})" if others else ""),
     )
+
+
+def keep_budget(choice: Choice, budget_ms: float) -> Callable[[int, float], int]:
+    """Return how a rollout keeps a budget on this machine, garment and hour, for `rollout_in_chunks`.
+
+    The calibration knows how the cost of a frame divides; what the last frames took says how much slower or
+    faster all of it is.
+
+    Args:
+        choice: Of `choose`, for the budget.
+        budget_ms: Milliseconds per frame.
+
+    Returns:
+        From the iterations of the last frames and the milliseconds that one of them took, the iterations of the
+        next: at least one of the solver alone, at least none behind a network.
+    """
+    least = 1 if choice.method == SOLVER else 0
+
+    def pace(iterations: int, took_ms: float) -> int:
+        slower = took_ms / (choice.fixed_ms + iterations * choice.iteration_ms)
+        count = int((budget_ms / slower - choice.fixed_ms) / choice.iteration_ms)
+        return min(max(count, least), ITERATIONS[-1])
+
+    return pace
 
 
 def interpolate_excess(curve: Mapping[Any, float], place: float) -> float:

@@ -184,14 +184,13 @@ def step(
         iterations: Of L-BFGS, in place of the configuration's; traced, so that all numbers share a program.
     """
     point, earlier, status = start_point(params, garment, material, problem, state, config)
-    most = config.solver_iterations if config.simulator == "physics" else config.corrector_steps
-    if most or iterations is not None:
+    if config.iterations or iterations is not None:
         minimum = solve(
             problem,
             garment,
             material,
             point,
-            iterations=most if iterations is None else iterations,
+            iterations=config.iterations if iterations is None else iterations,
             memory=config.solver_memory,
             tolerance=config.tolerance,
             earlier=earlier,

@@ -11,6 +11,7 @@ from eslr_jax.evaluation.calibrate import (
     Method,
     choose,
     fit_costs,
+    keep_budget,
     read_calibration,
     write_calibration,
 )
@@ -31,6 +32,18 @@ def test_a_budget_buys_the_least_excess():
     choice = choose(Calibration("there", (PLAIN, FAST)), 1000, budget_ms=12.0)
     assert (choice.method, choice.iterations) == ("net", 10)
     assert choice.expected_excess == pytest.approx(0.01)
+
+
+def test_a_budget_is_kept_on_a_machine_of_another_speed():
+    choice = choose(Calibration("here", (PLAIN,)), 1000, budget_ms=31.0)  # 1 ms, and 1 ms an iteration
+    assert choice.iterations == 30
+    pace = keep_budget(choice, 31.0)
+    assert pace(30, 31.0) == 30
+    assert pace(30, 62.0) == 14  # twice as slow: 2 ms, and 2 ms an iteration
+    assert pace(14, 30.0) == 14
+    assert pace(30, 15.5) == 61
+    assert pace(30, 3100.0) == 1  # the solver alone takes one at least
+    assert pace(30, 0.31) == 160  # beyond it nothing was measured
 
 
 def test_a_tolerance_takes_the_least_time():

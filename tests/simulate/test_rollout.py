@@ -66,6 +66,19 @@ def test_frame_by_frame_equals_one_scan(scene, params, learned):
     assert timing.frame_ms > 0
 
 
+def test_a_pace_sets_the_iterations_of_the_next_frames(scene, physical):
+    asked = []
+
+    def pace(iterations, took_ms):
+        asked.append((iterations, took_ms > 0))
+        return iterations + 5
+
+    config = dataclasses.replace(PHYSICS, solver_iterations=10)
+    paced, _ = rollout_in_chunks(None, scene, config=config, chunk=3, pace=pace)
+    assert asked == [(10, True), (15, True), (20, True)]  # seven frames: the last chunk has one
+    np.testing.assert_array_equal(paced.iterations, [0, 10, 10, 10, 15, 15, 15, 20])
+
+
 def test_corrector_lowers_the_residual(scene, params, learned):
     corrected = simulate_scene(
         params, scene, PhysicsParameters(), dataclasses.replace(NETWORK, corrector_steps=30)
