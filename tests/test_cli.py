@@ -58,6 +58,11 @@ def test_assets_lists_every_kind():
         (("--body", "robot"), ("no body named", "anny")),
         (("--garment", "missing.obj"), ("missing.obj",)),
         (("--frames", "1"), ("two frames",)),
+        (("--budget", "20ms", "--model", "eslr-small"), ("leave out", "--model")),
+        (("--tolerance", "1%", "--iterations", "5"), ("leave out", "--iterations")),
+        (("--budget", "20ms", "--tolerance", "1%"), ("either",)),
+        (("--iterations", "5"), ("--simulator physics", "--corrector-steps")),
+        (("--simulator", "physics", "--corrector-steps", "5"), ("--iterations",)),
         (("--frames", "100000", "--simulator", "physics"), ("fewer than",)),
     ],
 )

@@ -10,6 +10,8 @@ from rich.table import Table
 from eslr_jax.cli.console import app, stderr, use_compile_cache
 from eslr_jax.errors import ConfigError
 
+_TOLERANCE = "1%"  # by default: what is left is not seen, and it takes a third of the default network's time
+
 
 def parse_budget(text: str | None) -> float | None:
     """Return a time in milliseconds.
@@ -45,6 +47,29 @@ def parse_share(text: str | None) -> float | None:
     if not 0 < value < 1:
         raise ConfigError(f"--tolerance {text}: write a share of what a frame gains, such as 1% or 0.01")
     return value
+
+
+def parse_request(
+    budget: str | None, tolerance: str | None, *, is_chosen: bool
+) -> tuple[float | None, float | None]:
+    """Return the budget [ms] or the tolerance by which a simulator shall be chosen; neither where one is named.
+
+    Args:
+        budget: As on the command line.
+        tolerance: The same.
+        is_chosen: Nothing on the command line names a simulator.
+
+    Raises:
+        ConfigError: One of them can't be read, both are given, or one of them and a simulator.
+    """
+    if is_chosen:
+        return parse_budget(budget), parse_share(tolerance or (None if budget else _TOLERANCE))
+    if budget is not None or tolerance is not None:
+        raise ConfigError(
+            "--budget and --tolerance choose the simulator and its iterations; leave out --simulator, --model, "
+            "--iterations and --corrector-steps"
+        )
+    return None, None
 
 
 @app.command

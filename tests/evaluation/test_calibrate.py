@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eslr_jax.cli.budget import parse_budget, parse_share
+from eslr_jax.cli.budget import parse_budget, parse_request, parse_share
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation.calibrate import (
     SOLVER,
@@ -122,3 +122,10 @@ def test_tolerances_are_shares(text, value):
 def test_other_tolerances_are_refused(text):
     with pytest.raises(ConfigError, match="1%"):
         parse_share(text)
+
+
+def test_nothing_asked_for_is_a_tolerance():
+    assert parse_request(None, None, is_chosen=True) == (None, 0.01)
+    assert parse_request(None, "2%", is_chosen=True) == (None, 0.02)
+    assert parse_request("20ms", None, is_chosen=True) == (20.0, None)
+    assert parse_request(None, None, is_chosen=False) == (None, None)
