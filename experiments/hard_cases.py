@@ -4,6 +4,7 @@
     python experiments/hard_cases.py network --model eslr-small
     python experiments/hard_cases.py corrected --model smooth-small --sheet
     python experiments/hard_cases.py vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
+    python experiments/hard_cases.py blender             # its cloth, see `blender_cloth.py`
 
 Writes `experiments/results/hard_cases_<simulator>.json` after every case (`_<model>` where it is not the default
 network) and, with `--sheet`, a picture of all that ran beside it. Entries of an earlier file stay until their
@@ -23,6 +24,7 @@ PEERS = {
     "style3d": (2, 20),
     "xpbd": (None, 1),
 }  # substeps, iterations: the best of peers.json
+BLENDER = (45, 2)  # steps per frame, rounds of collision per step: likewise
 
 
 def merge(old: dict, new: dict) -> dict:
@@ -41,7 +43,7 @@ def merge(old: dict, new: dict) -> dict:
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("simulator", choices=["physics", "network", "corrected", *PEERS])
+    parser.add_argument("simulator", choices=["physics", "network", "corrected", "blender", *PEERS])
     parser.add_argument("--model", default="eslr-small")
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("--corrector-steps", type=int, default=20)
@@ -55,6 +57,12 @@ def main() -> None:
 
     if options.simulator == "physics":
         simulator = physics_simulator(iterations=options.iterations)
+    elif options.simulator == "blender":
+        from blender_cloth import blender_python, blender_simulator
+
+        if blender_python() is None:
+            parser.error("BLENDER_PYTHON names no Python with bpy, see peers.py")
+        simulator = blender_simulator(BLENDER)
     elif options.simulator in PEERS:
         from newton_cloth import Setting, newton_simulator
 

@@ -1,4 +1,4 @@
-"""Other simulators beside ours, same scenes, same run: Newton's VBD, Style3D and XPBD (extra `peers`).
+"""Other simulators beside ours, same scenes, same run: Newton's VBD, Style3D and XPBD, Blender's cloth.
 
     python experiments/peers.py                          # T-shirt at 1k and 4k, 60 frames
     python experiments/peers.py --scenes ball_1k tshirt_4k --frames 46
@@ -10,9 +10,11 @@ processor time: Newton uses one core, ours all that it gets, so give the process
 (`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The excess is
 teacher-forced: one frame from states of our near-optimal rollout, potential of our definition minus its minimum,
 over the frame's drop. A method with substeps solves a finer problem than that; the row of our own solver with
-substeps shows what this alone costs.
+substeps shows what this alone costs. The excess on its own rollout is that of the frames that a method simulated.
 
-Without Newton only our rows are there. Writes peers.json.
+Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced excess.
+Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a Python with `bpy`
+(`python3.11 -m venv blender && blender/bin/pip install bpy`). What is missing is left out. Writes peers.json.
 """
 
 from __future__ import annotations
@@ -31,13 +33,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from blender_cloth import blender_python, run_blender, trajectory_of
 from newton_cloth import NewtonCloth, Setting
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import MissingExtraError
 from eslr_jax.evaluation.calibrate import device_name, example_scene
-from eslr_jax.evaluation.excess import answer_potentials, measure_excess, trajectory_states
+from eslr_jax.evaluation.excess import Excess, answer_potentials, measure_excess, trajectory_states
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.hard_cases.simulators import split_frames
 from eslr_jax.evaluation.referee import Referee
@@ -64,6 +67,7 @@ SETTINGS = (
     Setting("xpbd", None, 1),
 )
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
+BLENDER = ((5, 2), (15, 2), (45, 2))  # steps per frame, rounds of collision per step
 OURS = ((1, 10), (1, 20), (1, 50), (1, 100), (5, 50))  # substeps, iterations of L-BFGS
 EVERY = 6  # frames between those whose excess is measured
 TIMED_FRAMES = 20  # of `peer_points`
@@ -156,6 +160,15 @@ def take_turns(
     return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
 
 
+def _optima(trajectory: Trajectory, scene: Scene, every: int) -> Excess:
+    """Return where frames of a rollout start, end, and could have ended, as NumPy arrays [J]."""
+    config = SimConfig(simulator="physics")
+    ends = measure_excess(
+        None, trajectory, scene, PhysicsParameters(), config, every=every, iterations=(), corrector_steps=()
+    )
+    return jax.device_get(ends)
+
+
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -168,10 +181,7 @@ def teach(
         every: Frames between the states.
     """
     parameters = PhysicsParameters()
-    config = SimConfig(simulator="physics")
-    ends = jax.device_get(
-        measure_excess(None, truth, scene, parameters, config, every=every, iterations=(), corrector_steps=())
-    )
+    ends = _optima(truth, scene, every)
     states, inputs = trajectory_states(truth, scene, parameters)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
     frames = range(1, scene.num_frames - 1, every)
@@ -215,12 +225,16 @@ def count_intersections(position: np.ndarray, scene: Scene) -> dict[str, int | N
     return dict(zip(names, (verdict.cloth_cloth, verdict.cloth_body), strict=True))
 
 
-def describe_rollout(positions: np.ndarray, scene: Scene) -> dict[str, Any]:
-    """Return the measures of a free rollout; None where it did not stay finite."""
+def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[str, Any]:
+    """Return the measures of a free rollout, excess every so many frames; None where it did not stay finite."""
     is_finite = bool(np.isfinite(positions).all())
     row: dict[str, Any] = {"finite": is_finite, "stretch_p99": None, "penetration_p999_mm": None}
+    row["excess_relative_own"] = None
     if not is_finite:
         return row
+    ends = _optima(trajectory_of(positions, scene), scene, every)
+    excess = np.maximum(ends.answer - ends.optimum, 0.0)
+    row["excess_relative_own"] = float(np.median(excess / np.maximum(ends.start - ends.optimum, 1e-9)))
     stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
     is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
     row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))
@@ -230,23 +244,46 @@ def describe_rollout(positions: np.ndarray, scene: Scene) -> dict[str, Any]:
 
 
 def measure_scene(
-    scene: Scene, efforts: tuple[tuple[int, int], ...], settings: tuple[Setting, ...], every: int
+    scene: Scene,
+    efforts: tuple[tuple[int, int], ...],
+    settings: tuple[Setting, ...],
+    blender: tuple[tuple[int, int], ...],
+    every: int,
 ) -> list[dict[str, Any]]:
-    """Return a row of plain values per method: ours by efforts, Newton's by settings."""
+    """Return a row of plain values per method: ours by efforts, Newton's by settings, Blender's by efforts."""
     methods = [our_method(scene, *effort) for effort in efforts] + newton_methods(scene, settings)
     truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
     excess, drop = teach(methods, scene, truth, every)
-    return [
+    rows = [
         {
             "method": method.name,
             "effort": method.effort,
             "frame_ms": float(np.median(wall[k])),
             "frame_cpu_ms": float(np.median(processor[k])),
-            **describe_rollout(positions[k], scene),
+            **describe_rollout(positions[k], scene, every),
             **summarize_excess(excess[k], drop),
         }
         for k, method in enumerate(methods)
+    ]
+    return rows + blender_rows(scene, blender, every)
+
+
+def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int) -> list[dict[str, Any]]:
+    """Return a row per effort of Blender's; none, and a line that says what is missing, without it."""
+    if blender_python() is None:
+        print("Blender left out: BLENDER_PYTHON names no Python with bpy", file=sys.stderr)
+        return []
+    runs = [run_blender(scene, effort) for effort in efforts]
+    return [
+        {
+            "method": f"Blender {run.version}",
+            "effort": f"{steps}x{rounds}",
+            "frame_ms": float(np.median(run.wall)),
+            "frame_cpu_ms": float(np.median(run.processor)),
+            **describe_rollout(run.positions, scene, every),
+        }
+        for (steps, rounds), run in zip(efforts, runs, strict=True)
     ]
 
 
@@ -298,6 +335,7 @@ COLUMNS = {
     "frame_ms": "ms a frame",
     "frame_cpu_ms": "CPU ms",
     "excess_relative_median": "excess, median [%]",
+    "excess_relative_own": "on its own rollout [%]",
     "stretch_p99": "stretch, 99 %",
     "penetration_p999_mm": "penetration, 99.9 % [mm]",
     "intersections_body": "pairs with the body",
@@ -313,7 +351,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             return "-"
         if not isinstance(value, float):
             return str(value)
-        scaled = 100 * value if name == "excess_relative_median" else value
+        scaled = 100 * value if name.startswith("excess_relative") else value
         return f"{scaled:.3g}" if abs(scaled) < 1e3 else f"{scaled:.0f}"
 
     lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]
@@ -342,10 +380,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
     arguments = parser.parse_args()
-    efforts, settings = OURS, SETTINGS
+    efforts, settings, blender = OURS, SETTINGS, BLENDER
     if arguments.smoke:
         arguments.scenes, arguments.frames = ["tshirt_1k"], 8
-        efforts, settings = OURS[-1:], SMOKE_SETTINGS
+        efforts, settings, blender = OURS[-1:], SMOKE_SETTINGS, BLENDER[:1]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
         "clip": CLIP,
@@ -359,7 +397,7 @@ def main() -> None:
     result["versions"] |= peer_versions()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.scenes:
-        rows = measure_scene(make_scene(name, arguments.frames), efforts, settings, EVERY)
+        rows = measure_scene(make_scene(name, arguments.frames), efforts, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         with atomic_write(arguments.out / "peers.json") as temporary:  # after every scene: they take minutes

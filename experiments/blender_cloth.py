@@ -1,0 +1,152 @@
+"""A scene of this package in Blender's cloth modifier, where `BLENDER_PYTHON` names a Python with `bpy`.
+
+Blender is GPL, https://www.blender.org; measured in version 5.0.1. It runs in a process of its own, from a start
+without velocity through all frames: it can't be set into a state that moves, so only its own rollouts are
+measured. No damping. Self-contact only in scenes that ask for it.
+
+What its numbers mean was measured, on sheets that fall, hang, bend and slide:
+
+- Time: gravity counts 0.001 m per frame^2 for every m/s^2, so a frame is sqrt(0.001) s long; `time_scale` makes
+  it ours.
+- Tension: every edge is a spring of 1000 T / l, with the mean edge length l. A lattice of equilateral triangles
+  with such springs has the strip stiffness 2 / sqrt(3) of theirs, so T = sqrt(3) / 2 E h l / 1000.
+- Bending: the force at a hinge's tip is 100 / 3 k l theta. Rest angles are those of the rest shape, ours flat.
+- Friction: 1 % of the body's number. Cloth and body each have a distance; both add up to ours.
+
+Fabric by part becomes one fabric, its mean. Lengths at rest are those of the mesh that carries the pins, so a
+pinned garment has to start in its rest shape.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from newton_cloth import prepare_cloth, strip_stiffness
+
+from eslr_jax.errors import EslrError
+from eslr_jax.evaluation.hard_cases import Simulator, StressScene
+from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
+from eslr_jax.simulate.scan import Frames, join_frames
+from eslr_jax.types import Scene, Trajectory
+
+SECONDS_PER_FRAME = 1e-3**0.5  # of Blender's cloth, whatever the frame rate
+_BODY_DISTANCE = 1e-3  # [m]; the least that Blender takes
+_SAME = 1e-5  # [m]; single precision
+
+
+@dataclasses.dataclass(frozen=True)
+class BlenderRun:
+    """A rollout of Blender's."""
+
+    positions: Float[np.ndarray, "frames vertices 3"]  # [m]; padding stays where it starts
+    wall: Float[np.ndarray, " steps"]  # [ms]
+    processor: Float[np.ndarray, " steps"]  # [ms]
+    version: str
+
+
+def blender_python() -> str | None:
+    """Return the Python that has `bpy`, or None."""
+    return os.environ.get("BLENDER_PYTHON")
+
+
+def run_blender(
+    scene: Scene,
+    effort: tuple[int, int],
+    parameters: PhysicsParameters | None = None,
+    *,
+    self_contact: bool = False,
+) -> BlenderRun:
+    """Simulate a scene in Blender.
+
+    Args:
+        scene: Of `prepare_scene`.
+        effort: Steps per frame, and rounds of collision per step.
+        parameters: Physical constants.
+        self_contact: Keep layers apart.
+
+    Raises:
+        EslrError: The scene can't be carried over, or Blender failed; the message holds the last line that it
+            wrote.
+    """
+    parameters = parameters or PhysicsParameters()
+    cloth = prepare_cloth(scene.garment, scene.material)
+    rows, start = cloth.vertices, np.asarray(scene.start.position, np.float32)[cloth.vertices]
+    is_deformed = np.abs(start - cloth.rest).max() > _SAME
+    if cloth.is_pinned.any() and is_deformed:
+        raise EslrError(
+            "Blender takes lengths at rest from the mesh that carries pins, which is deformed here"
+        )
+    if scene.body_positions is None and np.asarray(scene.start.velocity)[rows].any():
+        raise EslrError("Blender starts cloth without velocity")
+    stretch = strip_stiffness(cloth.shear, cloth.area_stiffness)
+    sides = np.concatenate([cloth.faces[:, [0, 1]], cloth.faces[:, [1, 2]], cloth.faces[:, [2, 0]]])
+    edges = np.unique(np.sort(sides, axis=1), axis=0)
+    edge_length = np.linalg.norm(cloth.rest[edges[:, 1]] - cloth.rest[edges[:, 0]], axis=1).mean()
+    distance = float(contact_thickness(scene.garment, parameters.collision_thickness))
+    arrays = {
+        "start": start,
+        "rest": np.asarray(cloth.rest, np.float32),
+        "faces": cloth.faces,
+        "is_pinned": cloth.is_pinned,
+        "frames": scene.num_frames,
+        "quality": effort[0],
+        "collision_quality": effort[1],
+        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME,
+        "gravity": float(parameters.gravity),
+        "mass": cloth.masses[cloth.masses > 0].mean(),
+        "tension": 3**0.5 / 2 * stretch.mean() * edge_length / 1e3,
+        "bending": 0.03 * (cloth.bending / cloth.hinge_areas).mean(),
+        "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE),
+        "body_distance": _BODY_DISTANCE,
+        "friction": 100.0 * float(parameters.friction_coefficient),
+    }
+    if self_contact:
+        arrays["layer_distance"] = float(contact_thickness(scene.garment, parameters.repulsion_thickness))
+    if scene.pin_targets is not None:
+        arrays["pin_targets"] = np.asarray(scene.pin_targets, np.float32)[:, rows]
+    if scene.body_positions is not None and scene.surface is not None:
+        arrays["body"] = np.asarray(scene.body_positions, np.float32)
+        arrays["body_faces"] = np.asarray(scene.surface.faces)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "scene.npz", Path(folder) / "out.npz"
+        np.savez(source, **arrays)  # type: ignore[arg-type]
+        command = [str(blender_python()), str(Path(__file__).with_name("blender_worker.py")), source, target]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if not target.exists():
+            lines = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()
+            raise EslrError(f"Blender failed: {lines[-1]}")
+        with np.load(target) as out:
+            positions = np.repeat(np.asarray(scene.start.position)[None], scene.num_frames, axis=0)
+            positions[:, rows] = out["positions"]
+            return BlenderRun(positions, out["wall"], out["processor"], str(out["version"]))
+
+
+def trajectory_of(positions: Float[np.ndarray, "frames vertices 3"], scene: Scene) -> Trajectory:
+    """Return the trajectory of a rollout of which only positions are known; residuals and iterations are zero."""
+    velocities = jnp.diff(positions, axis=0) / scene.timestep
+    none = jnp.zeros(len(velocities))
+    frames = Frames(
+        jnp.asarray(positions[1:]), velocities, none, none.astype(jnp.int32), needed_capacity=None
+    )
+    return join_frames(scene.start, frames, scene.start)
+
+
+def blender_simulator(effort: tuple[int, int]) -> Simulator:
+    """Return Blender's cloth as a simulator of the hard cases.
+
+    Args:
+        effort: Steps per frame, and rounds of collision per step.
+    """
+
+    def run(stress: StressScene) -> Trajectory:
+        done = run_blender(stress.scene, effort, stress.parameters, self_contact=stress.self_contact)
+        return trajectory_of(done.positions, stress.scene)
+
+    return Simulator(f"Blender, {effort[0]}x{effort[1]}", run)
