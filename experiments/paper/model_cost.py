@@ -1,17 +1,22 @@
-"""Table V of the paper: layers, parameters, latency and memory of the full-size networks.
+"""Table V of the paper: layers, parameters, loss, latency and memory of the full-size networks and of ours.
 
     python experiments/paper/model_cost.py [--smoke]
 
 Latency is a frame of the T-shirt at 4k vertices, contacts included, the networks in turns. Memory is what XLA
-sets aside for the call, weights included. The loss column needs networks of this size trained, which takes a GPU.
+sets aside for the call, weights included. Loss is the Total of `native_garments.json`: full-size networks have
+none, to train them takes a GPU.
 """
 
 from __future__ import annotations
 
-import jax
-from rollouts import arguments, write
+import json
 
-from eslr_jax.assets import load_body, load_garment, load_motion
+import jax
+from native_garments import ABLATION
+from rollouts import RESULTS, arguments, write
+
+from eslr_jax.assets import load_body, load_garment, load_model, load_motion
+from eslr_jax.assets.load import START_MODEL, default_model
 from eslr_jax.body.motion import pose_body
 from eslr_jax.evaluation.calibrate import device_name
 from eslr_jax.evaluation.scene_parts import take_turns
@@ -22,22 +27,26 @@ from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import frame_inputs
 from eslr_jax.simulate.step import frame_problem
 
-NAMES = ("mgn-48", "mgn-15", "eslr-15", "eslr-10")
+FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10")
+TRAINED = (default_model(), START_MODEL, *ABLATION)
 
 
 def main() -> None:
     """Measure and write."""
     chosen = arguments(__doc__)
-    names, size, turns = (NAMES, "4k", 7) if not chosen.smoke else (NAMES[-1:], "1k", 1)
+    names, size, turns = (*FULL_SIZE, *TRAINED), "4k", 7
+    if chosen.smoke:
+        names, size, turns = (FULL_SIZE[-1], START_MODEL), "1k", 1
+    losses = json.loads((RESULTS / "native_garments.json").read_text())["mean"]
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
-    scene = prepare_scene(load_garment("tshirt", vertices=size), poses)  # type: ignore[arg-type]
-    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     parts, rows = {}, {}
     for name in names:
-        config = MODELS[name]
-        params = init_model(config)
+        params, config = (init_model(MODELS[name]), MODELS[name]) if name in FULL_SIZE else load_model(name)
+        embedding = {"embedding_size": config.embedding_size, "embedding_mode": config.embedding_mode}
+        scene = prepare_scene(load_garment("tshirt", vertices=size, **embedding), poses)  # type: ignore[arg-type]
+        inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
-        def forward(params, state, config=config):
+        def forward(params, state, config=config, scene=scene, inputs=inputs):
             problem = frame_problem(
                 scene.garment, state, inputs, scene.surface, scene.timestep, PhysicsParameters()
             )
@@ -47,8 +56,10 @@ def main() -> None:
         parts[name] = (forward, (params, scene.start))
         rows[name] = {
             "layers": config.message_passing_steps,
+            "passes": config.passes,
             "parameters": count_parameters(params),
             "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
+            **({"loss": losses[name]["total"]} if name in losses else {}),
         }
     for name, milliseconds in take_turns(parts, turns).items():
         rows[name]["latency_ms"] = milliseconds

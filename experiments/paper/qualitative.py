@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from native_garments import MODELS
+from native_garments import ABLATION, BUNDLED
 from rollouts import OPTIMUM, arguments, simulator, write
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.assets.load import default_model
 from eslr_jax.body.motion import pose_body
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.io.atomic import atomic_write
@@ -89,7 +88,7 @@ def main() -> None:
     """Simulate, render and write."""
     chosen = arguments(__doc__, frames=90)
     clip = load_splits()["motions"]["test"][0]
-    models, garments = (*MODELS[::-1], default_model(), OPTIMUM), GARMENTS
+    models, garments = (*ABLATION[::-1], *BUNDLED, OPTIMUM), GARMENTS
     if chosen.smoke:
         models, garments = models[-1:], garments[:1]
     body = load_body()

@@ -45,10 +45,11 @@ def arguments(description: str | None, *, frames: int = 150) -> argparse.Namespa
 
 
 def simulator(model: str) -> tuple[Any, SimConfig, dict[str, Any]]:
-    """Return weights, configuration and garment options of a network, or of the optimum."""
+    """Return weights, configuration and garment options of a network or the optimum; NAME+20 adds iterations."""
     if model == OPTIMUM:
         return *simulator_of(SOLVER, _OPTIMUM_ITERATIONS), {}
-    params, config = simulator_of(model)
+    name, _, iterations = model.partition("+")
+    params, config = simulator_of(name, int(iterations or 0))
     assert config.model is not None
     names = ("embedding_size", "embedding_mode")
     return params, config, {name: getattr(config.model, name) for name in names}
@@ -66,7 +67,7 @@ def table(
     """Return the measures of every model on every garment, means over clips.
 
     Args:
-        models: Names of networks or exported files; `OPTIMUM` is the solver run near convergence.
+        models: As for `simulator`; `OPTIMUM` is the solver run near convergence.
         garments: Names of bundled garments.
         clips: Names of bundled clips, played back and forth.
         vertices: Resolution.
