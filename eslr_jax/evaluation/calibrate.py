@@ -40,6 +40,9 @@ _TIMED_FRAMES = 20
 _TIMED_ITERATIONS = (10, 60)
 _TURNS = 9  # timings of each, in turns; medians count
 _STOPS_AT = 0.04  # of the tolerance: the median excess where frames stop, on test clips at 1k
+_FEWEST = (
+    5  # iterations, to keep a budget: with five the network's rollouts hold together, with none they don't
+)
 _MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
 
@@ -335,9 +338,9 @@ def keep_budget(choice: Choice, budget_ms: float) -> Callable[[int, float], int]
 
     Returns:
         From the iterations of the last frames and the milliseconds that one of them took, the iterations of the
-        next: at least one of the solver alone, at least none behind a network.
+        next; where the budget is too small for cloth, it is missed.
     """
-    least = 1 if choice.method == SOLVER else 0
+    least = min(choice.iterations, _FEWEST)
 
     def pace(iterations: int, took_ms: float) -> int:
         slower = took_ms / (choice.fixed_ms + iterations * choice.iteration_ms)
