@@ -1,7 +1,7 @@
 """Other simulators beside ours, same scenes, same run: Newton's VBD, Style3D and XPBD, Blender's cloth.
 
-    python experiments/peers.py                          # T-shirt at 1k and 4k, 60 frames
-    python experiments/peers.py --scenes ball_1k tshirt_4k --frames 46
+    python experiments/peers.py                          # T-shirt at 1k, 4k and 10k, 40 frames: half an hour
+    python experiments/peers.py --scenes tshirt_10k      # joins the scenes that the file already holds
     python experiments/peers.py --smoke --out DIR
 
 All methods step the same frame one after the other, then all the next one, so that whatever disturbs the machine
@@ -375,8 +375,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k"])
-    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
+    parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
     arguments = parser.parse_args()
@@ -396,11 +396,14 @@ def main() -> None:
     }
     result["versions"] |= peer_versions()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "peers.json"
+    if path.exists():
+        result["scenes"] = json.loads(path.read_text())["scenes"]
     for name in arguments.scenes:
         rows = measure_scene(make_scene(name, arguments.frames), efforts, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
-        with atomic_write(arguments.out / "peers.json") as temporary:  # after every scene: they take minutes
+        with atomic_write(path) as temporary:  # after every scene: they take minutes
             temporary.write_text(json.dumps(result, indent=1) + "\n")
         print(f"\n{name}\n\n{table(rows)}", flush=True)
         jax.clear_caches()
