@@ -32,6 +32,7 @@ from newton_cloth import prepare_cloth, springs, strip_stiffness
 
 from eslr_jax.errors import EslrError
 from eslr_jax.evaluation.hard_cases import Simulator, StressScene
+from eslr_jax.io.point_cache import write_pc2
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
 from eslr_jax.simulate.scan import Frames, join_frames
 from eslr_jax.types import Scene, Trajectory
@@ -90,7 +91,6 @@ def run_blender(
     distance = float(contact_thickness(scene.garment, parameters.collision_thickness))
     arrays = {
         "start": start,
-        "rest": np.asarray(cloth.rest, np.float32),
         "faces": cloth.faces,
         "is_pinned": cloth.is_pinned,
         "frames": scene.num_frames,
@@ -107,20 +107,25 @@ def run_blender(
     }
     if self_contact:
         arrays["layer_distance"] = float(contact_thickness(scene.garment, parameters.repulsion_thickness))
-    if scene.pin_targets is not None:
-        arrays["pin_targets"] = np.asarray(scene.pin_targets, np.float32)[:, rows]
-    if scene.body_positions is not None and scene.surface is not None:
-        arrays["body"] = np.asarray(scene.body_positions, np.float32)
-        arrays["body_faces"] = np.asarray(scene.surface.faces)
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "scene.npz", Path(folder) / "out.npz"
-        np.savez(source, **arrays)  # type: ignore[arg-type]
-        command = [str(blender_python()), str(Path(__file__).with_name("blender_worker.py")), source, target]
+    if cloth.is_pinned.any():
+        below = np.repeat(start[None], scene.num_frames, axis=0)
+        below[:, cloth.is_pinned] = np.asarray(scene.pin_targets)[:, rows[cloth.is_pinned]]
+    else:  # the start, then the rest shape for its lengths
+        below = np.stack([start, cloth.rest])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_pc2(folder / "cloth.pc2", below)
+        if scene.body_positions is not None and scene.surface is not None:
+            body = np.asarray(scene.body_positions)
+            write_pc2(folder / "body.pc2", body)
+            arrays |= {"body_start": body[0], "body_faces": np.asarray(scene.surface.faces)}
+        np.savez(folder / "scene.npz", **arrays)  # type: ignore[arg-type]
+        command = [str(blender_python()), str(Path(__file__).with_name("blender_worker.py")), name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if not target.exists():
+        if not (folder / "out.npz").exists():
             lines = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()
             raise EslrError(f"Blender failed: {lines[-1]}")
-        with np.load(target) as out:
+        with np.load(folder / "out.npz") as out:
             positions = np.repeat(np.asarray(scene.start.position)[None], scene.num_frames, axis=0)
             positions[:, rows] = out["positions"]
             return BlenderRun(positions, out["wall"], out["processor"], str(out["version"]))

@@ -1,12 +1,13 @@
-"""Run Blender's cloth on a scene that `blender_cloth.py` wrote down; for a Python that has `bpy`.
+"""Run Blender's cloth on a scene that `blender_cloth.py` wrote into a folder; for a Python that has `bpy`.
 
 `bpy` wants NumPy 1 and the package NumPy 2, so the two never share an interpreter.
 
-    python blender_worker.py SCENE.npz OUT.npz
+    python blender_worker.py FOLDER
+
+Reads scene.npz and the point caches cloth.pc2 and body.pc2; writes out.npz.
 """
 
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -23,14 +24,8 @@ def add_mesh(name, positions, faces):
     return thing
 
 
-def animate(thing, positions, path):
-    """Lay the positions of all frames on a mesh, through a point cache in the form PC2."""
-    with path.open("wb") as file:
-        file.write(b"POINTCACHE2\0")
-        np.array([1, positions.shape[1]], "<i4").tofile(file)
-        np.array([0.0, 1.0], "<f4").tofile(file)
-        np.array([len(positions)], "<i4").tofile(file)
-        positions.astype("<f4").tofile(file)
+def animate(thing, path):
+    """Let a mesh follow a point cache, in the axes that it was written in."""
     cache = thing.modifiers.new("motion", "MESH_CACHE")
     cache.cache_format, cache.filepath, cache.frame_start = "PC2", str(path), 0
     cache.forward_axis, cache.up_axis = "POS_Y", "POS_Z"
@@ -38,23 +33,16 @@ def animate(thing, positions, path):
 
 def add_cloth(scene, folder):
     """Return the cloth object; `scene` holds the arrays and settings of the file."""
-    start, frames = scene["start"], int(scene["frames"])
-    thing = add_mesh("cloth", start, scene["faces"])
-    is_pinned = scene["is_pinned"]
-    if is_pinned.any():
-        below = np.repeat(start[None], frames, axis=0)
-        below[:, is_pinned] = scene["pin_targets"][:, is_pinned]
-        group = thing.vertex_groups.new(name="pins")
-        group.add(np.flatnonzero(is_pinned).tolist(), 1.0, "REPLACE")
-    else:
-        below = np.stack([start, scene["rest"]])
-    animate(thing, below, folder / "cloth.pc2")
+    thing = add_mesh("cloth", scene["start"], scene["faces"])
+    animate(thing, folder / "cloth.pc2")
     cloth = thing.modifiers.new("cloth", "CLOTH")
-    cloth.point_cache.frame_start, cloth.point_cache.frame_end = 0, frames - 1
+    cloth.point_cache.frame_start, cloth.point_cache.frame_end = 0, int(scene["frames"]) - 1
     settings, contacts = cloth.settings, cloth.collision_settings
-    if is_pinned.any():
-        settings.vertex_group_mass = "pins"
-    else:  # from the second frame on lengths are those of the mesh below; a rest shape key is not heeded
+    if scene["is_pinned"].any():
+        group = thing.vertex_groups.new(name="pins")
+        group.add(np.flatnonzero(scene["is_pinned"]).tolist(), 1.0, "REPLACE")
+        settings.vertex_group_mass = group.name
+    else:  # lengths at rest are those that the point cache has now; a rest shape key is not heeded
         settings.use_dynamic_mesh = True
     settings.quality, settings.time_scale = int(scene["quality"]), float(scene["time_scale"])
     settings.mass, settings.air_damping, settings.bending_model = float(scene["mass"]), 0.0, "ANGULAR"
@@ -62,7 +50,7 @@ def add_cloth(scene, folder):
     settings.tension_stiffness = settings.compression_stiffness = settings.shear_stiffness = tension
     settings.tension_damping = settings.compression_damping = settings.shear_damping = 0.0
     settings.bending_stiffness, settings.bending_damping = bending, 0.0
-    contacts.use_collision = "body" in scene
+    contacts.use_collision = "body_start" in scene
     contacts.collision_quality = int(scene["collision_quality"])
     contacts.distance_min = float(scene["distance"])
     contacts.use_self_collision = "layer_distance" in scene
@@ -73,8 +61,8 @@ def add_cloth(scene, folder):
 
 def add_body(scene, folder):
     """Add the body that cloth collides with."""
-    thing = add_mesh("body", scene["body"][0], scene["body_faces"])
-    animate(thing, scene["body"], folder / "body.pc2")
+    thing = add_mesh("body", scene["body_start"], scene["body_faces"])
+    animate(thing, folder / "body.pc2")
     thing.modifiers.new("collision", "COLLISION")
     body = thing.collision
     body.damping, body.cloth_friction = 0.0, float(scene["friction"])
@@ -83,28 +71,26 @@ def add_body(scene, folder):
 
 def main():
     """Simulate and write positions, and the time that every frame took."""
-    source, target = map(Path, sys.argv[1:])
-    scene = dict(np.load(source))
+    folder = Path(sys.argv[1])
+    scene = dict(np.load(folder / "scene.npz"))
     frames = int(scene["frames"])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     world = bpy.context.scene
     world.gravity = (0.0, -float(scene["gravity"]), 0.0)
     world.frame_start, world.frame_end = 0, frames - 1
     positions, wall, processor = np.empty((frames, *scene["start"].shape), np.float32), [], []
-    with tempfile.TemporaryDirectory() as folder:
-        if "body" in scene:
-            add_body(scene, Path(folder))
-        cloth = add_cloth(scene, Path(folder))
-        for frame in range(frames):
-            began, began_processor = time.perf_counter(), time.process_time()
-            world.frame_set(frame)
-            shown = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get())
-            wall.append(1e3 * (time.perf_counter() - began))
-            processor.append(1e3 * (time.process_time() - began_processor))
-            shown.data.vertices.foreach_get("co", positions[frame].reshape(-1))
-    np.savez(
-        target, positions=positions, wall=wall[1:], processor=processor[1:], version=bpy.app.version_string
-    )
+    if "body_start" in scene:
+        add_body(scene, folder)
+    cloth = add_cloth(scene, folder)
+    for frame in range(frames):
+        began, began_processor = time.perf_counter(), time.process_time()
+        world.frame_set(frame)
+        shown = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        wall.append(1e3 * (time.perf_counter() - began))
+        processor.append(1e3 * (time.process_time() - began_processor))
+        shown.data.vertices.foreach_get("co", positions[frame].reshape(-1))
+    times = {"wall": wall[1:], "processor": processor[1:]}
+    np.savez(folder / "out.npz", positions=positions, version=bpy.app.version_string, **times)
 
 
 main()

@@ -45,7 +45,7 @@ def simulate(
 ) -> None:
     """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
 
-    How is chosen for a tolerance of 1 %, unless a budget, another tolerance or a simulator is given.
+    The fastest within a tolerance of 1 % is chosen, unless a budget, another tolerance or a simulator is given.
 
     Args:
         garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
@@ -126,7 +126,8 @@ def simulate(
             }
         cloth = prepare_stored(stored, name=Path(garment).name, **options)
         material = garment_material(fabric, cloth, stored)
-        unseen = beyond_training(material) if simulator == "network" else ()
+        # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
+        unseen = beyond_training(material) if simulator == "network" and share is None else ()
         _check_skin(garment, cloth, rig, body)
         scene = prepare_scene(cloth, poses, material=material)
     if unseen:

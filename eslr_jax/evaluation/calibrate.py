@@ -40,9 +40,7 @@ _TIMED_FRAMES = 20
 _TIMED_ITERATIONS = (10, 60)
 _TURNS = 9  # timings of each, in turns; medians count
 _STOPS_AT = 0.04  # of the tolerance: the median excess where frames stop, on test clips at 1k
-_FEWEST = (
-    5  # iterations, to keep a budget: with five the network's rollouts hold together, with none they don't
-)
+_FEWEST = 5  # iterations, to keep a budget: with five a network's rollouts hold together, with none not
 _MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
 
