@@ -5,8 +5,9 @@
     python experiments/hard_cases.py corrected --model smooth-small --sheet
     python experiments/hard_cases.py vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
     python experiments/hard_cases.py blender             # its cloth, see `blender_cloth.py`
+    python experiments/hard_cases.py --smoke --out DIR   # one case
 
-Writes `experiments/results/hard_cases_<simulator>.json` after every case (`_<model>` where it is not the default
+Writes `hard_cases_<simulator>.json` after every case (`_<model>` where it is not the default
 network) and, with `--sheet`, a picture of all that ran beside it. Entries of an earlier file stay until their
 case is run anew.
 """
@@ -43,13 +44,19 @@ def merge(old: dict, new: dict) -> dict:
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("simulator", choices=["physics", "network", "corrected", "blender", *PEERS])
+    choices = ["physics", "network", "corrected", "blender", *PEERS]
+    parser.add_argument("simulator", nargs="?", default="corrected", choices=choices)
     parser.add_argument("--model", default="eslr-small")
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("--corrector-steps", type=int, default=20)
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true")
     options = parser.parse_args()
+    if options.smoke:
+        options.model, options.case = "smooth-small", ["pull"]
+    options.out.mkdir(parents=True, exist_ok=True)
 
     from eslr_jax.assets import load_model
     from eslr_jax.evaluation.hard_cases import network_simulator, physics_simulator
@@ -73,7 +80,7 @@ def main() -> None:
         simulator = network_simulator(*load_model(options.model), name=name, corrector_steps=steps)
 
     other = f"_{options.model}" if options.model != parser.get_default("model") else ""
-    path = RESULTS / f"hard_cases_{options.simulator}{other}.json"
+    path = options.out / f"hard_cases_{options.simulator}{other}.json"
 
     def keep(name, outcome, seconds):
         result = summary(simulator, [outcome])

@@ -3,13 +3,14 @@
     python experiments/solver_convergence.py                  # all scenes, then the cost
     python experiments/solver_convergence.py tshirt_1k ball_4k
     python experiments/solver_convergence.py cost
+    python experiments/solver_convergence.py --smoke --out DIR
 
 Frames are taken from a solved rollout. Of every frame: L-BFGS from the pushed-out start after 5 to 200
 iterations, with three preconditioners; projected Newton from the same start, and from a second one, the cloth
 where it was, brought near a minimum by L-BFGS. The remaining gap is (E - E*) / (E_0 - E*): E_0 the potential of
 the pushed-out inertial guess, E* the lowest of all answers, everything in float64.
 
-Entries of `experiments/results/solver_convergence.json` that are not measured anew stay as they are.
+Entries of solver_convergence.json that are not measured anew stay as they are.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from eslr_jax.simulate.network import network_step
 from eslr_jax.simulate.scan import simulate_scene
 from eslr_jax.simulate.step import frame_problem
 
-RESULT = Path(__file__).resolve().parent / "results" / "solver_convergence.json"
+RESULTS = Path(__file__).resolve().parent / "results"
 COUNTS = (5, 10, 20, 50, 100, 200)  # L-BFGS iterations
 CLIP = "cmu_016_32"
 LAST_FRAME = 40  # frames are spread from the second to this one
@@ -214,8 +215,14 @@ def main() -> None:
     parser.add_argument(
         "--newton-iterations", type=int, default=300, help="0: the optimum is the best of L-BFGS"
     )
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="one frame of one scene, without Newton")
     options = parser.parse_args()
-    result = json.loads(RESULT.read_text()) if RESULT.exists() else {"scenes": {}}
+    if options.smoke:
+        options.what, options.frames, options.newton_iterations = names[:1], 1, 0
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "solver_convergence.json"
+    result = json.loads(path.read_text()) if path.exists() else {"scenes": {}}
     for what in options.what:
         if what == "cost":
             result["cost_of_100_iterations"] = measure_cost()
@@ -223,7 +230,7 @@ def main() -> None:
             result["scenes"][what] = measure_scene(what, options.frames, options.newton_iterations)
         result["scenes"] = {name: result["scenes"][name] for name in names if name in result["scenes"]}
         result |= environment()
-        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+        path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

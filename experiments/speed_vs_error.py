@@ -23,6 +23,7 @@ import numpy as np
 from peers import SETTINGS, SMOKE_SETTINGS, peer_points, peer_versions
 
 from eslr_jax.assets import asset_names
+from eslr_jax.assets.load import START_MODEL
 from eslr_jax.evaluation.calibrate import (
     SOLVER,
     Method,
@@ -144,7 +145,7 @@ def main() -> None:
     solver_counts, network_counts = ROLLOUTS
     if arguments.smoke:
         garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 8, SMOKE_SETTINGS
-        arguments.sizes, arguments.models = ["1k"], arguments.models[:1]
+        arguments.sizes, arguments.models = ["1k"], [START_MODEL]
         solver_counts = network_counts = (10,)  # which the calibration has compiled
     path = arguments.out / "speed_vs_error.json"
     result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}

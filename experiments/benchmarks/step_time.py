@@ -288,8 +288,11 @@ def main() -> None:
     parser.add_argument(
         "--keep-memory", action="store_true", help="keep freed memory, for both sides (glibc)"
     )
+    parser.add_argument("--smoke", action="store_true", help="1k, one turn, neither training nor PyTorch")
     parser.add_argument("--json", nargs="?", const="-", help="write JSON to this file, or to the screen")
     options = parser.parse_args()
+    if options.smoke:
+        options.sizes, options.turns, options.no_training, options.no_torch = ["1k"], 1, True, True
     if options.keep_memory:
         keep_memory()
 

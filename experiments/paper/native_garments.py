@@ -23,7 +23,7 @@ def main() -> None:
     garments, clips = splits["garments"]["train"], splits["motions"]["test"][:3]
     models = (*ABLATION, *BUNDLED, OPTIMUM)
     if chosen.smoke:
-        garments, clips, models = garments[:1], clips[:1], (BUNDLED[-1], OPTIMUM)
+        garments, clips, models = garments[:1], clips[:1], BUNDLED[-1:]
     measured = table(models, garments, clips, vertices=chosen.vertices, frames=chosen.frames)
     result = {"clips": clips, "frames": chosen.frames, "vertices": chosen.vertices, "garments": measured}
     write({**result, "mean": mean_over_garments(measured)}, chosen.out / "native_garments.json")

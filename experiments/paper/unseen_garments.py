@@ -11,7 +11,7 @@ from __future__ import annotations
 from rollouts import OPTIMUM, arguments, mean_over_garments, table, write
 
 from eslr_jax.assets import load_splits
-from eslr_jax.assets.load import default_model
+from eslr_jax.assets.load import START_MODEL, default_model
 
 MODES = ("canonical", "landmarks", "raw")
 
@@ -22,9 +22,9 @@ def main() -> None:
     splits = load_splits()
     garments, clips = splits["garments"]["unseen"], splits["motions"]["test"][:3]
     modes, others = MODES, ("mgn-small-6k", OPTIMUM)
-    if chosen.smoke:
-        garments, clips, modes, others = garments[:1], clips[:1], MODES[:1], others[1:]
     model = default_model()
+    if chosen.smoke:
+        garments, clips, modes, others, model = garments[:1], clips[:1], MODES[:1], (), START_MODEL
     sizes = {"vertices": chosen.vertices, "frames": chosen.frames}
     measured = {
         f"{model}, {mode}": table((model,), garments, clips, embedding_mode=mode, **sizes)[model]
