@@ -29,7 +29,7 @@ from eslr_jax.evaluation.calibrate import (
     read_calibration,
     simulator_of,
 )
-from eslr_jax.evaluation.excess import measure_excess
+from eslr_jax.evaluation.excess import trajectory_excess
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
@@ -50,12 +50,8 @@ def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, 
     params, config = simulator_of(choice.method, tolerance=choice.tolerance)
     parameters = PhysicsParameters()
     trajectory = simulate_scene(params, scene, parameters, config, choice.iterations)
-    ends = jax.device_get(
-        measure_excess(
-            None, trajectory, scene, parameters, config, every=every, iterations=(), corrector_steps=()
-        )
-    )
-    shares = np.maximum(ends.answer - ends.optimum, 0.0) / np.maximum(ends.start - ends.optimum, 1e-9)
+    ends = trajectory_excess(trajectory, scene, parameters, every=every)
+    shares = np.asarray(ends.share(ends.answer))
     return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
 
 

@@ -40,7 +40,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import MissingExtraError
 from eslr_jax.evaluation.calibrate import device_name, example_scene
-from eslr_jax.evaluation.excess import Excess, answer_potentials, measure_excess, trajectory_states
+from eslr_jax.evaluation.excess import answer_potentials, trajectory_excess, trajectory_states
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.hard_cases.simulators import split_frames
 from eslr_jax.evaluation.referee import Referee
@@ -160,15 +160,6 @@ def take_turns(
     return [np.stack(rows) for rows in positions], list(map(np.array, wall)), list(map(np.array, processor))
 
 
-def _optima(trajectory: Trajectory, scene: Scene, every: int) -> Excess:
-    """Return where frames of a rollout start, end, and could have ended, as NumPy arrays [J]."""
-    config = SimConfig(simulator="physics")
-    ends = measure_excess(
-        None, trajectory, scene, PhysicsParameters(), config, every=every, iterations=(), corrector_steps=()
-    )
-    return jax.device_get(ends)
-
-
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -181,7 +172,7 @@ def teach(
         every: Frames between the states.
     """
     parameters = PhysicsParameters()
-    ends = _optima(truth, scene, every)
+    ends = trajectory_excess(truth, scene, parameters, every=every)
     states, inputs = trajectory_states(truth, scene, parameters)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
     frames = range(1, scene.num_frames - 1, every)
@@ -192,8 +183,8 @@ def teach(
             for frame in frames
         ]
         reached = answer_potentials(jnp.stack(answers), *taken, scene, parameters)
-        excess.append(np.asarray(reached) - ends.optimum)
-    return excess, np.maximum(ends.start - ends.optimum, 1e-9)
+        excess.append(np.asarray(reached - ends.optimum))
+    return excess, np.asarray(ends.drop)
 
 
 @jax.jit
@@ -232,9 +223,8 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[st
     row["excess_relative_own"] = None
     if not is_finite:
         return row
-    ends = _optima(trajectory_of(positions, scene), scene, every)
-    excess = np.maximum(ends.answer - ends.optimum, 0.0)
-    row["excess_relative_own"] = float(np.median(excess / np.maximum(ends.start - ends.optimum, 1e-9)))
+    ends = trajectory_excess(trajectory_of(positions, scene), scene, PhysicsParameters(), every=every)
+    row["excess_relative_own"] = float(np.median(ends.share(ends.answer)))
     stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
     is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
     row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))

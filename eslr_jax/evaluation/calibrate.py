@@ -174,9 +174,9 @@ def _quantiles(
     """Return the median and the 99 % quantile of a method's relative excess over all scenes, by iterations."""
     relative: dict[int, list[np.ndarray]] = {}
     for ends, optimum in zip(excesses, optima, strict=True):
-        drop = np.maximum(ends.start - optimum, 1e-9)
+        best = ends._replace(optimum=optimum)
         for count, energy in (ends.solver if name == SOLVER else ends.corrected).items():
-            relative.setdefault(count, []).append(np.maximum(energy - optimum, 0.0) / drop)
+            relative.setdefault(count, []).append(np.asarray(best.share(energy)))
     joined = {count: np.concatenate(parts) for count, parts in relative.items()}
     return (
         {str(count): float(np.median(values)) for count, values in joined.items()},
@@ -270,11 +270,15 @@ def methods_at(calibration: Calibration, num_vertices: int) -> list[Method]:
     ]
 
 
+def _affordable(budget_ms: float, fixed_ms: float, iteration_ms: float) -> int:
+    """Return the iterations that a frame has time for, no more than were measured; negative where none fits."""
+    return min(int((budget_ms - fixed_ms) / iteration_ms), ITERATIONS[-1])
+
+
 def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
     options = []
     for method in methods:
-        count = int((budget_ms - method.fixed_ms) / method.iteration_ms)
-        count = min(count, ITERATIONS[-1])
+        count = _affordable(budget_ms, method.fixed_ms, method.iteration_ms)
         if count >= min(int(key) for key in method.median):
             options.append((interpolate_excess(method.median, count), method, count))
     if not options:
@@ -342,8 +346,7 @@ def keep_budget(choice: Choice, budget_ms: float) -> Callable[[int, float], int]
 
     def pace(iterations: int, took_ms: float) -> int:
         slower = took_ms / (choice.fixed_ms + iterations * choice.iteration_ms)
-        count = int((budget_ms / slower - choice.fixed_ms) / choice.iteration_ms)
-        return min(max(count, least), ITERATIONS[-1])
+        return max(_affordable(budget_ms / slower, choice.fixed_ms, choice.iteration_ms), least)
 
     return pace
 

@@ -187,7 +187,7 @@ def _summarize(measured: list[Excess]) -> dict[str, Any]:
         return np.concatenate([np.asarray(pick(entry)) for entry in measured])
 
     optimum = join(lambda entry: entry.optimum)
-    drop = np.maximum(join(lambda entry: entry.start) - optimum, 1e-9)
+    drop = join(lambda entry: entry.drop)
 
     def medians(energy: np.ndarray) -> dict[str, float]:
         excess = energy - optimum

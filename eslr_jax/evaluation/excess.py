@@ -20,6 +20,7 @@ from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
 _SOLVER = SimConfig(simulator="physics")
+_LEAST_DROP = 1e-9  # [J]
 _OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
 
 
@@ -31,6 +32,15 @@ class Excess(NamedTuple):
     answer: Float[Array, " frames"]  # what the trajectory itself did
     solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from where the solver starts
     corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
+
+    @property
+    def drop(self) -> Float[Array, " frames"]:
+        """What a frame has to gain [J]; a floor keeps shares of it finite."""
+        return jnp.maximum(self.start - self.optimum, _LEAST_DROP)
+
+    def share(self, energy: Float[Array, " frames"]) -> Float[Array, " frames"]:
+        """Return by how much potentials [J] exceed the optimum, relative to the drop."""
+        return jnp.maximum(energy - self.optimum, 0.0) / self.drop
 
 
 def trajectory_states(
@@ -120,6 +130,18 @@ def measure_excess(
         return Excess(guess, optimum, answered, solver, corrected)
 
     return jax.lax.map(measure, taken)
+
+
+def trajectory_excess(
+    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters, *, every: int
+) -> Excess:
+    """Return where frames of a trajectory start, end, and could have ended; nothing else is solved.
+
+    The arguments are those of `measure_excess`.
+    """
+    return measure_excess(
+        None, trajectory, scene, parameters, _SOLVER, every=every, iterations=(), corrector_steps=()
+    )
 
 
 def map_answers(
