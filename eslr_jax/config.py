@@ -42,7 +42,7 @@ class ModelConfig:
     # combination of these three, which never climbs the potential ("subspace").
     output: Literal["acceleration", "correction", "descent", "subspace"] = "acceleration"
     output_scale: float = 1.0  # metres per unit of output, for corrections
-    passes: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
+    refinement_steps: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
     world_edge_capacity: int | None = None  # rows for world edges; None is one per vertex
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
@@ -55,7 +55,13 @@ class ModelConfig:
         Raises:
             ValueError: Names the field and what to change.
         """
-        sizes = ("message_passing_steps", "latent_size", "attention_size", "attention_features", "passes")
+        sizes = (
+            "message_passing_steps",
+            "latent_size",
+            "attention_size",
+            "attention_features",
+            "refinement_steps",
+        )
         for name in sizes:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -67,11 +73,13 @@ class ModelConfig:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.world_edge_capacity is not None and self.world_edge_capacity < 1:
             raise ValueError("world_edge_capacity must be at least 1, or null for one row per vertex")
-        if self.passes > 1 and self.features != "gradient":
-            raise ValueError('passes > 1 needs features = "gradient": others are the same in every pass')
-        if self.passes > 1 and self.output == "acceleration":
+        if self.refinement_steps > 1 and self.features != "gradient":
             raise ValueError(
-                'passes > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
+                'refinement_steps > 1 needs features = "gradient": others are the same in every pass'
+            )
+        if self.refinement_steps > 1 and self.output == "acceleration":
+            raise ValueError(
+                'refinement_steps > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
             )
         if not self.edge_latents and self.features != "gradient":
             raise ValueError(
@@ -137,7 +145,7 @@ class TrainConfig:
     warmup: int = 100  # iterations of linear warm-up
     clip_norm: float = 1.0  # of the global gradient (HOOD)
     # Train a start for the solver: with so many L-BFGS iterations behind the network a frame's optimum is found,
-    # from which excess and distance are measured, and the trajectory goes on. 0 trains a network of its own.
+    # from which gap and distance are measured, and the trajectory goes on. 0 trains a network of its own.
     corrector_steps: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment
@@ -149,8 +157,8 @@ class TrainConfig:
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
-    # Energies of which passes count: all, the last one's, or each by the share of its excess that it leaves.
-    pass_weights: Literal["equal", "last", "contraction"] = "equal"
+    # Energies of which passes count: all, the last one's, or each by the share of its gap that it leaves.
+    refinement_weights: Literal["equal", "last", "contraction"] = "equal"
     max_skipped: int = 100  # non-finite updates skipped before training stops
     log_every: int = 100
     checkpoint_every: int = 1000

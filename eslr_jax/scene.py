@@ -167,8 +167,8 @@ def _surface_near(is_near: np.ndarray, body: Body | BodyMotion) -> BodySurface |
     is_kept = is_near[faces].any(axis=1)
     if not is_kept.any():
         return None
-    rim = np.intersect1d(faces[is_kept], faces[~is_kept])
-    return prepare_surface(np.asarray(body.rest_positions), faces[is_kept], rim=rim)
+    boundary = np.intersect1d(faces[is_kept], faces[~is_kept])
+    return prepare_surface(np.asarray(body.rest_positions), faces[is_kept], boundary=boundary)
 
 
 def _looseness(garment: Garment, body: Body | BodyMotion) -> np.ndarray:

@@ -94,7 +94,7 @@ class BodySurface:
     patch_centers: Int[Array, " patches"]  # a vertex of each patch
     patch_vertices: Int[Array, "patches members"]  # padded by repetition
     vertex_faces: Int[Array, "surface_vertices candidates"]  # padded by repetition
-    is_rim: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
+    is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
 
 
 @struct.dataclass

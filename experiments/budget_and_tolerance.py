@@ -29,7 +29,7 @@ from eslr_jax.evaluation.calibrate import (
     read_calibration,
     simulator_of,
 )
-from eslr_jax.evaluation.excess import trajectory_excess
+from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
@@ -42,15 +42,15 @@ RESULTS = Path(__file__).parent / "results"
 GARMENTS = ("tshirt", "dress", "pants")
 TOLERANCES = (0.01, 0.001)
 BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration knows of
-EVERY = 5  # frames between those whose excess is measured
+EVERY = 5  # frames between those whose gap is measured
 
 
 def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, float]:
-    """Return the excess of frames of a free rollout over their drop, and the mean of iterations spent."""
+    """Return the gap of frames of a free rollout over their drop, and the mean of iterations spent."""
     params, config = simulator_of(choice.method, tolerance=choice.tolerance)
     parameters = PhysicsParameters()
     trajectory = simulate_scene(params, scene, parameters, config, choice.iterations)
-    ends = trajectory_excess(trajectory, scene, parameters, every=every)
+    ends = trajectory_gap(trajectory, scene, parameters, every=every)
     shares = np.asarray(ends.share(ends.answer))
     return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
 
@@ -116,8 +116,8 @@ def main() -> None:
                 "methods": sorted({choice.method for choice in chosen[tolerance]}),
                 "frames": len(joined),
                 "kept": float(np.mean(joined <= tolerance)),
-                "excess_relative_median": float(np.median(joined)),
-                "excess_relative_p99": float(np.quantile(joined, 0.99)),
+                "gap_relative_median": float(np.median(joined)),
+                "gap_relative_p99": float(np.quantile(joined, 0.99)),
                 "iterations_mean": float(np.mean(spent[tolerance])),
                 "iterations_allowed": max(choice.iterations for choice in chosen[tolerance]),
             }

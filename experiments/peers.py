@@ -7,12 +7,12 @@
 All methods step the same frame one after the other, then all the next one, so that whatever disturbs the machine
 disturbs all; times are medians over frames, kernels compiled and first frames run before. `frame_cpu_ms` counts
 processor time: Newton uses one core, ours all that it gets, so give the process one core to compare them
-(`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The excess is
+(`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The gap is
 teacher-forced: one frame from states of our near-optimal rollout, potential of our definition minus its minimum,
-over the frame's drop. A method with substeps solves a finer problem than that; the row of our own solver with
-substeps shows what this alone costs. The excess on its own rollout is that of the frames that a method simulated.
+over the initial gap. A method with substeps solves a finer problem than that; the row of our own solver with
+substeps shows what this alone costs. The gap on its own rollout is that of the frames that a method simulated.
 
-Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced excess.
+Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced gap.
 Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a Python with `bpy`
 (`python3.11 -m venv blender && blender/bin/pip install bpy`). What is missing is left out. Writes peers.json.
 """
@@ -40,7 +40,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import MissingExtraError
 from eslr_jax.evaluation.calibrate import device_name, example_scene
-from eslr_jax.evaluation.excess import answer_potentials, trajectory_excess, trajectory_states
+from eslr_jax.evaluation.gap import answer_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.hard_cases.simulators import split_frames
 from eslr_jax.evaluation.referee import Referee
@@ -69,7 +69,7 @@ SETTINGS = (
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
 BLENDER = ((5, 2), (15, 2), (45, 2))  # steps per frame, rounds of collision per step
 OURS = ((1, 10), (1, 20), (1, 50), (1, 100), (5, 50))  # substeps, iterations of L-BFGS
-EVERY = 6  # frames between those whose excess is measured
+EVERY = 6  # frames between those whose gap is measured
 TIMED_FRAMES = 20  # of `peer_points`
 
 Step = Callable[[ClothState, int], ClothState]  # from a state at a frame to the next
@@ -163,7 +163,7 @@ def take_turns(
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the excess [J] of one frame of every method from some states of a rollout, and the frames' drops.
+    """Return the gap [J] of one frame of every method from some states of a rollout, and the frames' drops.
 
     Args:
         methods: On the scene.
@@ -172,19 +172,19 @@ def teach(
         every: Frames between the states.
     """
     parameters = PhysicsParameters()
-    ends = trajectory_excess(truth, scene, parameters, every=every)
+    ends = trajectory_gap(truth, scene, parameters, every=every)
     states, inputs = trajectory_states(truth, scene, parameters)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
     frames = range(1, scene.num_frames - 1, every)
-    excess = []
+    gap = []
     for method in methods:
         answers = [
             method.step(jax.tree.map(lambda leaf, f=frame: leaf[f], states), frame).position
             for frame in frames
         ]
         reached = answer_potentials(jnp.stack(answers), *taken, scene, parameters)
-        excess.append(np.asarray(reached - ends.optimum))
-    return excess, np.asarray(ends.drop)
+        gap.append(np.asarray(reached - ends.optimum))
+    return gap, np.asarray(ends.initial_gap)
 
 
 @jax.jit
@@ -217,14 +217,14 @@ def count_intersections(position: np.ndarray, scene: Scene) -> dict[str, int | N
 
 
 def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[str, Any]:
-    """Return the measures of a free rollout, excess every so many frames; None where it did not stay finite."""
+    """Return the measures of a free rollout, gap every so many frames; None where it did not stay finite."""
     is_finite = bool(np.isfinite(positions).all())
     row: dict[str, Any] = {"finite": is_finite, "stretch_p99": None, "penetration_p999_mm": None}
-    row["excess_relative_own"] = None
+    row["gap_relative_own"] = None
     if not is_finite:
         return row
-    ends = trajectory_excess(trajectory_of(positions, scene), scene, PhysicsParameters(), every=every)
-    row["excess_relative_own"] = float(np.median(ends.share(ends.answer)))
+    ends = trajectory_gap(trajectory_of(positions, scene), scene, PhysicsParameters(), every=every)
+    row["gap_relative_own"] = float(np.median(ends.share(ends.answer)))
     stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
     is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
     row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))
@@ -244,7 +244,7 @@ def measure_scene(
     methods = [our_method(scene, *effort) for effort in efforts] + newton_methods(scene, settings)
     truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
-    excess, drop = teach(methods, scene, truth, every)
+    gap, drop = teach(methods, scene, truth, every)
     rows = [
         {
             "method": method.name,
@@ -252,7 +252,7 @@ def measure_scene(
             "frame_ms": float(np.median(wall[k])),
             "frame_cpu_ms": float(np.median(processor[k])),
             **describe_rollout(positions[k], scene, every),
-            **summarize_excess(excess[k], drop),
+            **summarize_gap(gap[k], drop),
         }
         for k, method in enumerate(methods)
     ]
@@ -277,13 +277,13 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int)
     ]
 
 
-def summarize_excess(excess: np.ndarray, drop: np.ndarray) -> dict[str, float | None]:
+def summarize_gap(gap: np.ndarray, drop: np.ndarray) -> dict[str, float | None]:
     """Return medians and largest values; None where an answer was not finite."""
-    excess = np.maximum(excess, 0.0)
+    gap = np.maximum(gap, 0.0)
     values = {
-        "excess_relative_median": np.median(excess / drop),
-        "excess_relative_max": np.max(excess / drop),
-        "excess_j_median": np.median(excess),
+        "gap_relative_median": np.median(gap / drop),
+        "gap_relative_max": np.max(gap / drop),
+        "gap_j_median": np.median(gap),
     }
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
@@ -302,8 +302,8 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
         truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
-        excess, drop = teach(of_scene, scene, truth, EVERY)
-        relative.append([np.maximum(values, 0.0) / drop for values in excess])
+        gap, drop = teach(of_scene, scene, truth, EVERY)
+        relative.append([np.maximum(values, 0.0) / drop for values in gap])
     points: dict[str, list[dict[str, Any]]] = {}
     for k, method in enumerate(methods[0]):
         shares = np.concatenate([values[k] for values in relative])
@@ -312,8 +312,8 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
                 {
                     "iterations": method.effort,
                     "frame_ms": float(np.median(wall[k])),
-                    "excess_relative_median": float(np.median(shares)),
-                    "excess_relative_p99": float(np.quantile(shares, 0.99)),
+                    "gap_relative_median": float(np.median(shares)),
+                    "gap_relative_p99": float(np.quantile(shares, 0.99)),
                 }
             )
     return points
@@ -324,8 +324,8 @@ COLUMNS = {
     "effort": "substeps x iterations",
     "frame_ms": "ms a frame",
     "frame_cpu_ms": "CPU ms",
-    "excess_relative_median": "excess, median [%]",
-    "excess_relative_own": "on its own rollout [%]",
+    "gap_relative_median": "gap, median [%]",
+    "gap_relative_own": "on its own rollout [%]",
     "stretch_p99": "stretch, 99 %",
     "penetration_p999_mm": "penetration, 99.9 % [mm]",
     "intersections_body": "pairs with the body",
@@ -341,7 +341,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             return "-"
         if not isinstance(value, float):
             return str(value)
-        scaled = 100 * value if name.startswith("excess_relative") else value
+        scaled = 100 * value if name.startswith("gap_relative") else value
         return f"{scaled:.3g}" if abs(scaled) < 1e3 else f"{scaled:.0f}"
 
     lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]

@@ -28,7 +28,7 @@ import numpy as np
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.hard_cases.body import drop_scene
 from eslr_jax.evaluation.report import environment
 from eslr_jax.models.registry import MODELS, init_model
@@ -152,7 +152,7 @@ def measure_scene(name: str, frames: int, newton_iterations: int) -> dict:
     result: dict = {
         "vertices": int(np.sum(np.asarray(garment.vertex_mask))),
         "frames": len(measured),
-        "drop_j": {"median": float(np.median(drop)), "least": float(drop.min())},
+        "initial_gap_j": {"median": float(np.median(drop)), "least": float(drop.min())},
         "gap_median": {kind: by_count(np.median(gap, axis=0)) for kind, gap in gaps.items()},
         "gap_largest": {kind: by_count(np.max(gap, axis=0)) for kind, gap in gaps.items()},
     }

@@ -1,4 +1,4 @@
-"""Speed against error: excess over the optimum against time per frame, for the solver, networks and both.
+"""Speed against error: optimality gap against time per frame, for the solver, networks and both.
 
     python experiments/speed_vs_error.py                 # 1k and 4k, about half an hour on two cores
     python experiments/speed_vs_error.py --sizes 10k     # joins the sizes that the file already holds
@@ -29,7 +29,7 @@ from eslr_jax.evaluation.calibrate import (
     Method,
     device_name,
     example_scene,
-    interpolate_excess,
+    interpolate_gap,
     measure_methods,
     simulator_of,
 )
@@ -45,15 +45,15 @@ ROLLOUTS = (5, 10, 20, 50, 100), (0, 5, 20)  # iterations of free rollouts, by t
 
 
 def points(method: Method) -> list[dict]:
-    """Return a method's measured points: iterations, milliseconds, relative excess."""
+    """Return a method's measured points: iterations, milliseconds, relative gap."""
     return [
         {
             "iterations": int(count),
             "frame_ms": method.fixed_ms + int(count) * method.iteration_ms,
-            "excess_relative_median": excess,
-            "excess_relative_p99": method.p99[count],
+            "gap_relative_median": gap,
+            "gap_relative_p99": method.p99[count],
         }
-        for count, excess in method.median.items()
+        for count, gap in method.median.items()
     ]
 
 
@@ -71,7 +71,7 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
 
 
 def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
-    """Return, for a range of budgets, the excess of every method within them.
+    """Return, for a range of budgets, the gap of every method within them.
 
     Ours can take any number of iterations between those that were measured; a peer's settings are single points,
     of which the best counts.
@@ -80,10 +80,10 @@ def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
     most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
 
     def within(name: str, budget: float) -> float | None:
-        curve = {entry["frame_ms"]: entry["excess_relative_median"] for entry in by_name[name]}
+        curve = {entry["frame_ms"]: entry["gap_relative_median"] for entry in by_name[name]}
         if name in peers:
-            return min((excess for time, excess in curve.items() if time <= budget), default=None)
-        return interpolate_excess(curve, budget) if budget >= min(curve) else None
+            return min((gap for time, gap in curve.items() if time <= budget), default=None)
+        return interpolate_gap(curve, budget) if budget >= min(curve) else None
 
     return [
         {"budget_ms": float(budget), **{name: within(name, budget) for name in by_name}}
@@ -107,16 +107,14 @@ def draw(result: dict, path: Path) -> None:
     )
     for axis, size in zip(axes[0], sizes, strict=True):
         for name, entries in result["sizes"][size]["methods"].items():
-            shown = [entry for entry in entries if entry["excess_relative_median"] > 1e-6]
+            shown = [entry for entry in entries if entry["gap_relative_median"] > 1e-6]
             label = "L-BFGS" if name == SOLVER else name if name in peers else f"{name} + L-BFGS"
-            times, errors = (
-                [entry[key] for entry in shown] for key in ("frame_ms", "excess_relative_median")
-            )
+            times, errors = ([entry[key] for entry in shown] for key in ("frame_ms", "gap_relative_median"))
             (lines[label],) = axis.loglog(times, errors, "o-", color=colors[name], markersize=4)
             for entry in shown:
                 axis.annotate(
                     str(entry["iterations"]),
-                    (entry["frame_ms"], entry["excess_relative_median"]),
+                    (entry["frame_ms"], entry["gap_relative_median"]),
                     fontsize=7,
                     textcoords="offset points",
                     xytext=(3, 3),
@@ -124,7 +122,7 @@ def draw(result: dict, path: Path) -> None:
         axis.set_title(f"{size} vertices")
         axis.set_xlabel("time per frame [ms]")
         axis.grid(True, which="both", alpha=0.2)
-    axes[0][0].set_ylabel("excess over the optimum / the frame's drop (median)")
+    axes[0][0].set_ylabel("optimality gap / the initial gap (median)")
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize=8)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
@@ -198,7 +196,7 @@ def main() -> None:
 
 
 def print_budgets(size: str, rows: list[dict]) -> None:
-    """Print the best excess of every method within each budget."""
+    """Print the best gap of every method within each budget."""
     print(size)
     for row in rows:
         cells = ", ".join(

@@ -38,7 +38,7 @@ def test_nested_unknown_key_names_its_table():
         ({"latent_size": True}, "wrong type"),
         ({"latent_size": 0}, "latent_size must be at least 1"),
         ({"features": "magic"}, "not one of"),
-        ({"passes": 3}, "passes > 1 needs"),
+        ({"refinement_steps": 3}, "refinement_steps > 1 needs"),
         ({"output_scale": -1.0}, "must be positive"),
     ],
 )
@@ -52,11 +52,11 @@ def test_configs_are_hashable_static_arguments():
 
 
 def test_overrides_reach_into_tables():
-    values = {"model": {"passes": 1}}
-    apply_overrides(values, dict([parse_override("model.passes=4"), parse_override("split=test")]))
-    assert values == {"model": {"passes": 4}, "split": "test"}
+    values = {"model": {"refinement_steps": 1}}
+    apply_overrides(values, dict([parse_override("model.refinement_steps=4"), parse_override("split=test")]))
+    assert values == {"model": {"refinement_steps": 4}, "split": "test"}
     with pytest.raises(ConfigError, match="key=value"):
-        parse_override("passes")
+        parse_override("refinement_steps")
     with pytest.raises(ConfigError, match="not a table"):
         apply_overrides({"split": "train"}, {"split.x": 1})
 
@@ -64,8 +64,8 @@ def test_overrides_reach_into_tables():
 def test_recipe_takes_a_model_by_name(tmp_path):
     path = tmp_path / "recipe.toml"
     path.write_text('model = "eslr-small"\niterations = 10\n')
-    config = load_recipe(path, {"model.passes": 2})
-    assert (config.iterations, config.model.passes, config.model.latent_size) == (10, 2, 32)
+    config = load_recipe(path, {"model.refinement_steps": 2})
+    assert (config.iterations, config.model.refinement_steps, config.model.latent_size) == (10, 2, 32)
     assert from_dict(TrainConfig, json.loads(json.dumps(to_dict(config)))) == config
 
 

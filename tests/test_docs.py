@@ -19,7 +19,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # Commands of ```bash blocks are run as they stand, apart from what would only take time:
 SHORTER = {
     "train": ["--set", "iterations=1"],
-    "evaluate": ["--excess-frames", "3", "--every", "1", "--rollout-frames", "4", "--garments", "tshirt"],
+    "evaluate": ["--gap-frames", "3", "--every", "1", "--rollout-frames", "4", "--garments", "tshirt"],
     "simulate": ["--frames", "3"],
 }
 # ```console blocks need what a test has not (a network, minutes of an idle machine, several machines): their

@@ -17,8 +17,8 @@ from eslr_jax.assets import load_garment_file
 from eslr_jax.cli.runs import render
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.excess import trajectory_states
-from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, excess_shares, run_field
+from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
 from eslr_jax.io.garment import write_garment_npz
 from eslr_jax.io.run import read_run
@@ -101,13 +101,13 @@ def test_excess_shares_add_up_to_what_the_answer_is_above_the_optimum(runs, last
     problem, garment, material = last_problem
     answer = start_guess(problem, garment)
     minimum = solve(problem, garment, material, answer, iterations=500, memory=8, tolerance=1e-3)
-    excess = float(potential(answer, problem, garment, material) - minimum.value)
-    shares = np.asarray(excess_shares(answer, problem, garment, material))
-    assert excess > 1e-3
-    assert shares.sum() == pytest.approx(excess, rel=0.01)  # contacts have kinks
-    assert -shares[shares < 0].sum() < 0.5 * excess
-    at_optimum = excess_shares(minimum.position, problem, garment, material)
-    assert abs(float(at_optimum.sum())) < 0.01 * excess
+    gap = float(potential(answer, problem, garment, material) - minimum.value)
+    shares = np.asarray(gap_shares(answer, problem, garment, material))
+    assert gap > 1e-3
+    assert shares.sum() == pytest.approx(gap, rel=0.01)  # contacts have kinks
+    assert -shares[shares < 0].sum() < 0.5 * gap
+    at_optimum = gap_shares(minimum.position, problem, garment, material)
+    assert abs(float(at_optimum.sum())) < 0.01 * gap
 
 
 def test_repulsion_counts_where_layers_meet():
@@ -134,7 +134,7 @@ def test_repulsion_counts_where_layers_meet():
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
-    ("excess", {"contact_faces": None, "body_rest_positions": None}, "rest pose, which contacts need"),
+    ("gap", {"contact_faces": None, "body_rest_positions": None}, "rest pose, which contacts need"),
     ("friction-energy", {"body_positions": None, "body_faces": None}, "has no body, and so no friction-energy"),
     ("distance", {"body_positions": None, "body_faces": None}, "has no body"),
 ])  # fmt: skip
@@ -285,7 +285,7 @@ def test_page_in_headless_chromium(view, tmp_path):
 
         until(lambda red, green, blue: (blue > red + 40) & (blue > 90), 1500)  # two blue garments
         view.controls["frame"].value = 1
-        view.controls["color"].value = "excess"
+        view.controls["color"].value = "gap"
         show(view)
         until(
             lambda red, green, blue: (np.minimum(red, green) > blue + 60) & (green > 0.8 * red), 30

@@ -318,7 +318,7 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     """Load a trained network.
 
     Args:
-        name: Name of a bundled model, or path of an exported npz file; `NAME:PASSES` takes more or fewer passes
+        name: Name of a bundled model, or path of an exported npz file; `NAME:STEPS` takes more or fewer passes
             per frame than it was trained with, for less error or less time.
 
     Returns:
@@ -333,7 +333,7 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     params, config, _ = read_weights(Path(model) if _is_path(model) else find_asset("model", model))
     if parts:
         try:
-            config = dataclasses.replace(config, passes=int(parts[2]))
+            config = dataclasses.replace(config, refinement_steps=int(parts[2]))
         except ValueError as error:
             raise AssetError(f"model {name}: {error}") from error
     return params, config

@@ -92,7 +92,7 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
         measured = run(models or (START_MODEL, default_model()))
     path = out or cache_path()
     write_calibration(measured, path)
-    table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "excess after 20", box=None)
+    table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "gap after 20", box=None)
     for method in measured.methods:
         table.add_row(
             method.name,

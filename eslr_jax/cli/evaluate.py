@@ -22,12 +22,12 @@ def evaluate(
     garments: tuple[str, ...] = (),
     clips: tuple[str, ...] = (),
     corrector_steps: int = 0,
-    excess_frames: int = 40,
+    gap_frames: int = 40,
     every: int = 4,
     rollout_frames: int = 300,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Evaluate a network on a split: excess over the optimum, and free rollouts.
+    """Evaluate a network on a split: optimality gap, and free rollouts.
 
     Args:
         model: Name of a bundled network, or an exported file.
@@ -36,7 +36,7 @@ def evaluate(
         garments: Only these; the training garments if not given.
         clips: Only these; all of the split if not given.
         corrector_steps: Solver iterations behind the network.
-        excess_frames: Frames of each clip from which the excess is measured.
+        gap_frames: Frames of each clip from which the gap is measured.
         every: Of those, measure one in so many.
         rollout_frames: Length of the free rollouts; clips are played back and forth.
         json_: Print as JSON.
@@ -52,7 +52,7 @@ def evaluate(
         garments=garments,
         clips=clips,
         vertices=vertices,
-        excess_frames=excess_frames,
+        gap_frames=gap_frames,
         every=every,
         rollout_frames=rollout_frames,
     )
@@ -70,7 +70,7 @@ def evaluate(
         print(json.dumps(result, indent=2))
         return
     table = Table(
-        "", "excess, median [mJ]", "relative to the drop", "on the model's own states [mJ]", box=None
+        "", "gap, median [mJ]", "relative to the initial gap", "on the model's own states [mJ]", box=None
     )
     own = result["on_policy"]
     rows = {model: (result, own)}
@@ -78,9 +78,9 @@ def evaluate(
     for label, (forced, policy) in rows.items():
         table.add_row(
             label,
-            f"{forced['excess_median_j'] * 1e3:.3f}",
-            f"{forced['excess_relative_median']:.4f}",
-            f"{policy['excess_median_j'] * 1e3:.3f}",
+            f"{forced['gap_median_j'] * 1e3:.3f}",
+            f"{forced['gap_relative_median']:.4f}",
+            f"{policy['gap_median_j'] * 1e3:.3f}",
         )
     Console().print(table, markup=False)
     print(json.dumps(result["rollout"], indent=2))

@@ -47,7 +47,7 @@ def render(
         "collision-energy",
         "friction-energy",
         "repulsion-energy",
-        "excess",
+        "gap",
         "distance",
     ] = "fabric",
     camera: str = "front",

@@ -66,7 +66,7 @@ def simulate(
         corrector_steps: Solver iterations behind the network, 10 if not given; 0 is the network alone.
         budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it,
             and keep to it while it runs.
-        tolerance: Excess over the optimum relative to what a frame gains, such as 1%: choose the fastest
+        tolerance: OptimalityOptimality gap relative to what a frame gains, such as 1%: choose the fastest
             simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.
         joint_map: JSON file of changes to the map of joints that `eslr joints` shows.
         motion_up: Axis that points up in a BVH motion.
@@ -248,10 +248,17 @@ def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: d
 
     faces = np.asarray(scene.garment.faces)
     timestep = float(poses.timestep)
-    contact_faces, contact_rim, surface = np.empty((0, 3), np.int32), np.empty(0, np.int32), scene.surface
+    contact_faces, contact_boundary, surface = (
+        np.empty((0, 3), np.int32),
+        np.empty(0, np.int32),
+        scene.surface,
+    )
     if surface is not None:
         vertex_ids = np.asarray(surface.vertex_ids)
-        contact_faces, contact_rim = vertex_ids[np.asarray(surface.faces)], vertex_ids[surface.is_rim]
+        contact_faces, contact_boundary = (
+            vertex_ids[np.asarray(surface.faces)],
+            vertex_ids[surface.is_boundary],
+        )
     write_trajectory(
         out / "trajectory.npz",
         positions=positions,
@@ -262,7 +269,7 @@ def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: d
         body_faces=np.asarray(poses.faces),
         body_rest_positions=np.asarray(poses.rest_positions),
         contact_faces=contact_faces,
-        contact_rim=contact_rim,
+        contact_boundary=contact_boundary,
         metadata=report,
     )
     meshes, skinned = [AnimatedMesh("garment", positions, faces)], None

@@ -43,7 +43,7 @@ def train(
     Args:
         out: Folder of metrics, checkpoints and the exported model.
         config: TOML file of a training configuration; not needed with --resume.
-        set_: Changes to the configuration, as key=value with dots for tables, e.g. model.passes=4.
+        set_: Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4.
         resume: Go on from the newest checkpoint of the folder.
         start_from: Name of a bundled network or an exported file whose weights to start from.
         tensorboard: Write event files for TensorBoard too.

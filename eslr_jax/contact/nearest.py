@@ -15,7 +15,7 @@ _NEAREST_PATCHES = 4  # patches whose vertices are tried
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
 _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
-_ON_RIM = 0.999  # share of a point's weights on rim vertices above which it lies on the rim
+_ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 
 
@@ -205,10 +205,10 @@ def find_both_sides(
 
     vertex = _nearest_vertex(point, body_points, surface, is_excluded)
     opposite = _nearest_on_faces(point, body_points, surface, vertex)
-    across = _contacts_at(opposite, position, body, next_body, normals, surface)
-    is_facing = jnp.sum(across.normals * contacts.normals, axis=-1) < _OPPOSED
-    is_outside = across.distances > -_TOUCHING
-    return contacts, across.replace(is_near=across.is_near & is_facing & is_outside)
+    opposing = _contacts_at(opposite, position, body, next_body, normals, surface)
+    is_facing = jnp.sum(opposing.normals * contacts.normals, axis=-1) < _OPPOSED
+    is_outside = opposing.distances > -_TOUCHING
+    return contacts, opposing.replace(is_near=opposing.is_near & is_facing & is_outside)
 
 
 def _contacts_at(
@@ -221,7 +221,7 @@ def _contacts_at(
 ) -> Contacts:
     """Carry located body points to t + 1, with their tangent planes.
 
-    Where the surface ends, cloth beyond its rim is not in contact: the tangent plane there says nothing, and
+    Where the surface ends, cloth beyond its boundary is not in contact: the tangent plane there says nothing, and
     the nearest point of the whole body, which the surface is a part of, is another one.
     """
     next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
@@ -230,17 +230,19 @@ def _contacts_at(
     here = safe_normalize(interpolate(normals, location, surface))
     side = jnp.sum((position - points) * here, axis=-1)
     distance = jnp.sqrt(location.squared_distance)
-    on_rim = surface.is_rim[surface.faces[location.face]]
-    is_on_rim = sum(jnp.where(on_rim[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_RIM
+    on_boundary = surface.is_boundary[surface.faces[location.face]]
+    is_on_boundary = (
+        sum(jnp.where(on_boundary[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY
+    )
     return Contacts(
         points=points,
         next_points=next_points,
         normals=here,
         next_normals=safe_normalize(interpolate(next_normals, location, surface)),
-        distances=jnp.where((side < 0) & ~is_on_rim, -distance, distance),
+        distances=jnp.where((side < 0) & ~is_on_boundary, -distance, distance),
         # A limb that comes closer during the frame would otherwise jump over cloth that is far at t.
         is_near=(distance - jnp.maximum(approach(points, next_points, here), 0.0) < CONTACT_RADIUS)
-        & ~is_on_rim,
+        & ~is_on_boundary,
     )
 
 

@@ -13,14 +13,14 @@ _CANDIDATE_FACES = 20  # faces tried around the nearest vertex: its own and most
 
 
 def prepare_surface(
-    rest_positions: np.ndarray, faces: np.ndarray, *, rim: np.ndarray | None = None
+    rest_positions: np.ndarray, faces: np.ndarray, *, boundary: np.ndarray | None = None
 ) -> BodySurface:
     """Build the search tables of a body surface.
 
     Args:
         rest_positions: All body vertices in any pose without self-contact [m], shape [body_vertices, 3].
         faces: The faces to keep, shape [surface_faces, 3]; other vertices are dropped.
-        rim: Body vertices where the body goes on with faces that are not kept, shape [rim_vertices]; cloth
+        boundary: Body vertices where the body goes on with faces that are not kept, shape [boundary_vertices]; cloth
             beyond them is not in contact. None if all that the body has is kept.
     """
     vertex_ids, flat = np.unique(faces, return_inverse=True)
@@ -34,7 +34,7 @@ def prepare_surface(
         patch_centers=jnp.asarray(centers, jnp.int32),
         patch_vertices=jnp.asarray(patch_vertices, jnp.int32),
         vertex_faces=jnp.asarray(_candidate_faces(positions, faces), jnp.int32),
-        is_rim=jnp.asarray(np.isin(vertex_ids, [] if rim is None else rim)),
+        is_boundary=jnp.asarray(np.isin(vertex_ids, [] if boundary is None else boundary)),
     )
 
 

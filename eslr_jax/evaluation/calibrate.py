@@ -19,7 +19,7 @@ from eslr_jax.assets.catalog import data_folder
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation.excess import Excess, measure_excess
+from eslr_jax.evaluation.gap import OptimalityGap, measure_gap
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import Name, time_in_turns
 from eslr_jax.io.atomic import atomic_write
@@ -34,12 +34,12 @@ SOLVER = "solver"
 _CLIP = "cmu_016_22"  # of the training split, so that the choice has not seen the test clips
 _GARMENTS = ("tshirt", "dress")
 _FRAMES = 60
-_EVERY = 3  # frames between those whose excess is measured
+_EVERY = 3  # frames between those whose gap is measured
 _TRUTH_ITERATIONS = 100  # of the rollouts that supply the states
 _TIMED_FRAMES = 20
 _TIMED_ITERATIONS = (10, 60)
 _TURNS = 9  # timings of each, in turns; medians count
-_STOPS_AT = 0.04  # of the tolerance: the median excess where frames stop, on test clips at 1k
+_STOPS_AT = 0.04  # of the tolerance: the median gap where frames stop, on test clips at 1k
 _FEWEST = 5  # iterations, to keep a budget: with five a network's rollouts hold together, with none not
 _MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
@@ -52,7 +52,7 @@ class Method:
     vertices: int
     fixed_ms: float  # per frame: contacts, and the network's passes
     iteration_ms: float  # per L-BFGS iteration
-    median: dict[str, float]  # excess relative to the frame's drop after so many iterations
+    median: dict[str, float]  # gap relative to the initial gap after so many iterations
     p99: dict[str, float]  # the same, not exceeded by 99 % of the frames
 
 
@@ -74,7 +74,7 @@ class Choice:
     fixed_ms: float  # of the method, scaled to the garment
     iteration_ms: float
     expected_ms: float
-    expected_excess: float  # median, relative to the frame's drop
+    expected_gap: float  # median, relative to the initial gap
     reason: str
 
 
@@ -111,7 +111,7 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
     _, solver = simulator_of(SOLVER)
     truths = [simulate_scene(None, scene, PhysicsParameters(), solver, _TRUTH_ITERATIONS) for scene in scenes]
     measured = {
-        name: [_measure_excess(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
+        name: [_measure_gap(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
         for name in names
     }
     optima = [
@@ -121,8 +121,8 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
     fixed_ms, iteration_ms = fit_costs(time_frames(runs, scenes[0]))
     num_vertices = int(np.sum(scenes[0].garment.vertex_mask))
     return [
-        Method(name, num_vertices, fixed_ms[name], iteration_ms, *_quantiles(name, excesses, optima))
-        for name, excesses in measured.items()
+        Method(name, num_vertices, fixed_ms[name], iteration_ms, *_quantiles(name, gaps, optima))
+        for name, gaps in measured.items()
     ]
 
 
@@ -150,12 +150,12 @@ def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, f
     }, iteration_ms
 
 
-def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
+def _measure_gap(name: str, scene: Scene, truth: Trajectory) -> OptimalityGap:
     """Return the potentials that a method leaves after every count of `ITERATIONS`, as NumPy arrays."""
     params, config = simulator_of(name)
     is_solver = name == SOLVER
     return jax.device_get(
-        measure_excess(
+        measure_gap(
             params,
             truth,
             scene,
@@ -169,11 +169,11 @@ def _measure_excess(name: str, scene: Scene, truth: Trajectory) -> Excess:
 
 
 def _quantiles(
-    name: str, excesses: list[Excess], optima: list[np.ndarray]
+    name: str, gaps: list[OptimalityGap], optima: list[np.ndarray]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the median and the 99 % quantile of a method's relative excess over all scenes, by iterations."""
+    """Return the median and the 99 % quantile of a method's relative gap over all scenes, by iterations."""
     relative: dict[int, list[np.ndarray]] = {}
-    for ends, optimum in zip(excesses, optima, strict=True):
+    for ends, optimum in zip(gaps, optima, strict=True):
         best = ends._replace(optimum=optimum)
         for count, energy in (ends.solver if name == SOLVER else ends.corrected).items():
             relative.setdefault(count, []).append(np.asarray(best.share(energy)))
@@ -234,7 +234,7 @@ def choose(
     budget_ms: float | None = None,
     tolerance: float | None = None,
 ) -> Choice:
-    """Choose a simulator for a time per frame, or for an excess relative to the frame's drop.
+    """Choose a simulator for a time per frame, or for a gap relative to the initial gap.
 
     Costs are scaled in proportion to the number of vertices from the size that was measured nearest by.
 
@@ -242,7 +242,7 @@ def choose(
         calibration: Of this device.
         num_vertices: Of the garment.
         budget_ms: Milliseconds per frame to stay within.
-        tolerance: Relative excess to stay below on 99 % of the frames.
+        tolerance: Relative gap to stay below on 99 % of the frames.
 
     Raises:
         ConfigError: Neither or both are given, the budget is too small, or the tolerance out of reach.
@@ -280,12 +280,12 @@ def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
     for method in methods:
         count = _affordable(budget_ms, method.fixed_ms, method.iteration_ms)
         if count >= min(int(key) for key in method.median):
-            options.append((interpolate_excess(method.median, count), method, count))
+            options.append((interpolate_gap(method.median, count), method, count))
     if not options:
         least = min(method.fixed_ms + method.iteration_ms for method in methods)
         raise ConfigError(f"--budget {budget_ms:g}ms: the fastest frame here takes {least:.1f} ms")
     options.sort(key=lambda option: option[0])
-    excess, method, count = options[0]
+    gap, method, count = options[0]
     others = ", ".join(f"{other.name} {value:.2%}" for value, other, _ in options[1:])
     return Choice(
         method=method.name,
@@ -294,8 +294,8 @@ def _within_budget(methods: list[Method], budget_ms: float) -> Choice:
         fixed_ms=method.fixed_ms,
         iteration_ms=method.iteration_ms,
         expected_ms=method.fixed_ms + count * method.iteration_ms,
-        expected_excess=excess,
-        reason=f"least excess within {budget_ms:g} ms" + (f" (others: {others})" if others else ""),
+        expected_gap=gap,
+        reason=f"least gap within {budget_ms:g} ms" + (f" (others: {others})" if others else ""),
     )
 
 
@@ -303,10 +303,10 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
     options = []
     for method in methods:
         counts = range(min(int(key) for key in method.p99), ITERATIONS[-1] + 1)
-        kept = next((count for count in counts if interpolate_excess(method.p99, count) <= tolerance), None)
+        kept = next((count for count in counts if interpolate_gap(method.p99, count) <= tolerance), None)
         if kept is not None:
             stops_at = _STOPS_AT * tolerance
-            stops = (count for count in counts if interpolate_excess(method.median, count) <= stops_at)
+            stops = (count for count in counts if interpolate_gap(method.median, count) <= stops_at)
             count = max(kept, next(stops, counts[-1]))
             options.append((method.fixed_ms + count * method.iteration_ms, method, count))
     if not options:
@@ -322,7 +322,7 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
         fixed_ms=method.fixed_ms,
         iteration_ms=method.iteration_ms,
         expected_ms=cost,
-        expected_excess=interpolate_excess(method.median, count),
+        expected_gap=interpolate_gap(method.median, count),
         reason=f"fastest below {tolerance:.2%} on 99 % of frames"
         + (f" (others: {others})" if others else ""),
     )
@@ -351,11 +351,11 @@ def keep_budget(choice: Choice, budget_ms: float) -> Callable[[int, float], int]
     return pace
 
 
-def interpolate_excess(curve: Mapping[Any, float], place: float) -> float:
-    """Return a curve's excess at a place: between measurements its logarithm is linear, beyond them it stays.
+def interpolate_gap(curve: Mapping[Any, float], place: float) -> float:
+    """Return a curve's gap at a place: between measurements its logarithm is linear, beyond them it stays.
 
     Args:
-        curve: Relative excess by iterations or by milliseconds; keys are numbers, or their text as JSON has it.
+        curve: Relative gap by iterations or by milliseconds; keys are numbers, or their text as JSON has it.
         place: The same.
     """
     keys = sorted(curve, key=float)

@@ -1,4 +1,4 @@
-"""Evaluate a model on a split: excess over the optimum, and free rollouts (host)."""
+"""Evaluate a model on a split: optimality gap, and free rollouts (host)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError, MissingExtraError
-from eslr_jax.evaluation.excess import ITERATIONS, Excess, measure_excess
+from eslr_jax.evaluation.gap import ITERATIONS, OptimalityGap, measure_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.referee import Referee
 from eslr_jax.geometry.prepare import pad_alike
@@ -37,7 +37,7 @@ class EvaluationOptions:
     garments: tuple[str, ...] = ()  # empty: the training garments
     clips: tuple[str, ...] = ()  # empty: all of the split
     vertices: str = "1k"
-    excess_frames: int = 40  # frames of each clip for the excess
+    gap_frames: int = 40  # frames of each clip for the gap
     every: int = 4  # of those, measure one in so many
     rollout_frames: int = 300  # of the free rollout; clips are played back and forth
 
@@ -47,7 +47,7 @@ class EvaluationOptions:
         Raises:
             ConfigError: Names the field and the least value.
         """
-        for name, least in (("excess_frames", 3), ("every", 1), ("rollout_frames", 4)):
+        for name, least in (("gap_frames", 3), ("every", 1), ("rollout_frames", 4)):
             if getattr(self, name) < least:
                 raise ConfigError(
                     f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
@@ -72,7 +72,7 @@ def evaluate(
         on_scene: Called after each garment and clip with the count, the total and a label.
 
     Returns:
-        Plain values: teacher-forced and on-policy excess [J] beside that of L-BFGS from the same states, and
+        Plain values: teacher-forced and on-policy gap [J] beside that of L-BFGS from the same states, and
         the measures of free rollouts; per garment and clip under `scenes`.
 
     Raises:
@@ -95,7 +95,7 @@ def evaluate(
                 poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
                 return prepare_scene(cloth, poses, surface=surface)
 
-            on_truth, on_policy = _excesses(params, scene_of(options.excess_frames), config, options.every)
+            on_truth, on_policy = _gaps(params, scene_of(options.gap_frames), config, options.every)
             forced.append(on_truth)
             policy.append(on_policy)
             free = _free_rollout(params, scene_of(options.rollout_frames), config)
@@ -157,8 +157,8 @@ def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion
     )
 
 
-def _excesses(params: Any, scene, config: SimConfig, every: int) -> tuple[Excess, Excess]:
-    """Return the excess from the optimum's states and from those of the model's own rollout."""
+def _gaps(params: Any, scene, config: SimConfig, every: int) -> tuple[OptimalityGap, OptimalityGap]:
+    """Return the gap from the optimum's states and from those of the model's own rollout."""
     parameters = PhysicsParameters()
     truth = SimConfig(simulator="physics", solver_iterations=_TRUTH_ITERATIONS)
     measured = []
@@ -166,7 +166,7 @@ def _excesses(params: Any, scene, config: SimConfig, every: int) -> tuple[Excess
         trajectory = simulate_scene(weights, scene, parameters, simulator)
         measured.append(
             jax.device_get(
-                measure_excess(
+                measure_gap(
                     params,
                     trajectory,
                     scene,
@@ -180,22 +180,22 @@ def _excesses(params: Any, scene, config: SimConfig, every: int) -> tuple[Excess
     return measured[0], measured[1]
 
 
-def _summarize(measured: list[Excess]) -> dict[str, Any]:
-    """Return medians over all frames of all scenes: joules, and relative to the frame's own drop."""
+def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
+    """Return medians over all frames of all scenes: joules, and relative to the frame's own initial gap."""
 
-    def join(pick: Callable[[Excess], Any]) -> np.ndarray:
+    def join(pick: Callable[[OptimalityGap], Any]) -> np.ndarray:
         return np.concatenate([np.asarray(pick(entry)) for entry in measured])
 
     optimum = join(lambda entry: entry.optimum)
-    drop = join(lambda entry: entry.drop)
+    drop = join(lambda entry: entry.initial_gap)
 
     def medians(energy: np.ndarray) -> dict[str, float]:
-        excess = energy - optimum
+        gap = energy - optimum
         return {
-            "excess_median_j": float(np.median(excess)),
-            "excess_relative_median": float(np.median(excess / drop)),
-            "excess_mean_j": float(np.mean(excess)),
-            "excess_p90_j": float(np.quantile(excess, 0.9)),
+            "gap_median_j": float(np.median(gap)),
+            "gap_relative_median": float(np.median(gap / drop)),
+            "gap_mean_j": float(np.mean(gap)),
+            "gap_p90_j": float(np.quantile(gap, 0.9)),
         }
 
     lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}

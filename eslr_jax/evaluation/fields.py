@@ -1,4 +1,4 @@
-"""Values over a garment to colour it by: stretch, energies, excess over the optimum, distance to the body."""
+"""Values over a garment to colour it by: stretch, energies, optimality gap, distance to the body."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from eslr_jax.assets import prepare_stored
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.excess import map_answers, trajectory_states
+from eslr_jax.evaluation.gap import map_answers, trajectory_states
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.garment import GarmentFile
@@ -28,9 +28,9 @@ from eslr_jax.scene import initial_state
 from eslr_jax.simulate.step import FrameInput, solve
 from eslr_jax.types import ClothState, Garment, Material, Scene
 
-FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "excess", "distance")
+FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
-_CONTACT_FIELDS = ("collision-energy", "friction-energy", "excess")
+_CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
 _PARAMETERS = PhysicsParameters()
 _ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
 _QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
@@ -48,8 +48,8 @@ class Field(NamedTuple):
 def run_field(run: Run, name: str) -> Field:
     """Return a field of a run.
 
-    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies and `excess`
-    are those of the frame's minimisation problem, per area, see `energy_shares` and `excess_shares`; `distance`
+    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies and `gap`
+    are those of the frame's minimisation problem, per area, see `energy_shares` and `gap_shares`; `distance`
     is to the tangent plane of the nearest body vertex.
 
     Args:
@@ -73,7 +73,7 @@ def run_field(run: Run, name: str) -> Field:
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
     values = _problem_values(run, name, garment, material)
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
-    # A few vertices in hard contact hold a hundred times what others do, and shares of excess may be negative.
+    # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
     low, high = (
         (0.0, np.quantile(values, 0.99)) if name in _CONTACT_FIELDS else np.quantile(values, [0.001, 0.999])
     )
@@ -116,7 +116,7 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
             raise AssetError(f"{run.name} lacks its body's rest pose, which contacts need; simulate it again")
         if len(trajectory.contact_faces):
             surface = prepare_surface(
-                trajectory.body_rest_positions, trajectory.contact_faces, rim=trajectory.contact_rim
+                trajectory.body_rest_positions, trajectory.contact_faces, boundary=trajectory.contact_boundary
             )
             body = jnp.asarray(trajectory.body_positions)[:, surface.vertex_ids]
     return Scene(
@@ -156,8 +156,8 @@ def _every_frame(
     garment, material = scene.garment, scene.material
 
     def measure(answer: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
-        if name == "excess":
-            return excess_shares(answer, problem, garment, material)
+        if name == "gap":
+            return gap_shares(answer, problem, garment, material)
         return energy_shares(name.removesuffix("-energy"), answer, problem, garment, material)
 
     return map_answers(measure, answers, states, inputs, scene, _PARAMETERS, config)
@@ -205,14 +205,14 @@ def energy_shares(
     return jax.grad(total)(jnp.ones_like(garment.vertex_areas))
 
 
-def excess_shares(
+def gap_shares(
     position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
 ) -> Float[Array, " vertices"]:
-    """Share the excess over the optimum out over the vertices [J]; the shares add up to it.
+    """Share the optimality gap out over the vertices [J]; the shares add up to it.
 
     A vertex' share is the work that the forces left at it do on its straight way x* + s (x - x*) to the optimum,
     the integral of grad P . (x - x*) over s. The difference of the energies that a vertex holds here and there
-    would add up as well, but the terms trade energy at first order of x - x* while the excess is of the second:
+    would add up as well, but the terms trade energy at first order of x - x* while the gap is of the second:
     it would show the trade.
 
     Args:

@@ -62,7 +62,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     sort("self-contact", config.self_contact, "layers of cloth keep apart", "not asked for")
     varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
-    sort("network", config.simulator == "network", "passes before the solver", "solver alone")
+    sort("network", config.simulator == "network", "refinement_steps before the solver", "solver alone")
     return SceneParts(modelled, left_out)
 
 

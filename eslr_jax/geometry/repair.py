@@ -122,7 +122,7 @@ def consistent_orientation(
     # falls into two components, and its faces as they are lie in the one or the other.
     num_faces = len(faces)
     left, right = first // 3, second // 3
-    across = np.where(agrees, 0, num_faces)
+    opposing = np.where(agrees, 0, num_faces)
     rows = np.concatenate([left, left + num_faces])
     columns = np.concatenate([right + across, right + num_faces - across])
     graph = scipy.sparse.coo_array(

@@ -298,9 +298,9 @@ def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
     centered = positions - positions.mean(axis=0)
     triangles = [centered[faces]]
     for loop in boundary_loops(faces):
-        rim = centered[loop]
-        center = np.broadcast_to(rim.mean(axis=0), rim.shape)
-        triangles.append(np.stack([np.roll(rim, -1, axis=0), rim, center], axis=1))
+        boundary = centered[loop]
+        center = np.broadcast_to(boundary.mean(axis=0), boundary.shape)
+        triangles.append(np.stack([np.roll(boundary, -1, axis=0), boundary, center], axis=1))
     areas = [
         0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in triangles
     ]

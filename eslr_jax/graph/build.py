@@ -54,7 +54,7 @@ def build_graph(
     graph = build_frame_graph(garment, material, inputs, config)
     if config.features == "hood":
         return graph
-    return join_features(graph, build_pass_graph(garment, material, inputs, graph))
+    return join_features(graph, build_refinement_graph(garment, material, inputs, graph))
 
 
 def build_frame_graph(
@@ -108,7 +108,7 @@ def build_frame_graph(
     )
 
 
-def build_pass_graph(
+def build_refinement_graph(
     garment: Garment, material: Material, inputs: GraphInputs, frame: jraph.GraphsTuple
 ) -> jraph.GraphsTuple:
     """Build the features that change from pass to pass, over the topology of `frame`.
@@ -121,7 +121,7 @@ def build_pass_graph(
             raise ValueError(f'GraphInputs.{name} is required by features = "gradient"')
     edge_length = frame.globals["edge_length"]
     nodes = {
-        "garment": features.pass_node_features(
+        "garment": features.refinement_node_features(
             garment,
             material,
             inputs.guess,
@@ -134,11 +134,11 @@ def build_pass_graph(
             inputs.previous_gradient,
         )
     }
-    edges = {"mesh": features.pass_mesh_features(garment, inputs.guess, edge_length)}
+    edges = {"mesh": features.refinement_mesh_features(garment, inputs.guess, edge_length)}
     if "world" in frame.edges:
         selected = _selection(frame)
         contacts = _take_contacts(inputs.contacts, selected)
-        world = features.pass_world_features(_take(inputs.guess, selected), contacts)
+        world = features.refinement_world_features(_take(inputs.guess, selected), contacts)
         edges["world"] = _mask_rows(world, frame.globals["world_mask"])
         if "world_reverse" in frame.edges:
             edges["world_reverse"] = edges["world"]  # distances have no direction
@@ -167,10 +167,10 @@ def feature_sizes(config: ModelConfig) -> dict[str, int]:
             "world": features.HOOD_WORLD_SIZE,
         }
     return {
-        "garment": features.NODE_FRAME_SIZE + features.NODE_PASS_SIZE,
+        "garment": features.NODE_FRAME_SIZE + features.NODE_REFINEMENT_SIZE,
         "body": features.BODY_FRAME_SIZE,
-        "mesh": features.MESH_FRAME_SIZE + features.MESH_PASS_SIZE,
-        "world": features.WORLD_FRAME_SIZE + features.WORLD_PASS_SIZE,
+        "mesh": features.MESH_FRAME_SIZE + features.MESH_REFINEMENT_SIZE,
+        "world": features.WORLD_FRAME_SIZE + features.WORLD_REFINEMENT_SIZE,
     }
 
 

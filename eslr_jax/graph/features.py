@@ -194,9 +194,9 @@ def hood_reverse_signs(dtype) -> Float[Array, " 9"]:
 # --- gradient -----------------------------------------------------------------------------------------------
 # Every kind of row has features that stay for a frame, and features that change from pass to pass.
 
-NODE_FRAME_SIZE, NODE_PASS_SIZE = 14, 18
-MESH_FRAME_SIZE, MESH_PASS_SIZE = 8, 4
-WORLD_FRAME_SIZE, WORLD_PASS_SIZE = 10, 2
+NODE_FRAME_SIZE, NODE_REFINEMENT_SIZE = 14, 18
+MESH_FRAME_SIZE, MESH_REFINEMENT_SIZE = 8, 4
+WORLD_FRAME_SIZE, WORLD_REFINEMENT_SIZE = 10, 2
 BODY_FRAME_SIZE = 10
 
 
@@ -230,7 +230,7 @@ def frame_node_features(
     )
 
 
-def pass_node_features(
+def refinement_node_features(
     garment: Garment,
     material: Material,
     guess: Float[Array, "vertices 3"],
@@ -295,7 +295,7 @@ def frame_mesh_features(
     )
 
 
-def pass_mesh_features(
+def refinement_mesh_features(
     garment: Garment, guess: Float[Array, "vertices 3"], edge_length: Float[Array, ""]
 ) -> Float[Array, "edges 4"]:
     """Sender minus receiver at the guess 3, in mesh spacings, and its strain."""
@@ -333,7 +333,7 @@ def frame_world_features(
     )
 
 
-def pass_world_features(
+def refinement_world_features(
     guess: Float[Array, "world_edges 3"], contacts: Contacts
 ) -> Float[Array, "world_edges 2"]:
     """Signed distance of the guess to the body's next tangent plane, coarse and in contact widths."""

@@ -37,7 +37,7 @@ class GraphInputs:
     previous_gradient: Float[Array, "vertices 3"] | None = None  # before that correction [N]
 
 
-def next_pass(
+def next_refinement(
     inputs: GraphInputs, guess: Float[Array, "vertices 3"], gradient: Float[Array, "vertices 3"]
 ) -> GraphInputs:
     """Return the inputs of the next pass over the same frame.

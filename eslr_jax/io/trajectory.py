@@ -3,7 +3,7 @@
 Layout: `positions`, `velocities` [frames, vertices, 3], `faces` [faces, 3], `timestep`, `metadata` (JSON
 text) and `format`; with a body also `body_positions` [frames, body_vertices, 3] and `body_faces`
 [body_faces, 3], and what finding its contacts again takes: `body_rest_positions` [body_vertices, 3] and
-`contact_faces` [contact_faces, 3], those of the body that were searched, and `contact_rim` [rim_vertices],
+`contact_faces` [contact_faces, 3], those of the body that were searched, and `contact_boundary` [boundary_vertices],
 the body vertices where it goes on with others. SI units, Y up, float32.
 """
 
@@ -37,7 +37,9 @@ class TrajectoryFile:
     metadata: dict[str, Any]  # JSON-compatible: garment, motion, versions, ...
     body_rest_positions: np.ndarray | None = None  # [body_vertices, 3], [m]; None in files of older versions
     contact_faces: np.ndarray | None = None  # [contact_faces, 3], body faces in the cloth's reach; likewise
-    contact_rim: np.ndarray | None = None  # [rim_vertices], body vertices at their rim; likewise
+    contact_boundary: np.ndarray | None = (
+        None  # [boundary_vertices], body vertices at their boundary; likewise
+    )
 
     @property
     def num_frames(self) -> int:
@@ -56,7 +58,7 @@ def write_trajectory(
     body_faces: np.ndarray | None = None,
     body_rest_positions: np.ndarray | None = None,
     contact_faces: np.ndarray | None = None,
-    contact_rim: np.ndarray | None = None,
+    contact_boundary: np.ndarray | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a trajectory, atomically.
@@ -71,7 +73,7 @@ def write_trajectory(
         body_faces: Body triangles, shape [body_faces, 3].
         body_rest_positions: Body vertex positions at rest [m], shape [body_vertices, 3].
         contact_faces: Body triangles that the simulation searched for contacts, shape [contact_faces, 3].
-        contact_rim: Body vertices where the body goes on with other triangles, shape [rim_vertices].
+        contact_boundary: Body vertices where the body goes on with other triangles, shape [boundary_vertices].
         metadata: Anything JSON can hold.
 
     Raises:
@@ -99,8 +101,8 @@ def write_trajectory(
         arrays["body_rest_positions"] = np.asarray(body_rest_positions, np.float32)
     if contact_faces is not None:
         arrays["contact_faces"] = np.asarray(contact_faces, np.int32)
-    if contact_rim is not None:
-        arrays["contact_rim"] = np.asarray(contact_rim, np.int32)
+    if contact_boundary is not None:
+        arrays["contact_boundary"] = np.asarray(contact_boundary, np.int32)
     _check(arrays, path)
     write_arrays(path, arrays)
 
@@ -135,7 +137,7 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         metadata=metadata,
         body_rest_positions=arrays.get("body_rest_positions"),
         contact_faces=arrays.get("contact_faces"),
-        contact_rim=arrays.get("contact_rim"),
+        contact_boundary=arrays.get("contact_boundary"),
     )
 
 
@@ -186,11 +188,11 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
         _check_mesh(
             {**arrays, "body_rest_positions": rest[None]}, "body_rest_positions", "contact_faces", path
         )
-    rim = arrays.get("contact_rim")
-    if rim is not None and (rim.ndim != 1 or rim.dtype.kind not in "iu"):
+    boundary = arrays.get("contact_boundary")
+    if boundary is not None and (boundary.ndim != 1 or boundary.dtype.kind not in "iu"):
         raise AssetError(
-            f"trajectory {path} has contact_rim of shape {rim.shape} and type {rim.dtype}; "
-            "it must be [rim_vertices] of integers"
+            f"trajectory {path} has contact_boundary of shape {boundary.shape} and type {boundary.dtype}; "
+            "it must be [boundary_vertices] of integers"
         )
 
 

@@ -107,12 +107,12 @@ class EncodeProcessDecode(TwoBranches):
             world_tables=graph_world_tables(graph, dtype) if has_body else None,
         )
 
-    def encode_pass(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
+    def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
         """Add the features of a pass to those of its frame.
 
         Args:
             encoded: Of `encode_frame` on the frame's features.
-            changing: Of `build_pass_graph`.
+            changing: Of `build_refinement_graph`.
         """
         nodes, edges = changing.nodes, changing.edges
         encoded = encoded._replace(

@@ -39,7 +39,7 @@ SMALL = ModelConfig(
     features="gradient",
     output="subspace",
     output_scale=0.005,
-    passes=12,
+    refinement_steps=12,
     remat="none",
 )
 
@@ -52,11 +52,15 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, attention_blocks=0)
 
 
-MEDIUM = dataclasses.replace(SMALL, message_passing_steps=2, latent_size=64, attention_size=64, passes=4)
-DEEP = dataclasses.replace(MEDIUM, message_passing_steps=6, attention_blocks=2, passes=1, remat="products")
+MEDIUM = dataclasses.replace(
+    SMALL, message_passing_steps=2, latent_size=64, attention_size=64, refinement_steps=4
+)
+DEEP = dataclasses.replace(
+    MEDIUM, message_passing_steps=6, attention_blocks=2, refinement_steps=1, remat="products"
+)
 # One pass as a start for the solver: it costs three to four of its iterations and saves more.
 SMOOTH = dataclasses.replace(
-    _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", passes=1
+    _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
@@ -131,7 +135,7 @@ def encode_frame(
     return make_network(config).apply(_variables(params), frame, garment, method="encode_frame")
 
 
-def apply_pass(
+def apply_refinement(
     config: ModelConfig,
     params: Params,
     encoded: Encoded | EncodedVertices,
@@ -144,12 +148,12 @@ def apply_pass(
         config: Architecture, with `features` "gradient"; static.
         params: Weights.
         encoded: Of `encode_frame`.
-        changing: Of `build_pass_graph`.
+        changing: Of `build_refinement_graph`.
         garment: The same garment.
     """
 
     def run(module: EncodeProcessDecode | SmoothingNetwork):
-        return module.process(module.encode_pass(encoded, changing), garment)
+        return module.process(module.encode_refinement(encoded, changing), garment)
 
     return make_network(config).apply(_variables(params), method=run)
 

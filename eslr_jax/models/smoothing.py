@@ -91,8 +91,8 @@ class SmoothingNetwork(TwoBranches):
             hidden = hidden + from_world(rows, tables)
         return EncodedVertices(hidden, mesh_tables(garment, nodes.dtype), tables)
 
-    def encode_pass(self, encoded: EncodedVertices, changing: jraph.GraphsTuple) -> EncodedVertices:
-        """Add the features of a pass, of `build_pass_graph`, to those of its frame."""
+    def encode_refinement(self, encoded: EncodedVertices, changing: jraph.GraphsTuple) -> EncodedVertices:
+        """Add the features of a pass, of `build_refinement_graph`, to those of its frame."""
         nodes, edges = changing.nodes, changing.edges
         hidden = encoded.hidden + self.encoder.start(nodes["garment"], features.NODE_FRAME_SIZE)
         if encoded.world_tables is not None:

@@ -123,7 +123,7 @@ def vertex_blocks(
     masses = np.asarray(material.density, np.float64) * np.asarray(garment.vertex_areas, np.float64)
     timestep = float(problem.timestep)
     blocks = (masses / timestep**2)[:, None, None] * np.eye(3)
-    for contacts in (problem.contacts, problem.across):
+    for contacts in (problem.contacts, problem.opposing):
         if contacts is not None:
             blocks = blocks + _collision_blocks(position, contacts, problem, garment)
     if problem.contacts is None:

@@ -42,7 +42,7 @@ class _State(NamedTuple):
     curvatures: Float[Array, " memory"]  # 1 / (s_k . y_k); zero marks an empty row
     head: Int[Array, ""]
     scale: Float[Array, ""]
-    decrement: Float[Array, ""]  # excess [J] that the last point was estimated to have
+    decrement: Float[Array, ""]  # gap [J] that the last point was estimated to have
     iterations: Int[Array, ""]
     is_stuck: Bool[Array, ""]  # not even the preconditioned gradient leads down
 
@@ -74,7 +74,7 @@ def minimize(
     iterations: int | Int[Array, ""],
     memory: int = 8,
     residual_tolerance: Float[Array, ""] | float = 0.0,
-    excess_tolerance: Float[Array, ""] | float = 0.0,
+    gap_tolerance: Float[Array, ""] | float = 0.0,
     reference_value: Float[Array, ""] | None = None,
     earlier: Point | None = None,
 ) -> Minimum:
@@ -89,7 +89,7 @@ def minimize(
         iterations: Upper bound of iterations.
         memory: Pairs of steps and gradient changes kept; static.
         residual_tolerance: Stop when the gradient norm [N] falls below it.
-        excess_tolerance: Stop when what is left to gain is estimated to be below this share of what was gained
+        gap_tolerance: Stop when what is left to gain is estimated to be below this share of what was gained
             since `reference_value`. The estimate is half the Newton decrement, g . H^-1 g / 2, with the
             recursion's own H^-1, times `_CAUTION`.
         reference_value: Energy [J] from which the gain counts; that of `start` by default.
@@ -105,7 +105,7 @@ def minimize(
 
     def is_running(state: _State) -> Array:
         is_above = jnp.dot(state.gradient, state.gradient) > jnp.square(residual_tolerance)
-        is_far = _CAUTION * state.decrement > excess_tolerance * (reference - state.value)
+        is_far = _CAUTION * state.decrement > gap_tolerance * (reference - state.value)
         return (state.iterations < iterations) & is_above & is_far & ~state.is_stuck
 
     def iterate(state: _State) -> _State:

@@ -72,9 +72,13 @@ def potential_terms(
         collision = collision_energy(
             position, contacts, garment, parameters.collision_stiffness, problem.collision_thickness
         )
-        if problem.across is not None:
+        if problem.opposing is not None:
             collision = collision + collision_energy(
-                position, problem.across, garment, parameters.collision_stiffness, problem.collision_thickness
+                position,
+                problem.opposing,
+                garment,
+                parameters.collision_stiffness,
+                problem.collision_thickness,
             )
         if problem.tips is not None:
             collision = collision + repulsion_energy(

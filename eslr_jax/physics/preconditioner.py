@@ -57,8 +57,8 @@ def hessian_diagonal(
         assert problem.collision_thickness is not None
         parameters = problem.parameters
         depth = penetration(position, problem.contacts, problem.collision_thickness)
-        if problem.across is not None:
-            depth = depth + penetration(position, problem.across, problem.collision_thickness)
+        if problem.opposing is not None:
+            depth = depth + penetration(position, problem.opposing, problem.collision_thickness)
         slip = parameters.friction_speed * problem.timestep
         if problem.tips is not None:
             diagonal = diagonal + repulsion_diagonal(

@@ -40,7 +40,7 @@ class FrameProblem:
     friction_load: Float[Array, " vertices"] | None  # normal force at t [N]
     collision_thickness: Float[Array, ""] | None  # of `contact_thickness` [m]
     parameters: PhysicsParameters
-    across: Contacts | None = None  # with the body part on the other side of the cloth; None without a body
+    opposing: Contacts | None = None  # with the body part on the other side of the cloth; None without a body
     self_contacts: FacePairs | None = None  # None: layers of cloth pass through each other
     repulsion_thickness: Float[Array, ""] | None = None  # between layers, likewise [m]
     tips: FacePairs | None = None  # of body vertices with the cloth; None: a tip may pass between vertices
@@ -66,7 +66,7 @@ def make_problem(
     timestep: Float[Array, ""],
     parameters: PhysicsParameters,
     self_contacts: FacePairs | None = None,
-    across: Contacts | None = None,
+    opposing: Contacts | None = None,
     tips: FacePairs | None = None,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> FrameProblem:
@@ -80,7 +80,7 @@ def make_problem(
         timestep: Duration of the frame [s].
         parameters: Constants of the scene.
         self_contacts: Pairs of vertices and faces of the cloth that are close, or None.
-        across: Contacts with the body part on the other side of the cloth, or None.
+        opposing: Contacts with the body part on the other side of the cloth, or None.
         tips: Pairs of body vertices and faces of the cloth that are close, or None.
         next_body: Body vertices at t + 1 [m]; needed with tips.
     """
@@ -95,7 +95,7 @@ def make_problem(
             None if contacts is None else contact_thickness(garment, parameters.collision_thickness)
         ),
         parameters=parameters,
-        across=across,
+        opposing=opposing,
         self_contacts=self_contacts,
         repulsion_thickness=(
             None if self_contacts is None else contact_thickness(garment, parameters.repulsion_thickness)

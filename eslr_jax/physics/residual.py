@@ -14,11 +14,11 @@ from eslr_jax.physics.problem import FrameProblem, start_guess
 from eslr_jax.types import Garment, Material
 
 
-class Excess(NamedTuple):
+class OptimalityGap(NamedTuple):
     """Potential above the optimum's from the same state."""
 
     joules: Float[Array, ""]
-    relative: Float[Array, ""]  # to the frame's drop: what the inertial guess, pushed out, has above it
+    relative: Float[Array, ""]  # to the initial gap: what the inertial guess, pushed out, has above it
 
 
 def weight_norm(problem: FrameProblem, garment: Garment, material: Material) -> Float[Array, ""]:
@@ -42,13 +42,13 @@ def residual(
     )
 
 
-def excess(
+def gap(
     position: Float[Array, "vertices 3"],
     problem: FrameProblem,
     garment: Garment,
     material: Material,
     optimum: Float[Array, ""] | float,
-) -> Excess:
+) -> OptimalityGap:
     """Return how much potential `position` leaves on the table.
 
     Args:
@@ -60,4 +60,4 @@ def excess(
     """
     joules = potential(position, problem, garment, material) - optimum
     drop = potential(start_guess(problem, garment), problem, garment, material) - optimum
-    return Excess(joules, joules / drop)
+    return OptimalityGap(joules, joules / drop)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import ModelConfig
-from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
-from eslr_jax.graph.inputs import GraphInputs, next_pass
-from eslr_jax.models.registry import apply_model, apply_pass, encode_frame, scale_output
+from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
+from eslr_jax.graph.inputs import GraphInputs, next_refinement
+from eslr_jax.models.registry import apply_model, apply_refinement, encode_frame, scale_output
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.lbfgs import Point
@@ -65,7 +65,7 @@ class Correction(NamedTuple):
     """What passes over a frame's guess lead to."""
 
     starts: Point  # of every pass, stacked
-    answers: Float[Array, "passes vertices 3"]  # [m]
+    answers: Float[Array, "refinement_steps vertices 3"]  # [m]
     status: Int[Array, ""]
 
 
@@ -77,7 +77,7 @@ class NetworkAnswer(NamedTuple):
     status: Int[Array, ""]
 
 
-def correction_passes(
+def refine(
     params: Any,
     garment: Garment,
     material: Material,
@@ -113,12 +113,12 @@ def correction_passes(
     def energy(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
         return potential(position, problem, garment, material)
 
-    def one_pass(carry: GraphInputs, _):
+    def one_step(carry: GraphInputs, _):
         value, gradient = jax.value_and_grad(energy)(carry.guess)
         step = descent_step(problem, garment, material, carry.guess, gradient, longest)
         inputs = carry.replace(gradient=gradient, step=step)
-        changing = build_pass_graph(garment, material, inputs, graph)
-        output = apply_pass(config, params, encoded, changing, garment)
+        changing = build_refinement_graph(garment, material, inputs, graph)
+        output = apply_refinement(config, params, encoded, changing, garment)
         move = correct(config, params, output, inputs)
         if config.output == "subspace":
             directions = jnp.stack([move, step, inputs.correction])
@@ -127,9 +127,9 @@ def correction_passes(
             move = combine_directions(energy, inputs.guess, value, gradient, directions)
         answer = pin(problem, garment, inputs.guess + move)
         onward = jax.lax.stop_gradient(answer) if detach else answer
-        return next_pass(inputs, onward, gradient), (answer, Point(inputs.guess, value, gradient))
+        return next_refinement(inputs, onward, gradient), (answer, Point(inputs.guess, value, gradient))
 
-    _, (answers, starts) = jax.lax.scan(one_pass, inputs, None, length=config.passes)
+    _, (answers, starts) = jax.lax.scan(one_step, inputs, None, length=config.refinement_steps)
     return Correction(starts, answers, graph.globals["status"])
 
 
@@ -188,6 +188,6 @@ def network_step(
     if config.output == "acceleration":
         position, status = predict_acceleration(params, garment, problem, inputs, material, config)
         return NetworkAnswer(position, None, status)
-    starts, answers, status = correction_passes(params, garment, material, problem, inputs, config)
+    starts, answers, status = refine(params, garment, material, problem, inputs, config)
     lowest = jnp.nanargmin(starts.value)
     return NetworkAnswer(answers[-1], jax.tree.map(lambda rows: rows[lowest], starts), status)

@@ -65,12 +65,12 @@ def frame_problem(
         config: Says whether layers and tips collide; neither does by default.
     """
     config = config or SimConfig()
-    contacts = across = tips = self_contacts = None
+    contacts = opposing = tips = self_contacts = None
     guess = state.position + timestep * state.velocity
     if surface is not None:
         assert frame.body is not None
         assert frame.next_body is not None
-        contacts, across = find_both_sides(state.position, frame.body, frame.next_body, surface)
+        contacts, opposing = find_both_sides(state.position, frame.body, frame.next_body, surface)
         if config.tip_contact:
             tips = find_tip_contacts(state.position, guess, frame.body, frame.next_body, garment)
     if config.self_contact:
@@ -89,7 +89,7 @@ def frame_problem(
         timestep,
         parameters,
         self_contacts=self_contacts,
-        across=across,
+        opposing=opposing,
         tips=tips,
         next_body=frame.next_body,
     )
@@ -117,7 +117,7 @@ def solve(
         stiffness(problem, garment, material, start.position if isinstance(start, Point) else start),
         iterations=iterations,
         memory=memory,
-        excess_tolerance=tolerance,
+        gap_tolerance=tolerance,
         # Whatever it starts from, a frame's gain counts from the best guess that costs nothing.
         reference_value=energy(start_guess(problem, garment)) if tolerance else None,
         earlier=earlier,

@@ -9,7 +9,7 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.training.checkpoint import read_run_config
 
 _LOSS = "loss, in units of lifting the garment by 1 cm"
-_CONTRACTION = "loss, mean share of a pass's excess that it leaves"
+_CONTRACTION = "loss, mean share of a pass's gap that it leaves"
 _TERMS = ("stretch", "bending", "inertia", "collision", "friction")
 
 
@@ -28,7 +28,7 @@ def plot_curves(folder: Path) -> Path | None:
     iterations = [record["iteration"] for record in records]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     left.plot(iterations, [record["loss"] for record in records], label="loss")
-    label = _CONTRACTION if read_run_config(folder).pass_weights == "contraction" else _LOSS
+    label = _CONTRACTION if read_run_config(folder).refinement_weights == "contraction" else _LOSS
     left.set(xlabel="iteration", ylabel=label, yscale="symlog")
     for term in _TERMS:
         right.plot(iterations, [max(record[term], 1e-7) for record in records], label=term)

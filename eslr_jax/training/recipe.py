@@ -16,7 +16,7 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
 
     Args:
         path: TOML file.
-        overrides: Dotted keys and their values, such as {"model.passes": 4}.
+        overrides: Dotted keys and their values, such as {"model.refinement_steps": 4}.
 
     Raises:
         ConfigError: The file is missing or not TOML, or a value is unknown or impossible.

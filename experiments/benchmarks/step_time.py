@@ -198,13 +198,13 @@ def matmul_flops(config, vertices: int, edges: int) -> float:
     return square + 2.0 * config.attention_blocks * vertices * block
 
 
-def measure_passes(size: str, turns: int) -> dict:
+def measure_refinement_steps(size: str, turns: int) -> dict:
     """Return the time of one pass of the small models, and of what a frame needs once."""
     import jax
     from reference_models import make_scene
 
-    from eslr_jax.graph.build import build_frame_graph, build_pass_graph
-    from eslr_jax.models.registry import MODELS, apply_pass, encode_frame, init_model
+    from eslr_jax.graph.build import build_frame_graph, build_refinement_graph
+    from eslr_jax.models.registry import MODELS, apply_refinement, encode_frame, init_model
 
     functions = {}
     for name in ("eslr-small", "lsdmp-small", "gsa-small", "mgn-small"):
@@ -215,13 +215,13 @@ def measure_passes(size: str, turns: int) -> dict:
             graph = build_frame_graph(garment, material, inputs, config)
             return graph, encode_frame(config, params, graph, garment)
 
-        def one_pass(params, graph, encoded, garment, material, inputs, config=config):
-            changing = build_pass_graph(garment, material, inputs, graph)
-            return apply_pass(config, params, encoded, changing, garment)
+        def one_step(params, graph, encoded, garment, material, inputs, config=config):
+            changing = build_refinement_graph(garment, material, inputs, graph)
+            return apply_refinement(config, params, encoded, changing, garment)
 
         graph, encoded = jax.jit(frame)(params, *scene)
         functions[f"{name} frame"] = (jax.jit(frame), (params, *scene))
-        functions[f"{name} pass"] = (jax.jit(one_pass), (params, graph, encoded, *scene))
+        functions[f"{name} pass"] = (jax.jit(one_step), (params, graph, encoded, *scene))
     return {name: round(1e3 * seconds, 3) for name, seconds in take_turns(functions, 5 * turns).items()}
 
 
@@ -302,7 +302,7 @@ def main() -> None:
     for size in options.sizes:
         print(f"{size}: {MODEL} ...", file=sys.stderr)
         sizes[size] = measure_size(size, options.turns, not options.no_training)
-        sizes[size]["pass_ms"] = measure_passes(size, options.turns)
+        sizes[size]["refinement_ms"] = measure_refinement_steps(size, options.turns)
         if not options.no_torch:
             print(f"{size}: PyTorch ...", file=sys.stderr)
             sizes[size]["torch"] = torch_in_a_process(size, options.turns, options.keep_memory)
@@ -340,7 +340,7 @@ def print_table(report: dict) -> None:
                 f"{name:18}"
                 + "".join(f"{value:>{width}}" for value, width in zip(columns, (10, 11, 11, 11), strict=True))
             )
-        for name, milliseconds in result["pass_ms"].items():
+        for name, milliseconds in result["refinement_ms"].items():
             print(f"{name:18}{milliseconds:>11}")
         for name, milliseconds in ((result.get("torch") or {}).get("run_ms") or {}).items():
             print(f"{name:18}{milliseconds:>11}  (one thread)")

@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--smoke", action="store_true", help="a small model, one turn")
     arguments = parser.parse_args()
-    changes = {"model": "mgn-small", "model.passes": 1, "garments": ["tshirt"]} if arguments.smoke else {}
+    changes = (
+        {"model": "mgn-small", "model.refinement_steps": 1, "garments": ["tshirt"]} if arguments.smoke else {}
+    )
     config = load_recipe(RECIPE, {"split": "validation", **changes})
     data = load_training_data(config, config.vertices[0])
     state = init_train_state(config, (data,))

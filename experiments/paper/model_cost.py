@@ -56,7 +56,7 @@ def main() -> None:
         parts[name] = (forward, (params, scene.start))
         rows[name] = {
             "layers": config.message_passing_steps,
-            "passes": config.passes,
+            "refinement_steps": config.refinement_steps,
             "parameters": count_parameters(params),
             "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
             **({"loss": losses[name]["total"]} if name in losses else {}),

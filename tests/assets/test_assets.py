@@ -44,8 +44,8 @@ def test_unknown_names_list_what_exists(load):
 def test_a_network_takes_as_many_passes_as_are_asked_for():
     _, trained = load_model("eslr-small")
     _, fewer = load_model("eslr-small:3")
-    assert fewer == dataclasses.replace(trained, passes=3)
-    with pytest.raises(AssetError, match="passes must be at least 1"):
+    assert fewer == dataclasses.replace(trained, refinement_steps=3)
+    with pytest.raises(AssetError, match="refinement_steps must be at least 1"):
         load_model("eslr-small:0")
 
 

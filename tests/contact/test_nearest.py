@@ -60,19 +60,19 @@ def test_cloth_between_two_limbs_sees_both():
     surface = prepare_surface(both.vertices, both.faces)
     vertices = jnp.asarray(both.vertices, jnp.float32)[surface.vertex_ids]
     query = jnp.array([[0.11, 0.0, 0.0], [-0.11, 0.0, 0.0]])  # between the two, and beyond the left one
-    contacts, across = jax.jit(find_both_sides)(query, vertices, vertices, surface)
+    contacts, opposing = jax.jit(find_both_sides)(query, vertices, vertices, surface)
     np.testing.assert_allclose(contacts.distances, [0.01, 0.01], atol=1e-3)
-    np.testing.assert_array_equal(across.is_near, [True, False])
-    np.testing.assert_allclose(across.distances[0], 0.02, atol=1e-3)
-    np.testing.assert_allclose(across.normals[0], [-1.0, 0.0, 0.0], atol=0.05)
+    np.testing.assert_array_equal(opposing.is_near, [True, False])
+    np.testing.assert_allclose(opposing.distances[0], 0.02, atol=1e-3)
+    np.testing.assert_allclose(opposing.normals[0], [-1.0, 0.0, 0.0], atol=0.05)
 
 
 def test_beyond_the_rim_of_a_part_nothing_is_touched(sphere):
-    """The tangent plane at the rim would push cloth there by as much as it hangs below it."""
+    """The tangent plane at the boundary would push cloth there by as much as it hangs below it."""
     mesh, _, _ = sphere
     is_upper = mesh.triangles_center[:, 1] > 0
     upper, lower = mesh.faces[is_upper], mesh.faces[~is_upper]
-    surface = prepare_surface(mesh.vertices, upper, rim=np.intersect1d(upper, lower))
+    surface = prepare_surface(mesh.vertices, upper, boundary=np.intersect1d(upper, lower))
     vertices = jnp.asarray(mesh.vertices, jnp.float32)[surface.vertex_ids]
     query = jnp.array([[0.24, -0.05, 0.0], [0.24, 0.1, 0.0]])
     contacts = find_contacts(query, vertices, vertices, surface)

@@ -31,7 +31,7 @@ def test_a_budget_buys_the_least_excess():
     assert "net" in choice.reason
     choice = choose(Calibration("there", (PLAIN, FAST)), 1000, budget_ms=12.0)
     assert (choice.method, choice.iterations) == ("net", 10)
-    assert choice.expected_excess == pytest.approx(0.01)
+    assert choice.expected_gap == pytest.approx(0.01)
 
 
 def test_a_budget_is_kept_on_a_machine_of_another_speed():

@@ -54,12 +54,12 @@ def replace_positions(simulator, change):
 
 
 def swing(turn):
-    """A simulator that turns a curtain about its upper rim, before the limb comes, by a share of a full turn."""
+    """A simulator that turns a curtain about its upper boundary, before the limb comes, by a share of a full turn."""
 
     def turned(positions):
         start, frames = np.asarray(positions[0], np.float64), np.arange(len(positions))
         angle = 2 * np.pi * turn * np.minimum(frames / 8, 1)[:, None]
-        hanging = 0.2 - start[:, 1]  # below the rim, which is 20 cm above the limb's axis
+        hanging = 0.2 - start[:, 1]  # below the boundary, which is 20 cm above the limb's axis
         path = np.stack(
             [
                 np.broadcast_to(start[:, 0], (len(frames), len(start))),

@@ -197,8 +197,8 @@ def test_vbd_minimises_our_potential_where_strains_are_small(tshirt):
     scene = make_scene(tshirt, rest + noise, 4, timestep=1 / 300).scene
     method = peers.Method("VBD", 1, 200, newton_cloth(scene, Setting("vbd", 1, 200)))
     truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
-    excess, drop = peers.teach([method], scene, truth, every=1)
-    assert (excess[0] / drop).max() < 1e-3
+    gap, drop = peers.teach([method], scene, truth, every=1)
+    assert (gap[0] / drop).max() < 1e-3
 
 
 @pytest.mark.slow

@@ -15,12 +15,12 @@ from eslr_jax.errors import Status
 from eslr_jax.graph.build import (
     build_frame_graph,
     build_graph,
-    build_pass_graph,
+    build_refinement_graph,
     feature_sizes,
     join_features,
 )
 from eslr_jax.graph.features import mean_edge_length
-from eslr_jax.graph.inputs import next_pass
+from eslr_jax.graph.inputs import next_refinement
 
 HOOD = ModelConfig(update_body=True)
 GRADIENT = ModelConfig(features="gradient", output="correction")
@@ -177,7 +177,7 @@ def test_the_first_pass_knows_no_correction(scene):
     first = inputs.replace(correction=None, previous_gradient=None)
     graph = build(GRADIENT, (garment, material, first))
     np.testing.assert_array_equal(graph.nodes["garment"][:, -7:], 0)
-    later = next_pass(first, first.guess + 0.01, 2 * first.gradient)
+    later = next_refinement(first, first.guess + 0.01, 2 * first.gradient)
     np.testing.assert_allclose(later.correction, 0.01, atol=1e-6)
     np.testing.assert_array_equal(later.previous_gradient, first.gradient)
 
@@ -192,7 +192,7 @@ def test_a_frame_joined_with_its_pass_is_the_whole_graph(scene, gradient_graph):
     @quick_jit
     def join(*scene):
         frame = build_frame_graph(*scene, GRADIENT)
-        return join_features(frame, build_pass_graph(*scene, frame))
+        return join_features(frame, build_refinement_graph(*scene, frame))
 
     joined = join(*scene)
     for first, second in zip(jax.tree.leaves(joined), jax.tree.leaves(gradient_graph), strict=True):

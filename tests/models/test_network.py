@@ -12,7 +12,7 @@ from reference_models import layer_weights, make_scene, plain_layer, plain_netwo
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.graph.build import build_frame_graph, build_graph, build_pass_graph
+from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
 from eslr_jax.graph.operators import mesh_tables, sum_receivers, world_tables
 from eslr_jax.models import registry
 from eslr_jax.models.lsdmp import Latents, LsdmpLayer
@@ -172,10 +172,10 @@ def test_passes_over_an_encoded_frame_equal_the_whole_graph(config):
     def both(params, garment, material, inputs):
         frame = build_frame_graph(garment, material, inputs, config)
         encoded = registry.encode_frame(config, params, frame, garment)
-        changing = build_pass_graph(garment, material, inputs, frame)
+        changing = build_refinement_graph(garment, material, inputs, frame)
         whole = build_graph(garment, material, inputs, config)
         return (
-            registry.apply_pass(config, params, encoded, changing, garment),
+            registry.apply_refinement(config, params, encoded, changing, garment),
             apply_model(config, params, whole, garment),
         )
 

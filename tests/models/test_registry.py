@@ -66,7 +66,7 @@ def test_outputs_have_physical_scales():
     params = init_model(SMALL)
     ones = jnp.ones((2, 3))
     np.testing.assert_allclose(scale_output(SMALL, params, ones), SMALL.output_scale)
-    faithful = dataclasses.replace(SMALL, features="hood", output="acceleration", passes=1)
+    faithful = dataclasses.replace(SMALL, features="hood", output="acceleration", refinement_steps=1)
     params = init_model(faithful)
     np.testing.assert_array_equal(scale_output(faithful, params, ones), ones)
 
@@ -83,8 +83,8 @@ def test_configs_survive_a_round_trip(name):
         {"smoothing_steps": -1},
         {"output_scale": 0.0},
         {"world_edge_capacity": 0},
-        {"passes": 3},
-        {"passes": 3, "features": "gradient"},
+        {"refinement_steps": 3},
+        {"refinement_steps": 3, "features": "gradient"},
     ],
 )
 def test_impossible_configs_name_the_field(values):
@@ -93,7 +93,7 @@ def test_impossible_configs_name_the_field(values):
 
 
 def test_statistics_are_required_where_features_are_normalised():
-    faithful = dataclasses.replace(SMALL, features="hood", output="acceleration", passes=1)
+    faithful = dataclasses.replace(SMALL, features="hood", output="acceleration", refinement_steps=1)
     params = init_model(faithful)
     assert set(params["statistics"]) == {"garment", "mesh", "world", "output"}
     assert set(init_model(SMALL)["statistics"]) == set()

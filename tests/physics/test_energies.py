@@ -17,7 +17,7 @@ from eslr_jax.physics.collision import contact_forces
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.membrane import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import PotentialTerms, next_friction_load, potential, potential_terms
-from eslr_jax.physics.residual import excess, relative_residual, residual
+from eslr_jax.physics.residual import gap, relative_residual, residual
 from eslr_jax.types import Material
 
 TERMS = PotentialTerms._fields[:6]
@@ -397,7 +397,7 @@ def test_residual_and_excess(case32):
     falling[:, 1] = 9.81 * material.density * garment.vertex_areas
     np.testing.assert_allclose(relative_residual(falling, problem, garment, material), 1, rtol=1e-6)
     total = float(np.sum(values))
-    found = excess(position, problem, garment, material, optimum=total - 0.25)
+    found = gap(position, problem, garment, material, optimum=total - 0.25)
     np.testing.assert_allclose(found.joules, 0.25, rtol=1e-4)
     load = next_friction_load(position, problem, garment)
     assert load.shape == position.shape[:1]

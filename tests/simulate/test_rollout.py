@@ -7,7 +7,7 @@ import pytest
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
-from eslr_jax.evaluation.excess import measure_excess, trajectory_states
+from eslr_jax.evaluation.gap import measure_gap, trajectory_states
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
@@ -17,7 +17,7 @@ from eslr_jax.simulate.scan import simulate_scene
 from eslr_jax.simulate.step import frame_problem
 
 PHYSICS = SimConfig(simulator="physics", solver_iterations=200)
-SMALL = dataclasses.replace(MODELS["eslr-small"], passes=2)
+SMALL = dataclasses.replace(MODELS["eslr-small"], refinement_steps=2)
 NETWORK = SimConfig(simulator="network", model=SMALL)
 
 
@@ -91,7 +91,7 @@ def test_tolerance_stops_early_and_is_kept(scene, physical):
     loose = dataclasses.replace(PHYSICS, tolerance=0.01)
     trajectory = simulate_scene(None, scene, PhysicsParameters(), loose)
     assert int(trajectory.iterations[1:].max()) < int(physical.iterations[1:].min())
-    excess = measure_excess(None, trajectory, scene, PhysicsParameters(), loose, iterations=())
+    gap = measure_gap(None, trajectory, scene, PhysicsParameters(), loose, iterations=())
     states, inputs = trajectory_states(trajectory, scene, PhysicsParameters())
 
     def energy(frame):
@@ -100,14 +100,14 @@ def test_tolerance_stops_early_and_is_kept(scene, physical):
         return potential(answer, frame_problem(*arguments), scene.garment, scene.material)
 
     reached = jax.lax.map(energy, (states, inputs, trajectory.positions[1:]))[1:]
-    np.testing.assert_allclose(excess.answer, reached, rtol=1e-5)
-    share = (excess.answer - excess.optimum) / (excess.start - excess.optimum)
+    np.testing.assert_allclose(gap.answer, reached, rtol=1e-5)
+    share = (gap.answer - gap.optimum) / (gap.start - gap.optimum)
     assert float(share.max()) <= 0.01
 
 
 @pytest.mark.slow
 def test_gradient_through_time_is_finite(scene):
-    plain = dataclasses.replace(MODELS["mgn-small"], passes=1, latent_size=8)
+    plain = dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size=8)
     params = init_model(plain)
     short = scene.replace(body_positions=scene.body_positions[:3], num_frames=3)
 

@@ -16,7 +16,7 @@ batch_size = 4
 log_every = 1
 [model]
 base = "mgn-small"
-passes = 1
+refinement_steps = 1
 latent_size = 16
 """
 

@@ -17,7 +17,7 @@ log_every = 5
 checkpoint_every = 10
 [model]
 base = "mgn-small"
-passes = 1
+refinement_steps = 1
 latent_size = 16
 """
 KILLS = 10

@@ -19,7 +19,7 @@ from eslr_jax.training.loop import train
 from eslr_jax.training.loss import _mean_contraction
 from eslr_jax.training.pool import start_trajectory
 
-MODEL = dataclasses.replace(MODELS["mgn-small"], passes=1, latent_size=16)
+MODEL = dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size=16)
 CONFIG = TrainConfig(
     model=MODEL,
     garments=("tshirt",),
@@ -71,7 +71,7 @@ def test_run_leaves_metrics_and_a_model(finished):
 
 
 def test_a_start_for_the_solver_trains_from_optima(tmp_path):
-    """Excess and distance to where the solver ends shrink."""
+    """OptimalityGap and distance to where the solver ends shrink."""
     model = dataclasses.replace(MODELS["smooth-small"], latent_size=16)
     config = dataclasses.replace(CONFIG, model=model, iterations=60, corrector_steps=10, log_every=10)
     state = train(config, tmp_path)
@@ -166,8 +166,8 @@ def test_overrides_may_name_another_model(tmp_path):
 
     recipe = tmp_path / "recipe.toml"
     recipe.write_text('model = "eslr-small"')
-    config = load_recipe(recipe, {"model": "mgn-small", "model.passes": 4})
-    assert config.model == dataclasses.replace(MODELS["mgn-small"], passes=4)
+    config = load_recipe(recipe, {"model": "mgn-small", "model.refinement_steps": 4})
+    assert config.model == dataclasses.replace(MODELS["mgn-small"], refinement_steps=4)
 
 
 def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them():
@@ -189,7 +189,7 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them():
 
 
 def test_contraction_weighs_each_pass_by_what_it_leaves():
-    """Passes from 10 J to 1 J to 0.1 J to 0 leave a tenth each; the last one's excess is known to 1 % of 10 J."""
+    """Passes from 10 J to 1 J to 0.1 J to 0 leave a tenth each; the last one's gap is known to 1 % of 10 J."""
     energies = jnp.array([10.0, 1.0, 0.1, 0.0])
     np.testing.assert_allclose(_mean_contraction(energies), (0.1 + 0.1 + 0.0) / 3, rtol=1e-6)
     np.testing.assert_allclose(

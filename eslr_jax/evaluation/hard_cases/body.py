@@ -16,7 +16,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import Status
 from eslr_jax.evaluation.colliders import Capsule, Collider, Sphere
-from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.hard_cases.build import (
     FRAME,
     capsule,
@@ -218,16 +218,16 @@ def _measure_drop(runs: Runs) -> list[Measure]:
     run = runs["drop"]
     taught = [own_gaps_from_start(runs[f"taught {frame}"]) for frame in _TAUGHT_FRAMES]
     return [
-        Measure("excess from the solver's states, median [J]", float(np.median(taught)), 0.008),
-        Measure("excess from the solver's states, largest [J]", float(np.max(taught)), None),
+        Measure("gap from the solver's states, median [J]", float(np.median(taught)), 0.008),
+        Measure("gap from the solver's states, largest [J]", float(np.max(taught)), None),
         Measure("depth in the ball, 99.9 % [mm]", quantile_depth(run), 2.0),
         Measure("stretch, largest", largest_stretch(run), 1.25),
     ]
 
 
 def own_gaps_from_start(run: Run) -> float:
-    """Return the excess of a run of one frame, from the state it starts in [J]."""
-    return float(own_gaps(run, 1).excess[0])
+    """Return the gap of a run of one frame, from the state it starts in [J]."""
+    return float(own_gaps(run, 1).gap[0])
 
 
 DROP = HardCase(
@@ -420,11 +420,11 @@ def _measure_steps_and_fabrics(runs: Runs) -> list[Measure]:
         if run.refusal is not None:
             measures.append(Measure(f"{label}: refused, {run.refusal}"[:100], 0, 0))
             continue
-        excess = own_gaps(run, max((len(run.positions) - 1) // 4, 1)).excess
+        gap = own_gaps(run, max((len(run.positions) - 1) // 4, 1)).gap
         measures += [
             Measure(f"{label}: stretch, largest", largest_stretch(run), 1.25),
             Measure(f"{label}: depth in the ball, 99.9 % [mm]", quantile_depth(run), 2.0),
-            Measure(f"{label}: excess, median [J]", float(np.median(excess)), 0.008),
+            Measure(f"{label}: gap, median [J]", float(np.median(gap)), 0.008),
         ]
     return measures
 
@@ -437,5 +437,5 @@ STEPS_AND_FABRICS = HardCase(
     picture="dt 1/10 s",
     may_refuse=True,
     limit="the heaviest fabric (0.7 kg/m2, four times cotton) stretches by 1.255 where the bar is 1.25: that is "
-    "the optimum's own stretch (excess below 1 uJ), so no solver of this potential can meet it",
+    "the optimum's own stretch (gap below 1 uJ), so no solver of this potential can meet it",
 )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.evaluation.colliders import triangle_distances
-from eslr_jax.evaluation.excess import trajectory_states
+from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.hard_cases.simulators import Run, StressScene
 from eslr_jax.evaluation.referee import Referee, Verdict
 from eslr_jax.physics.bending import bending_energy
@@ -178,7 +178,7 @@ def settle(
 class Gaps(NamedTuple):
     """How far answers are from the optimum of their own frame."""
 
-    excess: np.ndarray  # [J]
+    gap: np.ndarray  # [J]
     share: np.ndarray  # of the drop from the pushed-out inertial guess to the optimum
 
 

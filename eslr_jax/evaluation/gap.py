@@ -1,4 +1,4 @@
-"""Excess over the optimum: how much potential a stepper leaves on the table, frame by frame."""
+"""OptimalityOptimality gap: how much potential a stepper leaves on the table, frame by frame."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
 _SOLVER = SimConfig(simulator="physics")
-_LEAST_DROP = 1e-9  # [J]
+_LEAST_INITIAL_GAP = 1e-9  # [J]
 _OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
 
 
-class Excess(NamedTuple):
+class OptimalityGap(NamedTuple):
     """Potentials from the same states, one per frame [J]."""
 
     start: Float[Array, " frames"]  # at the pushed-out inertial guess
@@ -34,13 +34,13 @@ class Excess(NamedTuple):
     corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
 
     @property
-    def drop(self) -> Float[Array, " frames"]:
+    def initial_gap(self) -> Float[Array, " frames"]:
         """What a frame has to gain [J]; a floor keeps shares of it finite."""
-        return jnp.maximum(self.start - self.optimum, _LEAST_DROP)
+        return jnp.maximum(self.start - self.optimum, _LEAST_INITIAL_GAP)
 
     def share(self, energy: Float[Array, " frames"]) -> Float[Array, " frames"]:
-        """Return by how much potentials [J] exceed the optimum, relative to the drop."""
-        return jnp.maximum(energy - self.optimum, 0.0) / self.drop
+        """Return by how much potentials [J] exceed the optimum, relative to the initial gap."""
+        return jnp.maximum(energy - self.optimum, 0.0) / self.initial_gap
 
 
 def trajectory_states(
@@ -64,7 +64,7 @@ def trajectory_states(
 
 
 @partial(jax.jit, static_argnames=("config", "every", "iterations", "corrector_steps"))
-def measure_excess(
+def measure_gap(
     params: Any,
     trajectory: Trajectory,
     scene: Scene,
@@ -74,7 +74,7 @@ def measure_excess(
     every: int = 1,
     iterations: tuple[int, ...] = ITERATIONS,
     corrector_steps: tuple[int, ...] = (0,),
-) -> Excess:
+) -> OptimalityGap:
     """Compare a model, the solver after few iterations, and the optimum, from the states of a trajectory.
 
     Teacher-forced where the trajectory is the optimum's own, on-policy where it is the model's.
@@ -127,19 +127,19 @@ def measure_excess(
             lambda x: potential(x, problem, garment, material),
             jnp.stack([start_guess(problem, garment), answer]),
         )
-        return Excess(guess, optimum, answered, solver, corrected)
+        return OptimalityGap(guess, optimum, answered, solver, corrected)
 
     return jax.lax.map(measure, taken)
 
 
-def trajectory_excess(
+def trajectory_gap(
     trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters, *, every: int
-) -> Excess:
+) -> OptimalityGap:
     """Return where frames of a trajectory start, end, and could have ended; nothing else is solved.
 
-    The arguments are those of `measure_excess`.
+    The arguments are those of `measure_gap`.
     """
-    return measure_excess(
+    return measure_gap(
         None, trajectory, scene, parameters, _SOLVER, every=every, iterations=(), corrector_steps=()
     )
 
