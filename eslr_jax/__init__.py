@@ -15,8 +15,8 @@ _PUBLIC = {
     "SimConfig": "eslr_jax.config",
     "TrainConfig": "eslr_jax.config",
     "EslrError": "eslr_jax.errors",
-    "PhysicsParameters": "eslr_jax.physics.problem",
-    "SceneOptions": "eslr_jax.scene",
+    "PhysicsConstants": "eslr_jax.types",
+    "SceneOptions": "eslr_jax.scene.plan",
     "Material": "eslr_jax.types",
     "Trajectory": "eslr_jax.types",
     "load_body": "eslr_jax.assets",
@@ -25,9 +25,11 @@ _PUBLIC = {
     "load_motion": "eslr_jax.assets",
     "pose_body": "eslr_jax.body.motion",
     "prepare_garment": "eslr_jax.geometry.prepare",
-    "prepare_scene": "eslr_jax.scene",
-    "rollout": "eslr_jax.rollout",
-    "rollout_batch": "eslr_jax.rollout",
+    "plan_scene": "eslr_jax.scene.plan",
+    "prepare_scene": "eslr_jax.scene.plan",
+    "rollout": "eslr_jax.simulation.rollout",
+    "simulate": "eslr_jax.simulation.simulate",
+    "simulate_batch": "eslr_jax.simulation.batch",
 }
 
 __all__ = ["__version__", *_PUBLIC]
@@ -38,10 +40,11 @@ if TYPE_CHECKING:
     from eslr_jax.config import ModelConfig, SimConfig, TrainConfig
     from eslr_jax.errors import EslrError
     from eslr_jax.geometry.prepare import prepare_garment
-    from eslr_jax.physics.problem import PhysicsParameters
-    from eslr_jax.rollout import rollout, rollout_batch
-    from eslr_jax.scene import SceneOptions, prepare_scene
-    from eslr_jax.types import Material, Trajectory
+    from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
+    from eslr_jax.simulation.batch import simulate_batch
+    from eslr_jax.simulation.rollout import rollout
+    from eslr_jax.simulation.simulate import simulate
+    from eslr_jax.types import Material, PhysicsConstants, Trajectory
 
 
 def __getattr__(name: str) -> Any:

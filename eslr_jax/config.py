@@ -91,20 +91,18 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SimConfig:
-    """How a rollout is computed; static, so a change compiles anew."""
+    """How a frame is solved; static, so a change compiles anew.
 
-    simulator: Literal["network", "physics"] = "network"
-    model: ModelConfig | None = None  # required by the network
-    solver_iterations: int = 100  # L-BFGS iterations of the physics simulator
-    solver_memory: int = 8  # pairs kept by L-BFGS
-    corrector_steps: int = 0  # L-BFGS iterations behind the network
-    # Stop a frame's iterations where what is left to gain is estimated to be below this share of what the
-    # frame gains from its pushed-out inertial guess; 0.01 is kept on 99 % of frames.
+    Without a model the solver starts from its own guess. With one, it starts from the network's prediction;
+    `iterations=0` then leaves the prediction as it is.
+    """
+
+    model: ModelConfig | None = None  # architecture of the network; None: no network
+    iterations: int = 100  # of L-BFGS per frame, at most
+    # A frame's iterations stop where its optimality gap is estimated to be below this share of the initial gap;
+    # 0.01 is kept on 99 % of frames.
     tolerance: float = 0.0
-    self_contact: bool = False  # layers of cloth keep apart
-    self_contact_capacity: int | None = None  # rows for pairs; None is eight per vertex
-    self_contact_cell_capacity: int | None = None  # faces in a column of search cells; None is 96
-    tip_contact: bool = False  # the body's vertices collide too: tips finer than the cloth's mesh
+    memory: int = 8  # pairs that L-BFGS keeps
 
     def __post_init__(self) -> None:
         """Reject impossible values.
@@ -112,20 +110,11 @@ class SimConfig:
         Raises:
             ValueError: Names the field.
         """
-        if self.solver_memory < 1:
-            raise ValueError(f"solver_memory must be at least 1, got {self.solver_memory}")
-        for name in ("solver_iterations", "corrector_steps", "tolerance"):
+        if self.memory < 1:
+            raise ValueError(f"memory must be at least 1, got {self.memory}")
+        for name in ("iterations", "tolerance"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("self_contact_capacity", "self_contact_cell_capacity"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, or null for the default, got {value}")
-
-    @property
-    def iterations(self) -> int:
-        """L-BFGS iterations per frame: of the physics simulator, or behind the network."""
-        return self.solver_iterations if self.simulator == "physics" else self.corrector_steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,23 +123,23 @@ class TrainConfig:
 
     model: ModelConfig
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
-    vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed iteration by iteration
+    vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
-    iterations: int = 20_000  # optimiser steps
+    steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
     self_contact: bool = False  # layers of cloth keep apart, as in SimConfig
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine
-    warmup: int = 100  # iterations of linear warm-up
+    warmup: int = 100  # steps of linear warm-up
     clip_norm: float = 1.0  # of the global gradient (HOOD)
     # Train a start for the solver: with so many L-BFGS iterations behind the network a frame's optimum is found,
     # from which gap and distance are measured, and the trajectory goes on. 0 trains a network of its own.
-    corrector_steps: int = 0
+    iterations: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment
     horizon: int = 60  # longest trajectory [frames]
-    horizon_growth: int = 60  # iterations per frame of horizon
+    horizon_growth: int = 60  # steps per frame of horizon
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
     reset_stretch: float = 2.5  # a trajectory that stretches further starts anew
@@ -171,7 +160,7 @@ class TrainConfig:
             ValueError: Names the field.
         """
         for name in (
-            "iterations",
+            "steps",
             "batch_size",
             "slots_per_garment",
             "horizon",
@@ -184,8 +173,8 @@ class TrainConfig:
         for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.corrector_steps < 0 or (self.corrector_steps and self.energy_set == "hood"):
-            raise ValueError('corrector_steps must not be negative, and needs energy_set = "consistent"')
+        if self.iterations < 0 or (self.iterations and self.energy_set == "hood"):
+            raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
         for name in ("noise", "girth"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")

@@ -46,18 +46,16 @@ class Status(enum.IntFlag):
 
     OK = 0
     NON_FINITE = 1
-    WORLD_EDGE_OVERFLOW = 2
     SELF_CONTACT_OVERFLOW = 4
     BODY_TOO_FAST = 8
 
     def describe(self) -> str:
         """One line per set bit, with what to do about it."""
         texts = {
-            Status.NON_FINITE: "positions became NaN or infinite; use the physics simulator, more corrector "
-            "steps, or a smaller timestep",
-            Status.WORLD_EDGE_OVERFLOW: "more world edges than their capacity; raise world_edge_capacity",
-            Status.SELF_CONTACT_OVERFLOW: "more self-contact than its capacities hold; "
-            "raise self_contact_capacity",
+            Status.NON_FINITE: "positions became NaN or infinite; use the solver, more iterations, "
+            "or a smaller timestep",
+            Status.SELF_CONTACT_OVERFLOW: "more self-contact than its buffers hold; "
+            "prepare the scene with a larger PairCapacity",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
             "resample the motion to a smaller timestep",
         }

@@ -7,9 +7,27 @@ never out of range.
 
 from __future__ import annotations
 
+import dataclasses
+from typing import NamedTuple
+
 import jax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
+
+
+@struct.dataclass
+class PhysicsConstants:
+    """Constants of a scene; traced, so that a change does not compile anew."""
+
+    gravity: Float[Array, ""] | float = 9.81  # [m/s^2], along -y
+    collision_stiffness: Float[Array, ""] | float = 3.5e7
+    """[J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt."""
+    collision_thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD), see `problem.contact_thickness`
+    friction_coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
+    friction_speed: Float[Array, ""] | float = 9e-4
+    """[m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5."""
+    repulsion_stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], between layers of cloth; as for the body
+    repulsion_thickness: Float[Array, ""] | float = 3e-3  # [m] (ContourCraft)
 
 
 @struct.dataclass
@@ -69,22 +87,10 @@ class Body:
 
 
 @struct.dataclass
-class BodyMotion:
-    """A body in motion: what a rollout reads, frame by frame."""
-
-    positions: Float[Array, "frames body_vertices 3"]  # [m]
-    joint_transforms: Float[Array, "frames joints 3 4"]  # rest point -> posed point
-    faces: Int[Array, "body_faces 3"]
-    is_obstacle: Bool[Array, " body_faces"]
-    timestep: Float[Array, ""]  # seconds between frames
-    rest_positions: Float[Array, "body_vertices 3"]  # in the rest pose that garments are made for [m]
-
-
-@struct.dataclass
 class BodySurface:
     """Part of a body that cloth can touch, with a two-level search structure.
 
-    Vertices are grouped into patches that stay together when the body bends: the nearest patches lead to the
+    Vertices are grouped into patches that stay together when the body bends. The nearest patches lead to the
     nearest vertex, and that vertex to the faces around it.
     """
 
@@ -95,6 +101,19 @@ class BodySurface:
     patch_vertices: Int[Array, "patches members"]  # padded by repetition
     vertex_faces: Int[Array, "surface_vertices candidates"]  # padded by repetition
     is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
+
+
+@struct.dataclass
+class BodyMotion:
+    """A body in motion: what a rollout reads, frame by frame."""
+
+    positions: Float[Array, "frames body_vertices 3"]  # [m]
+    joint_transforms: Float[Array, "frames joints 3 4"]  # rest point -> posed point
+    faces: Int[Array, "body_faces 3"]
+    is_obstacle: Bool[Array, " body_faces"]
+    timestep: Float[Array, ""]  # seconds between frames
+    rest_positions: Float[Array, "body_vertices 3"]  # in the rest pose that garments are made for [m]
+    surface: BodySurface  # all obstacle faces; a scene may search fewer, see `scene.plan_scene`
 
 
 @struct.dataclass
@@ -111,7 +130,7 @@ class ClothState:
 
 @struct.dataclass
 class Contacts:
-    """The nearest body point of every garment vertex, at both ends of a frame."""
+    """One body point for every garment vertex, at both ends of a frame."""
 
     points: Float[Array, "vertices 3"]  # on the body at frame t [m]
     next_points: Float[Array, "vertices 3"]  # the same material points at t + 1 [m]
@@ -122,37 +141,67 @@ class Contacts:
 
 
 @struct.dataclass
+class SceneBody:
+    """The body of a scene, as far as cloth can reach it."""
+
+    surface: BodySurface
+    positions: Float[Array, "frames surface_vertices 3"]  # [m], in the order of the surface
+    is_sharp: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
+
+
+@dataclasses.dataclass(frozen=True)
+class PairCapacity:
+    """Sizes of the buffers of self-contact; static, so a change compiles anew."""
+
+    pairs: int  # rows for pairs of a vertex and a face
+    faces: int  # faces looked at in a column of search cells
+
+
+@struct.dataclass
 class Scene:
-    """All that a rollout reads. What is None is not modelled: it is absent from the compiled step."""
+    """All that a rollout reads. A part that is None is not modelled: the compiled step does not hold it."""
 
     garment: Garment
     material: Material
-    start: ClothState
+    constants: PhysicsConstants
     timestep: Float[Array, ""]  # [s]
-    surface: BodySurface | None  # None: no body
-    body_positions: Float[Array, "frames surface_vertices 3"] | None  # [m], in the order of the surface
-    pin_targets: Float[Array, "frames vertices 3"] | None  # [m]; None: nothing is pinned
+    initial_state: ClothState
+    body: SceneBody | None
+    pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
     num_frames: int = struct.field(pytree_node=False)
+    self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
+
+
+class PotentialTerms(NamedTuple):
+    """The energies of one frame [J], or of many along a leading axis; zero where a term is not modelled."""
+
+    stretch: Float[Array, "*frames"]
+    bending: Float[Array, "*frames"]
+    inertia: Float[Array, "*frames"]
+    gravity: Float[Array, "*frames"]  # counted from the frame's first positions
+    collision: Float[Array, "*frames"]
+    friction: Float[Array, "*frames"]
+    repulsion: Float[Array, "*frames"]  # between layers of cloth
 
 
 @struct.dataclass
 class Trajectory:
-    """A simulated garment."""
+    """A simulated garment; frame 0 is the scene's initial state, for which what a frame reports is zero."""
 
-    positions: Float[Array, "frames vertices 3"]  # frame 0 is the skinned start
+    positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
-    residuals: Float[
-        Array, " frames"
-    ]  # force norm over weight at the end of each frame's step; 0 at the start
-    iterations: Int[Array, " frames"]  # solver or corrector iterations spent on each frame
-    status: Int[Array, ""]
-    first_bad_frame: Int[Array, ""]
-    needed_capacity: Int[Array, "frames 2"] | None = None
-    """What self-contact needed of `self_contact_capacity` and `self_contact_cell_capacity`; None without."""
+    friction_loads: Float[Array, "frames vertices"]  # normal forces that load the next frame's friction [N]
+    terms: PotentialTerms  # energies that each frame ended with [J], shape [frames]
+    residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame
+    iterations: Int[Array, " frames"]  # of the solver
+    status: Int[Array, ""]  # errors.Status bits
+    first_bad_frame: Int[Array, ""]  # -1 while status is OK
+    pair_demand: Int[Array, "frames 2"] | None = None
+    """What self-contact needed of `PairCapacity.pairs` and `.faces`; None where it is not modelled."""
 
     @property
     def num_frames(self) -> int:
-        """Number of frames, the start included."""
+        """Number of frames, frame 0 included."""
         return self.positions.shape[0]
 
 

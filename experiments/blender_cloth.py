@@ -34,7 +34,7 @@ from eslr_jax.errors import EslrError
 from eslr_jax.evaluation.hard_cases import Simulator, StressScene
 from eslr_jax.io.point_cache import write_pc2
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulate.scan import Frames, join_frames
+from eslr_jax.simulation.scan import Frames, join_frames
 from eslr_jax.types import Scene, Trajectory
 
 SECONDS_PER_FRAME = 1e-3**0.5  # of Blender's cloth, whatever the frame rate

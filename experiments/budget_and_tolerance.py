@@ -35,7 +35,7 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import rollout_in_chunks
 from eslr_jax.scene import prepare_scene, prepare_scenes
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parent / "results"

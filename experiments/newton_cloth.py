@@ -37,7 +37,7 @@ from eslr_jax.evaluation.hard_cases import Simulator, StressScene
 from eslr_jax.extras import require
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulate.scan import Frames, join_frames
+from eslr_jax.simulation.scan import Frames, join_frames
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other

@@ -49,8 +49,8 @@ from eslr_jax.extras import require
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulate.scan import frame_inputs, simulate_scene
-from eslr_jax.simulate.step import frame_problem, step
+from eslr_jax.simulation.scan import frame_inputs, simulate_scene
+from eslr_jax.simulation.step import frame_problem, step
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 RESULTS = Path(__file__).parent / "results"

@@ -21,7 +21,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
-from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.evaluation.calibrate import device_name
 from eslr_jax.evaluation.hard_cases import StressScene, find_case
 from eslr_jax.evaluation.hard_cases.simulators import shorten
@@ -31,7 +31,7 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import SceneOptions, prepare_scene
-from eslr_jax.simulate.scan import frame_inputs, simulate_scene
+from eslr_jax.simulation.scan import frame_inputs, simulate_scene
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parent / "results"

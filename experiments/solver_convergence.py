@@ -39,9 +39,9 @@ from eslr_jax.physics.preconditioner import hessian_diagonal, stiffness
 from eslr_jax.physics.problem import PhysicsParameters, pin, push_out, start_guess
 from eslr_jax.physics.start import solver_start
 from eslr_jax.scene import prepare_scene
-from eslr_jax.simulate.network import network_step
-from eslr_jax.simulate.scan import simulate_scene
-from eslr_jax.simulate.step import frame_problem
+from eslr_jax.simulation.network import network_step
+from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.simulation.step import frame_problem
 
 RESULTS = Path(__file__).resolve().parent / "results"
 COUNTS = (5, 10, 20, 50, 100, 200)  # L-BFGS iterations

@@ -36,7 +36,7 @@ from eslr_jax.evaluation.calibrate import (
 from eslr_jax.evaluation.report import environment, trajectory_report
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 
 RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split

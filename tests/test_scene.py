@@ -10,7 +10,7 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 
 
 @pytest.mark.parametrize("name", ["dress", "tshirt"])

@@ -28,7 +28,7 @@ from eslr_jax.physics.potential import PotentialTerms, potential, potential_term
 from eslr_jax.physics.problem import PhysicsParameters, start_guess
 from eslr_jax.render.colors import color_scale
 from eslr_jax.scene import initial_state
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from eslr_jax.simulation.step import FrameInput, frame_problem, solve
 
 
 def make_run(folder, body, name, scale=1.0):

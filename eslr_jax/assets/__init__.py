@@ -1,6 +1,6 @@
 """What is in the box: a name, or the path of a file, to a body, garment, motion or model."""
 
-from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits
+from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits, split_clips
 from eslr_jax.assets.load import (
     load_body,
     load_garment,
@@ -22,4 +22,5 @@ __all__ = [
     "load_motion",
     "load_splits",
     "prepare_stored",
+    "split_clips",
 ]

@@ -76,6 +76,19 @@ def is_intact(asset: Asset) -> bool:
 
 
 @cache
+def split_clips(split: str) -> tuple[str, ...]:
+    """Return the names of a split's clips.
+
+    Raises:
+        ConfigError: There is no such split, or it is empty.
+    """
+    motions = load_splits()["motions"]
+    if not motions.get(split):
+        known = ", ".join(name for name in motions if motions[name])
+        raise ConfigError(f"no clips in split {split!r}; there are {known}")
+    return tuple(motions[split])
+
+
 def load_splits() -> dict[str, Any]:
     """Return the split of clips and garments into train, validation, test and unseen."""
     return json.loads((data_folder() / "splits.json").read_text())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,9 @@ from eslr_jax.body import lbs
 from eslr_jax.body.joints import find_parts, torso_axes
 from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, leg_length, resample
 from eslr_jax.errors import MotionError
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.io.skeleton import Skeleton
-from eslr_jax.types import Body, BodyMotion
+from eslr_jax.types import Body, BodyMotion, BodySurface
 
 _ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is taken to face it
 
@@ -130,6 +131,22 @@ def pose_body(
         is_obstacle=body.is_obstacle,
         timestep=jnp.float32(1.0 / fps),
         rest_positions=rest,
+        surface=obstacle_surface(body),
+    )
+
+
+def obstacle_surface(body: Body) -> BodySurface:
+    """Return the search tables of all faces of a body that cloth may touch."""
+    faces = np.asarray(body.faces)[np.asarray(body.is_obstacle)]
+    return _search_tables(np.asarray(body.rest_positions).tobytes(), faces.tobytes())
+
+
+@lru_cache(maxsize=4)
+def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
+    """Build search tables once per body."""
+    return prepare_surface(
+        np.frombuffer(rest_positions, np.float32).reshape(-1, 3),
+        np.frombuffer(faces, np.int32).reshape(-1, 3),
     )
 
 
@@ -183,7 +200,7 @@ def _front(body: Body) -> np.ndarray:
 def _skin_body(body: Body, rest: jax.Array, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
     """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
     if body.pose_directions is None:
-        return _skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
+        return skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
     bends = jnp.asarray(rotations[:, 1:], jnp.float32)
     return _skin_bent(rest, body.pose_directions, body.skin_weights, body.skin_indices, bends, transforms)
 
@@ -203,11 +220,9 @@ def _skin_bent(rest, directions, weights, indices, rotations, transforms):
 
 
 @jax.jit
-def _skin_frames(positions, weights, indices, transforms):
-    """Skin frame by frame: a vmap would hold frames x vertices x influences matrices at once."""
+def skin_frames(positions, weights, indices, transforms):
+    """Return skinned positions of every frame [m], shape [frames, vertices, 3].
+
+    Skin frame by frame: a vmap would hold frames x vertices x influences matrices at once.
+    """
     return jax.lax.map(lambda frame: lbs.skin(positions, weights, indices, frame), transforms)
-
-
-def skin_garment(garment, transforms: jax.Array) -> jax.Array:
-    """Return a garment's skinned positions in every frame [m], shape [frames, vertices, 3]."""
-    return _skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)

@@ -8,6 +8,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from eslr_jax.body.motion import obstacle_surface
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import unique_edges
@@ -73,6 +74,7 @@ def pose_sequence(
         is_obstacle=body.is_obstacle,
         timestep=jnp.float32(1.0 / fps),
         rest_positions=body.rest_positions,
+        surface=obstacle_surface(body),
     )
     return body, motion
 

@@ -66,8 +66,8 @@ def parse_request(
         return parse_budget(budget), parse_share(tolerance or (None if budget else _TOLERANCE))
     if budget is not None or tolerance is not None:
         raise ConfigError(
-            "--budget and --tolerance choose the simulator and its iterations; leave out --simulator, --model, "
-            "--iterations and --corrector-steps"
+            "--budget and --tolerance choose the simulator and its iterations; leave out --simulator, --model "
+            "and --iterations"
         )
     return None, None
 
@@ -84,14 +84,15 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
         out: File to write to, instead of the one that `eslr simulate` reads.
     """
     from eslr_jax.assets.load import START_MODEL, default_model
-    from eslr_jax.evaluation.calibrate import cache_path, write_calibration
     from eslr_jax.evaluation.calibrate import calibrate as run
+    from eslr_jax.evaluation.report import environment
+    from eslr_jax.simulation.budget import cache_path, write_calibration
 
     use_compile_cache()
     with stderr.status("measuring"):
         measured = run(models or (START_MODEL, default_model()))
     path = out or cache_path()
-    write_calibration(measured, path)
+    write_calibration(measured, path, environment())
     table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "gap after 20", box=None)
     for method in measured.methods:
         table.add_row(

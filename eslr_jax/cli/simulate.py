@@ -15,8 +15,8 @@ from eslr_jax.cli.budget import parse_request
 from eslr_jax.cli.console import app, progress, stderr, use_compile_cache
 from eslr_jax.errors import AssetError, ConfigError, MissingExtraError
 
-_ITERATIONS = 100  # of the physics simulator: 0.002 % above the optimum in the median, 1k
-_CORRECTOR_STEPS = 10
+_ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
+_BEHIND_NETWORK = 10  # likewise behind a network
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
 
@@ -31,7 +31,6 @@ def simulate(
     fabric: tuple[str, ...] = (),
     frames: int | None = None,
     iterations: int | None = None,
-    corrector_steps: int | None = None,
     budget: str | None = None,
     tolerance: str | None = None,
     joint_map: Path | None = None,
@@ -55,15 +54,15 @@ def simulate(
             cmu_016_32.
         body: Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
             character (glTF, FBX), or a moving mesh (.npz, or a folder of OBJ or PLY files).
-        simulator: A trained network, or the physics solver.
+        simulator: The solver alone (physics), or with a trained network in front (network).
         model: Name of a bundled network or an exported file; the default network if a network is asked for and
             none is named.
         vertices: Resolution of a bundled garment.
         fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
             density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
         frames: Simulate this many frames, the start included; all if not given.
-        iterations: Solver iterations per frame of the physics simulator; 100 if not given.
-        corrector_steps: Solver iterations behind the network, 10 if not given; 0 is the network alone.
+        iterations: Iterations of the solver per frame. By default 100, and 10 behind a network; with 0 the network
+            stays alone.
         budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it,
             and keep to it while it runs.
         tolerance: OptimalityOptimality gap relative to what a frame gains, such as 1%: choose the fastest
@@ -90,17 +89,18 @@ def simulate(
     from eslr_jax.assets import load_garment_file, load_model, prepare_stored
     from eslr_jax.assets.load import default_model
     from eslr_jax.config import SimConfig
-    from eslr_jax.evaluation.calibrate import SOLVER, choose, keep_budget, read_calibration
     from eslr_jax.evaluation.report import environment, trajectory_report
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import describe_fit
     from eslr_jax.io.garment import write_garment_npz
-    from eslr_jax.rollout import more_room, raise_for_status, rollout_in_chunks
-    from eslr_jax.scene import prepare_scene
+    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+    from eslr_jax.simulation.budget import SOLVER, choose, keep_budget, read_calibration
+    from eslr_jax.simulation.simulate import simulate as run_simulation
 
-    is_chosen = simulator is None and model is None and iterations is None and corrector_steps is None
+    is_chosen = simulator is None and model is None and iterations is None
     budget_ms, share = parse_request(budget, tolerance, is_chosen=is_chosen)
-    _check_iterations(simulator, iterations, corrector_steps)
+    if simulator == "physics" and model is not None:
+        raise ConfigError(f"--simulator physics has no network; leave out --model {model}")
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = _load_actor(
             body, motion, frames, joint_map=joint_map, up=motion_up, arm_abduction=arm_abduction, fps=body_fps
@@ -113,8 +113,8 @@ def simulate(
             )
             simulator = "physics" if choice.method == SOLVER else "network"
             model = None if choice.method == SOLVER else choice.method
-            iterations = corrector_steps = choice.iterations
-        simulator = simulator or "network"
+            iterations = choice.iterations
+        simulator = simulator or ("physics" if iterations is not None and model is None else "network")
         params, architecture = None, None
         options: dict[str, Any] = {}
         if simulator == "network":
@@ -129,28 +129,23 @@ def simulate(
         # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
         unseen = beyond_training(material) if simulator == "network" and share is None else ()
         _check_skin(garment, cloth, rig, body)
-        scene = prepare_scene(cloth, poses, material=material)
+        scene = prepare_scene(
+            cloth, poses, material=material, options=SceneOptions(self_contact=self_contact)
+        )
     if unseen:
         text = f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics"
         stderr.print(text, markup=False, highlight=False, soft_wrap=True)
     if "fit" in stored.metadata:
         stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
+    usual = _ITERATIONS if architecture is None else _BEHIND_NETWORK
     config = SimConfig(
-        simulator=simulator,
         model=architecture,
-        solver_iterations=_ITERATIONS if iterations is None else iterations,
-        corrector_steps=_CORRECTOR_STEPS if corrector_steps is None else corrector_steps,
+        iterations=usual if iterations is None else iterations,
         tolerance=0.0 if choice is None else choice.tolerance,
-        self_contact=self_contact,
     )
     pace = None if choice is None or budget_ms is None else keep_budget(choice, budget_ms)
-    larger: SimConfig | None = config
-    while larger is not None:
-        config = larger
-        with progress("simulating", scene.num_frames - 1) as advance:
-            trajectory, timing = rollout_in_chunks(params, scene, config=config, pace=pace, on_frames=advance)
-        larger = more_room(trajectory, config)
-    raise_for_status(trajectory)
+    with progress("simulating", scene.num_frames - 1) as advance:
+        trajectory, timing, scene = run_simulation(params, scene, config=config, pace=pace, on_frames=advance)
     if budget_ms is not None and timing.frame_ms > _KEPT * budget_ms:
         text = (
             f"missed --budget {budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells what the "
@@ -165,32 +160,23 @@ def simulate(
             "simulator": simulator,
             "model": model,
             "self_contact": self_contact,
-            **trajectory_report(trajectory, scene, config=config),
+            **trajectory_report(trajectory, scene),
             "choice": None if choice is None else dataclasses.asdict(choice),
             "frame_ms": timing.frame_ms,
             "compile_s": timing.compile_s,
             **environment(),
         }
-    positions = np.asarray(trajectory.positions)
     with stderr.status("writing files"):
-        _write_motion(out, positions, np.asarray(trajectory.velocities), scene, rig, poses, report)
+        with atomic_write(out / "report.json") as temporary:
+            temporary.write_text(json.dumps(report, indent=2))
         write_garment_npz(out / "garment.npz", stored)
+        _write_motion(out, trajectory, scene, rig, poses)
     if pictures:
-        _write_sheet(out, positions, cloth, poses)
-    with atomic_write(out / "report.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2))
+        _write_sheet(out, np.asarray(trajectory.positions), cloth, poses)
     if json_:
         print(json.dumps(report, indent=2))
     else:
         _print_report(report, out)
-
-
-def _check_iterations(simulator: str | None, iterations: int | None, corrector_steps: int | None) -> None:
-    """Refuse iterations of a simulator that was not asked for."""
-    if iterations is not None and simulator != "physics":
-        raise ConfigError("--iterations is for --simulator physics; a network takes --corrector-steps")
-    if corrector_steps is not None and simulator == "physics":
-        raise ConfigError("--corrector-steps is for a network; --simulator physics takes --iterations")
 
 
 def _load_actor(
@@ -238,39 +224,40 @@ def _check_skin(garment: str, cloth, rig, body: str) -> None:
         )
 
 
-def _write_motion(out: Path, positions, velocities, scene, rig, poses, report: dict[str, Any]) -> None:
+def _write_motion(out: Path, trajectory, scene, rig, poses) -> None:
     """Write the trajectory and the animated GLB."""
     import numpy as np
 
     from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
     from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR, SkinnedMesh
-    from eslr_jax.io.trajectory import write_trajectory
+    from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
 
-    faces = np.asarray(scene.garment.faces)
+    positions, faces = np.asarray(trajectory.positions), np.asarray(scene.garment.faces)
     timestep = float(poses.timestep)
-    contact_faces, contact_boundary, surface = (
-        np.empty((0, 3), np.int32),
-        np.empty(0, np.int32),
-        scene.surface,
-    )
-    if surface is not None:
+    contact_faces, contact_boundary = np.empty((0, 3), np.int32), np.empty(0, np.int32)
+    if scene.body is not None:
+        surface = scene.body.surface
         vertex_ids = np.asarray(surface.vertex_ids)
-        contact_faces, contact_boundary = (
-            vertex_ids[np.asarray(surface.faces)],
-            vertex_ids[surface.is_boundary],
-        )
-    write_trajectory(
-        out / "trajectory.npz",
-        positions=positions,
-        velocities=velocities,
-        faces=faces,
-        timestep=timestep,
-        body_positions=np.asarray(poses.positions),
-        body_faces=np.asarray(poses.faces),
-        body_rest_positions=np.asarray(poses.rest_positions),
+        contact_faces = vertex_ids[np.asarray(surface.faces)]
+        contact_boundary = vertex_ids[np.asarray(surface.is_boundary)]
+    body = BodyTrack(
+        positions=np.asarray(poses.positions),
+        faces=np.asarray(poses.faces),
+        rest_positions=np.asarray(poses.rest_positions),
         contact_faces=contact_faces,
         contact_boundary=contact_boundary,
-        metadata=report,
+    )
+    write_trajectory(
+        out / "trajectory.npz",
+        TrajectoryFile(
+            positions=positions,
+            velocities=np.asarray(trajectory.velocities),
+            faces=faces,
+            timestep=timestep,
+            body=body,
+            friction_loads=np.asarray(trajectory.friction_loads),
+            material=scene.material,
+        ),
     )
     meshes, skinned = [AnimatedMesh("garment", positions, faces)], None
     if rig.pose_directions is None and rig.parents.count(-1) == 1:

@@ -78,15 +78,15 @@ def train(
     if start_from is not None:
         initial, _ = load_model(start_from)
         check_params(chosen.model, initial)
-    with _training_progress(chosen.iterations, out if tensorboard else None) as show:
+    with _training_progress(chosen.steps, out if tensorboard else None) as show:
         state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
     if not is_first_process():
         return
     plot_curves(out)
-    done = int(state.iteration)
-    if done < chosen.iterations:
+    done = int(state.step)
+    if done < chosen.steps:
         stderr.print(
-            f"stopped at iteration {done} of {chosen.iterations}; go on with: eslr train --out {out} --resume",
+            f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume",
             markup=False,
         )
     else:
@@ -113,7 +113,7 @@ def _join_processes(coordinator: str, num_processes: int | None, process_id: int
 
 @contextlib.contextmanager
 def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
-    """Show iterations per second, the loss, its terms and the time left.
+    """Show steps per second, the loss, its terms and the time left.
 
     Raises:
         MissingExtraError: TensorBoard's event files are asked for and its writer is not installed.

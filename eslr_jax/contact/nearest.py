@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, vertex_normals
-from eslr_jax.types import BodySurface, Contacts
+from eslr_jax.types import BodySurface, Contacts, Garment
 
 _NEAREST_PATCHES = 4  # patches whose vertices are tried
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
 _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
+_PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
+_CLEARANCE = 2e-3  # [m] at which they leave it; the collision thickness
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 
 
@@ -253,3 +256,29 @@ def approach(
 ) -> Float[Array, " vertices"]:
     """Return by how much body points move along their normals during the frame, towards the cloth [m]."""
     return jnp.sum((next_points - points) * normals, axis=-1)
+
+
+def clear_of_body(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+    garment: Garment,
+) -> Float[Array, "vertices 3"]:
+    """Return positions [m], shape [vertices, 3], with vertices inside the body moved onto it; pinned ones stay.
+
+    Args:
+        position: Garment vertices [m], shape [vertices, 3].
+        body: Surface vertices [m], shape [surface_vertices, 3].
+        surface: Search tables.
+        garment: Says which vertices are pinned.
+    """
+
+    def project(_, position):
+        contacts = find_contacts(position, body, body, surface)
+        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
+        height = jnp.minimum(height, contacts.distances)
+        lift = jnp.where(contacts.is_near, jnp.maximum(_CLEARANCE - height, 0.0), 0.0)
+        lift = jnp.where(garment.is_pinned, 0.0, lift)
+        return position + lift[:, None] * contacts.normals
+
+    return jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.contact.nearest import point_triangle
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3
-from eslr_jax.types import Garment
+from eslr_jax.types import Garment, PairCapacity
 
 TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
 # [m] within which layers see each other: they may approach by this much in a frame. At 0.02 the walls of a pleat
@@ -55,14 +55,18 @@ class _Grid(NamedTuple):
     cell_size: Float[Array, ""]  # [m]
 
 
+def default_capacity(num_vertices: int) -> PairCapacity:
+    """Return the buffers that self-contact starts with, for a garment of so many vertices."""
+    return PairCapacity(pairs=PAIRS_PER_VERTEX * num_vertices, faces=CELL_CAPACITY)
+
+
 def find_self_contacts(
     position: Float[Array, "vertices 3"],
     predicted: Float[Array, "vertices 3"],
     garment: Garment,
+    capacity: PairCapacity,
     *,
-    radius: Float[Array, ""] | float = SEARCH_RADIUS,
-    capacity: int | None = None,
-    cell_capacity: int = CELL_CAPACITY,
+    radius: float = SEARCH_RADIUS,
 ) -> FacePairs:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
@@ -72,24 +76,14 @@ def find_self_contacts(
     of it that are also within 2 cm in the rest mesh.
 
     Args:
-        position: Vertices at t [m].
-        predicted: A guess of the vertices at t + 1 [m], such as the inertial one.
+        position: Vertices at t [m], shape [vertices, 3].
+        predicted: A guess of the vertices at t + 1 [m], such as the inertial one, shape [vertices, 3].
         garment: Rest mesh.
-        radius: Of the search [m].
-        capacity: Rows for pairs; eight per vertex by default. Static.
-        cell_capacity: Faces looked at in a column of three cells, and, as a mean over vertices, faces whose
-            centroid is close; static.
+        capacity: Sizes of the buffers; static.
+        radius: Radius of the search [m].
     """
-    capacity = PAIRS_PER_VERTEX * position.shape[0] if capacity is None else capacity
-    pairs = _find_pairs(
-        _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, is_cloth=True),
-        position,
-        predicted,
-        garment,
-        radius=radius,
-        capacity=capacity,
-        cell_capacity=cell_capacity,
-    )
+    points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, is_cloth=True)
+    pairs = _find_pairs(points, _Cloth(position, predicted, garment), radius, capacity)
     is_around = _is_around(pairs.vertices, pairs.corners, garment)
     return dataclasses.replace(pairs, side=jnp.where(is_around, 0.0, pairs.side))
 
@@ -100,39 +94,24 @@ def find_tip_contacts(
     body: Float[Array, "surface_vertices 3"],
     next_body: Float[Array, "surface_vertices 3"],
     garment: Garment,
-    *,
-    radius: Float[Array, ""] | float = TIP_RADIUS,
-    capacity: int | None = None,
-    cell_capacity: int = _TIP_CELL_CAPACITY,
 ) -> FacePairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 
-    The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh; its own
-    vertices see the faces.
+    The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh. The body's
+    own vertices see the faces.
 
     Args:
-        position: Cloth vertices at t [m].
-        predicted: A guess of them at t + 1 [m].
-        body: Body vertices at t [m].
-        next_body: At t + 1 [m].
+        position: Cloth vertices at t [m], shape [vertices, 3].
+        predicted: A guess of the cloth vertices at t + 1 [m], shape [vertices, 3].
+        body: Body vertices at t [m], shape [surface_vertices, 3].
+        next_body: Body vertices at t + 1 [m], shape [surface_vertices, 3].
         garment: Rest mesh.
-        radius: Of the search [m].
-        capacity: Rows for pairs; eight per vertex of cloth and body by default. Static.
-        cell_capacity: See `find_self_contacts`.
     """
-    capacity = PAIRS_PER_TIP * (position.shape[0] + body.shape[0]) if capacity is None else capacity
-    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
     count = body.shape[0]
+    capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count), _TIP_CELL_CAPACITY)
+    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
     points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), is_cloth=False)
-    return _find_pairs(
-        points,
-        position,
-        predicted,
-        garment,
-        radius=radius,
-        capacity=capacity,
-        cell_capacity=cell_capacity,
-    )
+    return _find_pairs(points, _Cloth(position, predicted, garment), TIP_RADIUS, capacity)
 
 
 class _Points(NamedTuple):
@@ -145,39 +124,39 @@ class _Points(NamedTuple):
     is_cloth: bool  # the points are the vertices of the faces
 
 
-def _find_pairs(
-    points: _Points,
-    position: Float[Array, "vertices 3"],
-    predicted: Float[Array, "vertices 3"],
-    garment: Garment,
-    *,
-    radius: Float[Array, ""] | float,
-    capacity: int,
-    cell_capacity: int,
-) -> FacePairs:
+class _Cloth(NamedTuple):
+    """Whose faces the points are paired with."""
+
+    position: Float[Array, "vertices 3"]  # at t [m]
+    predicted: Float[Array, "vertices 3"]  # at t + 1 [m]
+    garment: Garment
+
+
+def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
-    num_points, num_vertices = points.position.shape[0], position.shape[0]
-    corners = [_gather(position, garment.faces[:, k]) for k in range(3)]
+    garment = cloth.garment
+    num_points, num_vertices = points.position.shape[0], cloth.position.shape[0]
+    corners = [_gather(cloth.position, garment.faces[:, k]) for k in range(3)]
     centroid = _mean(corners)
     reach = _largest_reach(corners, centroid, garment.rest_areas > 0)
     grid = _sort_faces(centroid, garment.rest_areas > 0, radius + reach)
-    faces, is_listed, most = _listed_faces(points.position, grid, cell_capacity)
+    faces, is_listed, most = _listed_faces(points.position, grid, capacity.faces)
     # First by distance of centroids, which is cheap, then exactly.
     x, y, z = components(points.position)
     listed = (centroid[0][faces], centroid[1][faces], centroid[2][faces])
     squared = _squared_distance((x[:, None], y[:, None], z[:, None]), listed)
     is_close = is_listed & points.mask[:, None] & (squared < grid.cell_size**2)
-    limit = cell_capacity * num_points
+    limit = capacity.faces * num_points
     rows, num_close = _compact(is_close.ravel(), limit)
     point = jnp.minimum(rows // faces.shape[1], num_points - 1)
     face = faces.ravel()[jnp.minimum(rows, faces.size - 1)]
-    is_pair, weights, side = _is_pair(point, face, points, position, predicted, garment, radius)
-    rows, count = _compact(is_pair & (jnp.arange(limit) < num_close), capacity)
-    is_used = jnp.arange(capacity) < count
+    is_pair, weights, side = _is_pair(point, face, points, cloth, radius)
+    rows, count = _compact(is_pair & (jnp.arange(limit) < num_close), capacity.pairs)
+    is_used = jnp.arange(capacity.pairs) < count
     rows = jnp.minimum(rows, limit - 1)
     point = jnp.where(is_used, point[rows], num_points - 1)
     listed = jnp.maximum(most, -(-num_close // num_points))
-    is_full = (listed > cell_capacity) | (count > capacity)
+    is_full = (listed > capacity.faces) | (count > capacity.pairs)
     return FacePairs(
         vertices=point,
         corners=jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1),
@@ -259,21 +238,19 @@ def _is_pair(
     point: Int[Array, " rows"],
     face: Int[Array, " rows"],
     points: _Points,
-    position: Float[Array, "vertices 3"],
-    predicted: Float[Array, "vertices 3"],
-    garment: Garment,
-    radius: Float[Array, ""] | float,
+    cloth: _Cloth,
+    radius: float,
 ) -> tuple[Bool[Array, " rows"], Float[Array, "rows 3"], Float[Array, " rows"]]:
     """Return which rows are pairs, the barycentric weights of the nearest place, and the point's side."""
-    corner = garment.faces[face]
+    corner = cloth.garment.faces[face]
     here = _gather(points.position, point)
-    a, b, c = (_gather(position, corner[:, k]) for k in range(3))
+    a, b, c = (_gather(cloth.position, corner[:, k]) for k in range(3))
     squared, u, v = point_triangle(here, a, b, c)
     weights = (1.0 - u - v, u, v)
     height, size = _height(here, (a, b, c), weights)
-    moved = [_gather(predicted, corner[:, k]) for k in range(3)]
+    moved = [_gather(cloth.predicted, corner[:, k]) for k in range(3)]
     predicted_height, _ = _height(_gather(points.predicted, point), moved, weights)
-    side = jnp.where(height < 0, -1.0, 1.0).astype(position.dtype)
+    side = jnp.where(height < 0, -1.0, 1.0).astype(squared.dtype)
     is_over = jnp.abs(height) >= _MIN_COSINE * jnp.sqrt(squared)
     is_reached = (squared < _NEAR**2) | (side * predicted_height < _NEAR)
     is_pair = (squared < jnp.square(radius)) & is_over & is_reached & (size > 0)

@@ -8,23 +8,22 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.spatial import cKDTree
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
 from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.errors import ConfigError, MissingExtraError
-from eslr_jax.evaluation.gap import ITERATIONS, OptimalityGap, measure_gap
+from eslr_jax.errors import ConfigError
+from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, measure_gap
 from eslr_jax.evaluation.metrics import measure_frames
-from eslr_jax.evaluation.referee import Referee
+from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scene, shared_surface
-from eslr_jax.simulate.scan import simulate_scene
-from eslr_jax.types import Garment, Trajectory
+from eslr_jax.scene.plan import prepare_scene, shared_surface
+from eslr_jax.simulation.simulate import try_simulate
+from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the drop from the optimum
-_JUDGED_EVERY = 30  # frames; the referee takes a tenth of a second for each
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
 
@@ -59,7 +58,7 @@ def evaluate(
     model: ModelConfig,
     options: EvaluationOptions,
     *,
-    corrector_steps: int = 0,
+    iterations: int = 0,
     on_scene: Callable[[int, int, str], None] = lambda done, total, label: None,
 ) -> dict[str, Any]:
     """Evaluate a model.
@@ -68,7 +67,7 @@ def evaluate(
         params: Weights.
         model: Architecture.
         options: Split, garments, clips and lengths.
-        corrector_steps: Solver iterations behind the network.
+        iterations: Solver iterations behind the network.
         on_scene: Called after each garment and clip with the count, the total and a label.
 
     Returns:
@@ -80,7 +79,7 @@ def evaluate(
     """
     garments = options.garments or tuple(load_splits()["garments"]["train"])
     clips = options.clips or split_clips(options.split)
-    config = SimConfig(simulator="network", model=model, corrector_steps=corrector_steps)
+    config = SimConfig(model=model, iterations=iterations)
     body = load_body()
     scenes, forced, policy = [], [], []
     drifts: dict[str, float] = {}
@@ -131,20 +130,6 @@ def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> li
     )
 
 
-def split_clips(split: str) -> tuple[str, ...]:
-    """Return the clips of a split.
-
-    Raises:
-        ConfigError: There is no such split, or it is empty.
-    """
-    motions = load_splits()["motions"]
-    if not motions.get(split):
-        raise ConfigError(
-            f"no clips in split {split!r}; there are {', '.join(name for name in motions if motions[name])}"
-        )
-    return tuple(motions[split])
-
-
 def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion:
     """Return a motion of at least `num_frames` frames at `fps`, played forwards and backwards by turns."""
     needed = int(np.ceil(num_frames * motion.fps / fps)) + 1
@@ -157,26 +142,13 @@ def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion
     )
 
 
-def _gaps(params: Any, scene, config: SimConfig, every: int) -> tuple[OptimalityGap, OptimalityGap]:
-    """Return the gap from the optimum's states and from those of the model's own rollout."""
-    parameters = PhysicsParameters()
-    truth = SimConfig(simulator="physics", solver_iterations=_TRUTH_ITERATIONS)
+def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[OptimalityGap, OptimalityGap]:
+    """Return the gaps from the optimum's states and from those of the network's own rollout."""
+    options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
-    for weights, simulator in ((None, truth), (params, config)):
-        trajectory = simulate_scene(weights, scene, parameters, simulator)
-        measured.append(
-            jax.device_get(
-                measure_gap(
-                    params,
-                    trajectory,
-                    scene,
-                    parameters,
-                    config,
-                    every=every,
-                    corrector_steps=(config.corrector_steps,),
-                )
-            )
-        )
+    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS)), (params, config)):
+        trajectory = try_simulate(weights, scene, config=steps).trajectory
+        measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
     return measured[0], measured[1]
 
 
@@ -187,13 +159,13 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
         return np.concatenate([np.asarray(pick(entry)) for entry in measured])
 
     optimum = join(lambda entry: entry.optimum)
-    drop = join(lambda entry: entry.initial_gap)
+    initial_gap = join(lambda entry: entry.initial_gap)
 
     def medians(energy: np.ndarray) -> dict[str, float]:
         gap = energy - optimum
         return {
             "gap_median_j": float(np.median(gap)),
-            "gap_relative_median": float(np.median(gap / drop)),
+            "gap_relative_median": float(np.median(gap / initial_gap)),
             "gap_mean_j": float(np.mean(gap)),
             "gap_p90_j": float(np.quantile(gap, 0.9)),
         }
@@ -201,27 +173,27 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
     lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}
     return {
         "frames": len(optimum),
-        **medians(join(lambda entry: next(iter(entry.corrected.values())))),
+        **medians(join(lambda entry: next(iter(entry.refined.values())))),
         "lbfgs": lbfgs,
     }
 
 
-def _free_rollout(params: Any, scene, config: SimConfig) -> dict[str, Any]:
+def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any]:
     """Return the measures of one free rollout, beside those of the solver's on the same scene."""
-    measured = _measure_rollout(simulate_scene(params, scene, PhysicsParameters(), config), scene)
-    near_optimum = SimConfig(simulator="physics", solver_iterations=_REFERENCE_ITERATIONS)
-    reference = simulate_scene(None, scene, PhysicsParameters(), near_optimum)
-    return {**measured, "optimum": _measure_rollout(reference, scene)}
+    measured = measure_rollout(try_simulate(params, scene, config=config).trajectory, scene)
+    near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
+    reference = try_simulate(None, scene, config=near_optimum).trajectory
+    return {**measured, "optimum": measure_rollout(reference, scene)}
 
 
-def _measure_rollout(trajectory: Trajectory, scene) -> dict[str, Any]:
-    """Return the measures of one trajectory."""
-    measures = jax.device_get(measure_frames(trajectory, scene, PhysicsParameters()))
+def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
+    """Return plain measures of a trajectory on a scene with a body."""
+    measures = jax.device_get(measure_frames(trajectory, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
-    terms = {name: float(np.mean(values)) for name, values in measures.terms._asdict().items()}
+    terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}
     depth = -np.asarray(measures.distances)[:, is_real]
-    body = np.asarray(scene.body_positions)
+    body = np.asarray(scene.body.positions)
     jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
     return {
         "finite": bool(np.isfinite(positions).all()),
@@ -232,34 +204,12 @@ def _measure_rollout(trajectory: Trajectory, scene) -> dict[str, Any]:
         "penetration_p999_mm": float(max(np.quantile(depth, 0.999), 0.0) * 1e3),
         "jitter_m_s3": float(np.median(np.linalg.norm(jerk, axis=-1))),
         "coverage": _coverage(positions[-1], body[-1]),
-        "intersections": _intersections(np.asarray(trajectory.positions), body, scene),
     }
 
 
-def _intersections(positions: np.ndarray, body: np.ndarray, scene) -> dict[str, float] | None:
-    """Return intersecting pairs of triangles per frame, by the referee; None where it is not installed."""
-    garment = scene.garment
-    is_real = np.asarray(garment.rest_areas) > 0
-    try:
-        referee = Referee(
-            np.asarray(garment.faces)[is_real],
-            len(positions[0]),
-            np.asarray(scene.surface.faces),
-            len(body[0]),
-        )
-    except MissingExtraError:
-        return None
-    frames = range(_JUDGED_EVERY, len(positions), _JUDGED_EVERY)
-    verdicts = [referee.judge(positions[frame], body[frame]) for frame in frames]
-    return {
-        name: float(np.mean([getattr(verdict, name) for verdict in verdicts]))
-        for name in ("cloth_cloth", "cloth_body")
-    }
-
-
-def _drift(params: Any, scene, config: SimConfig) -> float:
+def _drift(params: Any, scene: Scene, config: SimConfig) -> float:
     """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s]."""
-    trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
+    trajectory = try_simulate(params, scene, config=config).trajectory
     areas = np.asarray(scene.garment.vertex_areas)
     centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
     frames = round(1.0 / float(scene.timestep))
@@ -269,8 +219,6 @@ def _drift(params: Any, scene, config: SimConfig) -> float:
 
 def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float:
     """Return the share of the reachable body vertices that lie within `reach` [m] of the cloth."""
-    from scipy.spatial import cKDTree
-
     distance, _ = cKDTree(cloth).query(body, distance_upper_bound=reach)
     return float(np.isfinite(distance).mean())
 
@@ -285,12 +233,8 @@ def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
             name: float(np.mean([scene[name] for scene in scenes]))
             for name in ("total", "jitter_m_s3", "coverage")
         },
-        **{
-            group: {
-                name: float(np.mean([scene[group][name] for scene in scenes])) for name in scenes[0][group]
-            }
-            for group in ("terms", "intersections")
-            if scenes[0][group] is not None
+        "terms": {
+            name: float(np.mean([scene["terms"][name] for scene in scenes])) for name in scenes[0]["terms"]
         },
     }
     if "optimum" in scenes[0]:

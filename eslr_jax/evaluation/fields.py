@@ -12,26 +12,34 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from eslr_jax.assets import prepare_stored
-from eslr_jax.config import SimConfig
-from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.gap import map_answers, trajectory_states
+from eslr_jax.evaluation.gap import find_friction_loads, map_frames
 from eslr_jax.fabric import garment_material
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters
-from eslr_jax.scene import initial_state
-from eslr_jax.simulate.step import FrameInput, solve
-from eslr_jax.types import ClothState, Garment, Material, Scene
+from eslr_jax.physics.potential import evaluate, potential, potential_terms
+from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
+from eslr_jax.physics.solve import Start, solve
+from eslr_jax.scene.build import initial_state
+from eslr_jax.simulation.frame import frame_inputs
+from eslr_jax.types import (
+    ClothState,
+    Garment,
+    Material,
+    PhysicsConstants,
+    PotentialTerms,
+    Scene,
+    SceneBody,
+)
 
 FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
 _CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
-_PARAMETERS = PhysicsParameters()
 _ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
 _QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
 
@@ -61,7 +69,7 @@ def run_field(run: Run, name: str) -> Field:
     """
     if name not in FIELDS:
         raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
-    if name in _BODY_FIELDS and run.trajectory.body_positions is None:
+    if name in _BODY_FIELDS and run.trajectory.body is None:
         raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
     if name == "repulsion-energy" and not run.report.get("self_contact"):
         raise AssetError(f"{run.name} has no {name}: it was simulated without --self-contact")
@@ -88,7 +96,10 @@ def _prepared(run: Run) -> tuple[Garment, Material]:
         one, zero = np.ones((len(first), 1)), np.zeros((len(first), 1), np.int64)
         stored = GarmentFile(first, faces, one, zero, np.zeros(len(first), bool))
     garment = prepare_stored(stored, name=run.name, allow_components=True)
-    return garment, garment_material(run.report.get("fabric", ()), garment, stored)
+    material = run.trajectory.material
+    if material is None:  # a run of an older version
+        material = garment_material(run.report.get("fabric", ()), garment, stored)
+    return garment, material
 
 
 @jax.jit
@@ -110,24 +121,22 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
     """Return the scene of a run as its folder tells it: with the faces it searched, and pins as they moved."""
     trajectory = run.trajectory
     positions, velocities = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)
-    surface = body = None
-    if has_contact and trajectory.body_positions is not None:
-        if trajectory.body_rest_positions is None or trajectory.contact_faces is None:
-            raise AssetError(f"{run.name} lacks its body's rest pose, which contacts need; simulate it again")
-        if len(trajectory.contact_faces):
-            surface = prepare_surface(
-                trajectory.body_rest_positions, trajectory.contact_faces, boundary=trajectory.contact_boundary
-            )
-            body = jnp.asarray(trajectory.body_positions)[:, surface.vertex_ids]
+    body = None
+    if has_contact and trajectory.body is not None and len(trajectory.body.contact_faces):
+        track = trajectory.body
+        surface = prepare_surface(track.rest_positions, track.contact_faces, boundary=track.contact_boundary)
+        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids])
+    has_layers = has_contact and bool(run.report.get("self_contact"))
     return Scene(
         garment=garment,
         material=material,
-        start=initial_state(positions[0], velocities[0]),
+        constants=PhysicsConstants(),
+        initial_state=initial_state(positions[0], velocities[0]),
         timestep=jnp.float32(trajectory.timestep),
-        surface=surface,
-        body_positions=body,
+        body=body,
         pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
         num_frames=trajectory.num_frames,
+        self_contact=default_capacity(positions.shape[1]) if has_layers else None,
     )
 
 
@@ -136,39 +145,35 @@ def _problem_values(
 ) -> Float[np.ndarray, "frames vertices"]:
     """Return a value [J] of the frames' minimisation problems; the first frame has none."""
     scene = _scene(run, garment, material, has_contact=name in _CONTACT_FIELDS)
-    config = SimConfig(simulator="physics", self_contact=bool(run.report.get("self_contact", False)))
-    states, inputs = trajectory_states(run.trajectory, scene, _PARAMETERS)
-    answers = jnp.asarray(run.trajectory.positions[1:])
-    values = np.asarray(_every_frame(name, answers, states, inputs, scene, config))
+    positions, velocities = jnp.asarray(run.trajectory.positions), jnp.asarray(run.trajectory.velocities)
+    loads = run.trajectory.friction_loads
+    if loads is None:  # a run of an older version, or somebody else's
+        loads = find_friction_loads(positions, velocities, scene)
+    before = initial_state(positions[0], velocities[0])
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(positions) - 1, *leaf.shape)), before)
+    states = states.replace(
+        position=positions[:-1], velocity=velocities[:-1], friction_load=jnp.asarray(loads)[:-1]
+    )
+    values = np.asarray(_every_frame(name, positions[1:], states, scene))
     return np.concatenate([np.zeros_like(values[:1]), values])
 
 
-@partial(jax.jit, static_argnames=("name", "config"))
+@partial(jax.jit, static_argnames="name")
 def _every_frame(
-    name: str,
-    answers: Float[Array, "answers vertices 3"],
-    states: ClothState,
-    inputs: FrameInput,
-    scene: Scene,
-    config: SimConfig,
-) -> Float[Array, "answers vertices"]:
-    """State the problem of every frame and return a value of its answer [J]."""
-    garment, material = scene.garment, scene.material
+    name: str, reached: Float[Array, "frames vertices 3"], states: ClothState, scene: Scene
+) -> Float[Array, "frames vertices"]:
+    """State the problem of every frame and return a value of where the cloth went [J]."""
 
-    def measure(answer: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
+    def measure(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
         if name == "gap":
-            return gap_shares(answer, problem, garment, material)
-        return energy_shares(name.removesuffix("-energy"), answer, problem, garment, material)
+            return gap_shares(position, problem)
+        return energy_shares(name.removesuffix("-energy"), position, problem)
 
-    return map_answers(measure, answers, states, inputs, scene, _PARAMETERS, config)
+    return map_frames(measure, reached, states, frame_inputs(scene), scene)
 
 
 def energy_shares(
-    term: str,
-    position: Float[Array, "vertices 3"],
-    problem: FrameProblem,
-    garment: Garment,
-    material: Material,
+    term: str, position: Float[Array, "vertices 3"], problem: FrameProblem
 ) -> Float[Array, " vertices"]:
     """Share one term of the potential out over the vertices [J]; the shares add up to it.
 
@@ -176,38 +181,34 @@ def energy_shares(
     mean of factors at its vertices: the gradient by these is what each vertex holds.
 
     Args:
-        term: Of `PotentialTerms`.
-        position: Positions at t + 1 [m].
+        term: Name of an entry of `PotentialTerms`.
+        position: Positions at t + 1 [m], shape [vertices, 3].
         problem: The frame's problem.
-        garment: Rest mesh.
-        material: Fabric.
     """
+    garment, material = problem.garment, problem.material
 
     def total(factors: Float[Array, " vertices"]) -> Float[Array, ""]:
         on_faces, on_hinges = (factors[rows].mean(axis=1) for rows in (garment.faces, garment.hinges))
-        scaled = garment.replace(
-            vertex_areas=garment.vertex_areas * factors, rest_areas=garment.rest_areas * on_faces
+        scaled = problem.replace(
+            garment=garment.replace(
+                vertex_areas=garment.vertex_areas * factors, rest_areas=garment.rest_areas * on_faces
+            ),
+            material=material.replace(bending_stiffness=material.bending_stiffness * on_hinges),
         )
-        load, pairs = problem.friction_load, problem.self_contacts
-        if load is not None:
-            load = load * factors
-        if pairs is not None:
+        if problem.body is not None:
+            load = problem.body.friction_load * factors
+            scaled = scaled.replace(body=problem.body.replace(friction_load=load))
+        if problem.layers is not None:
+            pairs = problem.layers.pairs
             on_pairs = 0.25 * (factors[pairs.vertices] + factors[pairs.corners].sum(axis=1))
             pairs = pairs.replace(areas=pairs.areas * on_pairs)
-        terms = potential_terms(
-            position,
-            problem.replace(friction_load=load, self_contacts=pairs),
-            scaled,
-            material.replace(bending_stiffness=material.bending_stiffness * on_hinges),
-        )
-        return jnp.asarray(getattr(terms, term))
+            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs))
+        return getattr(potential_terms(position, scaled), term)
 
     return jax.grad(total)(jnp.ones_like(garment.vertex_areas))
 
 
-def gap_shares(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
-) -> Float[Array, " vertices"]:
+def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
     """Share the optimality gap out over the vertices [J]; the shares add up to it.
 
     A vertex' share is the work that the forces left at it do on its straight way x* + s (x - x*) to the optimum,
@@ -216,17 +217,16 @@ def gap_shares(
     it would show the trade.
 
     Args:
-        position: Any stepper's answer at t + 1 [m].
+        position: Any stepper's positions at t + 1 [m], shape [vertices, 3].
         problem: The frame's problem.
-        garment: Rest mesh.
-        material: Fabric.
     """
-    minimum = solve(problem, garment, material, position, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    start = Start(evaluate(position, problem), potential(pushed_out_guess(problem), problem))
+    minimum = solve(problem, start, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     way = position - minimum.position
     places, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
 
     def work(place: Float[Array, ""]) -> Float[Array, " vertices"]:
-        gradient = jax.grad(potential)(minimum.position + place * way, problem, garment, material)
+        gradient = jax.grad(potential)(minimum.position + place * way, problem)
         return jnp.sum(gradient * way, axis=-1)
 
     works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
@@ -236,11 +236,11 @@ def gap_shares(
 def _distances(run: Run) -> Field:
     """Return the height of every vertex over the tangent plane of the nearest body vertex [m]."""
     trajectory = run.trajectory
-    assert trajectory.body_positions is not None
-    assert trajectory.body_faces is not None
+    if trajectory.body is None:
+        raise AssetError(f"{run.name} has no body, and so no distance to it")
     values = np.empty(trajectory.positions.shape[:2], np.float32)
-    faces = trajectory.body_faces
-    for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body_positions, strict=True)):
+    faces = trajectory.body.faces
+    for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body.positions, strict=True)):
         normals = np.zeros_like(body)
         crosses = face_cross_products(body, faces)
         for corner in range(3):

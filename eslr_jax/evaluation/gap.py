@@ -1,4 +1,4 @@
-"""OptimalityOptimality gap: how much potential a stepper leaves on the table, frame by frame."""
+"""The optimality gap: how much potential a stepper leaves above the minimum, frame by frame."""
 
 from __future__ import annotations
 
@@ -10,182 +10,178 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.config import SimConfig
-from eslr_jax.io.trajectory import TrajectoryFile
-from eslr_jax.physics.potential import next_friction_load, potential
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, start_guess
-from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve, start_point
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.physics.potential import contact_load, potential
+from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.solve import Start, solve
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import find_start
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
-_SOLVER = SimConfig(simulator="physics")
 _LEAST_INITIAL_GAP = 1e-9  # [J]
-_OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the drop; see experiments/solver_convergence.py
+_OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the initial gap; see experiments/solver_convergence.py
 
 
 class OptimalityGap(NamedTuple):
     """Potentials from the same states, one per frame [J]."""
 
-    start: Float[Array, " frames"]  # at the pushed-out inertial guess
+    guess: Float[Array, " frames"]  # at the pushed-out inertial guess
     optimum: Float[Array, " frames"]
-    answer: Float[Array, " frames"]  # what the trajectory itself did
-    solver: dict[int, Float[Array, " frames"]]  # after so many L-BFGS iterations from where the solver starts
-    corrected: dict[int, Float[Array, " frames"]]  # after as many from the model's answer; empty without one
+    reached: Float[Array, " frames"]  # where the trajectory itself went
+    solver: dict[int, Float[Array, " frames"]]  # after so many iterations from the solver's own guess
+    refined: dict[
+        int, Float[Array, " frames"]
+    ]  # after as many from the network's prediction; empty without one
 
     @property
     def initial_gap(self) -> Float[Array, " frames"]:
         """What a frame has to gain [J]; a floor keeps shares of it finite."""
-        return jnp.maximum(self.start - self.optimum, _LEAST_INITIAL_GAP)
+        return jnp.maximum(self.guess - self.optimum, _LEAST_INITIAL_GAP)
 
     def share(self, energy: Float[Array, " frames"]) -> Float[Array, " frames"]:
-        """Return by how much potentials [J] exceed the optimum, relative to the initial gap."""
+        """Return the gap of potentials [J], shape [frames], relative to the initial gap."""
         return jnp.maximum(energy - self.optimum, 0.0) / self.initial_gap
 
 
-def trajectory_states(
-    trajectory: Trajectory | TrajectoryFile, scene: Scene, parameters: PhysicsParameters
-) -> tuple[ClothState, FrameInput]:
-    """Return the state before every frame of a trajectory, with its friction load, and the frame's input."""
-    inputs = frame_inputs(scene)
-    garment = scene.garment
+def trajectory_states(trajectory: Trajectory, scene: Scene) -> tuple[ClothState, FrameInput]:
+    """Return the state before every simulated frame of a trajectory, and the frame's input, stacked."""
+    count = trajectory.positions.shape[0] - 1
+    still = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), scene.initial_state)
+    states = still.replace(
+        position=trajectory.positions[:-1],
+        velocity=trajectory.velocities[:-1],
+        friction_load=trajectory.friction_loads[:-1],
+    )
+    return states, frame_inputs(scene)
+
+
+@jax.jit
+def find_friction_loads(
+    positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
+) -> Float[Array, "frames vertices"]:
+    """Return the friction loads [N] of somebody else's trajectory, which does not tell them.
+
+    Args:
+        positions: Vertex positions [m], shape [frames, vertices, 3].
+        velocities: Vertex velocities [m/s], shape [frames, vertices, 3].
+        scene: Its scene.
+    """
 
     def advance(load, frame):
-        position, velocity, answer, inputs = frame
-        state = scene.start.replace(position=position, velocity=velocity, friction_load=load)
-        if scene.surface is not None:
-            problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-            load = next_friction_load(answer, problem, garment)
-        return load, state
+        position, velocity, reached, inputs = frame
+        state = scene.initial_state.replace(position=position, velocity=velocity, friction_load=load)
+        load = contact_load(reached, frame_problem(scene, state, inputs))
+        return load, load
 
-    frames = (trajectory.positions[:-1], trajectory.velocities[:-1], trajectory.positions[1:], inputs)
-    _, states = jax.lax.scan(advance, scene.start.friction_load, frames)
-    return states, inputs
+    first = scene.initial_state.friction_load
+    frames = (positions[:-1], velocities[:-1], positions[1:], frame_inputs(scene))
+    _, loads = jax.lax.scan(advance, first, frames)
+    return jnp.concatenate([first[None], loads])
 
 
-@partial(jax.jit, static_argnames=("config", "every", "iterations", "corrector_steps"))
+class GapOptions(NamedTuple):
+    """What a gap is compared with; static."""
+
+    every: int = 1  # take every so many frames, from the second on
+    iterations: tuple[int, ...] = ITERATIONS  # of the solver from its own guess
+    refined: tuple[int, ...] = (0,)  # of the solver from a network's prediction
+
+
+@partial(jax.jit, static_argnames=("model", "options"))
 def measure_gap(
     params: Any,
     trajectory: Trajectory,
     scene: Scene,
-    parameters: PhysicsParameters,
-    config: SimConfig,
-    *,
-    every: int = 1,
-    iterations: tuple[int, ...] = ITERATIONS,
-    corrector_steps: tuple[int, ...] = (0,),
+    model: ModelConfig | None = None,
+    options: GapOptions = GapOptions(),  # noqa: B008: a tuple of constants
 ) -> OptimalityGap:
-    """Compare a model, the solver after few iterations, and the optimum, from the states of a trajectory.
+    """Compare a network, the solver after few iterations, and the optimum, from the states of a trajectory.
 
-    Teacher-forced where the trajectory is the optimum's own, on-policy where it is the model's.
+    The states are teacher-forced where the trajectory is the optimum's own, on-policy where it is the network's.
 
     Args:
-        params: Weights; None leaves the model out.
+        params: Weights of the network; None without one.
         trajectory: Supplies the states.
-        scene: The same scene.
-        parameters: Physical constants.
-        config: With the model's architecture; static.
-        every: Take every so many frames, from the second on; static.
-        iterations: L-BFGS iterations to compare with; static.
-        corrector_steps: L-BFGS iterations behind the model; static.
+        scene: Its scene.
+        model: Architecture of the network; None compares the solver alone. Static.
+        options: What to compare with; static.
     """
-    states, inputs = trajectory_states(trajectory, scene, parameters)
-    taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs, trajectory.positions[1:]))
-    garment, material = scene.garment, scene.material
-
-    counts = [*iterations, _OPTIMUM_ITERATIONS]
-    rows = [0] * len(counts)  # 0: from the start, 1: from the model's answer
-    if params is not None:
-        counts += [*corrector_steps, _OPTIMUM_ITERATIONS]
+    states, inputs = trajectory_states(trajectory, scene)
+    taken = jax.tree.map(lambda leaf: leaf[1 :: options.every], (states, inputs, trajectory.positions[1:]))
+    counts = [*options.iterations, _OPTIMUM_ITERATIONS]
+    rows = [0] * len(counts)  # 0: from the solver's guess, 1: from the network's prediction
+    if model is not None:
+        counts += [*options.refined, _OPTIMUM_ITERATIONS]
         rows += [1] * (len(counts) - len(rows))
 
     def measure(frame):
-        state, inputs, answer = frame
-        problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-        starts = [start_point(None, garment, material, problem, state, _SOLVER)]
-        if params is not None:
-            starts.append(start_point(params, garment, material, problem, state, config))
-        # A start that nobody came to is its own earlier point.
-        pairs = [(start.point, start.earlier or start.point) for start in starts]
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
+        state, inputs, reached = frame
+        problem = frame_problem(scene, state, inputs)
+        starts = [find_start(None, problem, state, SimConfig())[0]]
+        if model is not None:
+            starts.append(find_start(params, problem, state, SimConfig(model=model))[0])
+        # Stacked, so that the solver is compiled once. A start without a previous point stands for its own:
+        # a step of length zero adds nothing to the history.
+        stacked = jax.tree.map(
+            lambda *leaves: jnp.stack(leaves),
+            *(start._replace(previous=start.previous or start.point) for start in starts),
+        )
 
         def descend(task):
             row, count = task
-            start, earlier = jax.tree.map(lambda rows: rows[row], stacked)
-            return solve(problem, garment, material, start, iterations=count, earlier=earlier).value
+            start: Start = jax.tree.map(lambda rows: rows[row], stacked)
+            return solve(problem, start, iterations=count).value
 
-        # In turn, not unrolled: the solver is compiled once.
         values = jax.lax.map(descend, (jnp.array(rows), jnp.array(counts)))
-        split = len(iterations)
-        solver = dict(zip(iterations, values[:split], strict=True))
-        optimum, corrected = values[split], {}
-        if params is not None:
-            corrected = dict(zip(corrector_steps, values[split + 1 : -1], strict=True))
-            # The network may start in the basin of a deeper minimum than the solver finds.
+        split = len(options.iterations)
+        solver = dict(zip(options.iterations, values[:split], strict=True))
+        optimum, refined = values[split], {}
+        if model is not None:
+            refined = dict(zip(options.refined, values[split + 1 : -1], strict=True))
+            # The network may begin in the basin of a deeper minimum than the solver finds.
             optimum = jnp.minimum(optimum, values[-1])
-        guess, answered = jax.lax.map(
-            lambda x: potential(x, problem, garment, material),
-            jnp.stack([start_guess(problem, garment), answer]),
-        )
-        return OptimalityGap(guess, optimum, answered, solver, corrected)
+        guess = starts[0].inertial_energy
+        return OptimalityGap(guess, optimum, potential(reached, problem), solver, refined)
 
     return jax.lax.map(measure, taken)
 
 
-def trajectory_gap(
-    trajectory: Trajectory, scene: Scene, parameters: PhysicsParameters, *, every: int
-) -> OptimalityGap:
-    """Return where frames of a trajectory start, end, and could have ended; nothing else is solved.
+def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> OptimalityGap:
+    """Return where frames of a trajectory begin, end, and could have ended; nothing else is solved.
 
     The arguments are those of `measure_gap`.
     """
-    return measure_gap(
-        None, trajectory, scene, parameters, _SOLVER, every=every, iterations=(), corrector_steps=()
-    )
+    return measure_gap(None, trajectory, scene, None, GapOptions(every, (), ()))
 
 
-def map_answers(
+def map_frames(
     measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Array],
-    answers: Float[Array, "frames vertices 3"],
+    reached: Float[Array, "frames vertices 3"],
     states: ClothState,
     inputs: FrameInput,
     scene: Scene,
-    parameters: PhysicsParameters,
-    config: SimConfig | None = None,
 ) -> Array:
-    """State the problem of every frame and return what `measure` makes of its answer.
+    """State the problem of every frame and return what `measure` makes of where the cloth went.
 
     Args:
-        measure: Of an answer and its frame's problem.
-        answers: Anybody's positions at t + 1 [m].
+        measure: From positions and their frame's problem to a value.
+        reached: Anybody's positions at t + 1 [m], shape [frames, vertices, 3].
         states: Cloth at t, of `trajectory_states`.
         inputs: The frames' inputs.
         scene: The scene.
-        parameters: Physical constants.
-        config: Says whether layers and tips collide; neither does by default.
     """
 
     def frame(arguments):
-        answer, state, inputs = arguments
-        problem = frame_problem(
-            scene.garment, state, inputs, scene.surface, scene.timestep, parameters, config
-        )
-        return measure(answer, problem)
+        position, state, inputs = arguments
+        return measure(position, frame_problem(scene, state, inputs))
 
-    return jax.lax.map(frame, (answers, states, inputs))
+    return jax.lax.map(frame, (reached, states, inputs))
 
 
 @jax.jit
-def answer_potentials(
-    answers: Float[Array, "frames vertices 3"],
-    states: ClothState,
-    inputs: FrameInput,
-    scene: Scene,
-    parameters: PhysicsParameters,
+def reached_potentials(
+    reached: Float[Array, "frames vertices 3"], states: ClothState, inputs: FrameInput, scene: Scene
 ) -> Float[Array, " frames"]:
-    """Return the potential [J] of every answer to the frame that starts in the state beside it; `map_answers`."""
-
-    def measure(answer: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
-        return potential(answer, problem, scene.garment, scene.material)
-
-    return map_answers(measure, answers, states, inputs, scene, parameters)
+    """Return the potential [J] of positions from the states beside them; the arguments are `map_frames`'s."""
+    return map_frames(potential, reached, states, inputs, scene)

@@ -12,12 +12,13 @@ import numpy as np
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
-from eslr_jax.physics.potential import potential
+from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.potential import evaluate
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
-from eslr_jax.physics.problem import PhysicsParameters, start_guess
-from eslr_jax.simulate.network import network_step
-from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import frame_problem, solve, step
+from eslr_jax.physics.solve import solve, start_from_guess
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.network import predict
+from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import BodyMotion, Scene
 
 Name = TypeVar("Name", bound=Hashable)
@@ -39,7 +40,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     Args:
         scene: Of `prepare_scene`.
         poses: The motion it was made from.
-        config: Decides about self-contact and the network.
+        config: Says whether there is a network.
     """
     vertices = int(np.sum(scene.garment.vertex_mask))
     modelled = {
@@ -52,17 +53,17 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     def sort(name: str, is_modelled: bool, size: str, why: str) -> None:
         (modelled if is_modelled else left_out)[name] = size if is_modelled else why
 
-    surface, total = scene.surface, int(np.asarray(poses.faces).shape[0])
-    faces = 0 if surface is None else surface.faces.shape[0]
-    sort("collision and friction", surface is not None, f"{faces} of {total} body faces", "no body in reach")
+    total = int(np.asarray(poses.faces).shape[0])
+    faces = 0 if scene.body is None else scene.body.surface.faces.shape[0]
+    sort("collision and friction", faces > 0, f"{faces} of {total} body faces", "no body in reach")
     if 0 < faces < total:
         left_out["other body faces"] = f"{total - faces} that the garment does not reach"
     pinned = int(np.sum(scene.garment.is_pinned))
     sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
-    sort("self-contact", config.self_contact, "layers of cloth keep apart", "not asked for")
+    sort("self-contact", scene.self_contact is not None, "layers of cloth keep apart", "not asked for")
     varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
-    sort("network", config.simulator == "network", "refinement_steps before the solver", "solver alone")
+    sort("network", config.model is not None, "before the solver", "solver alone")
     return SceneParts(modelled, left_out)
 
 
@@ -70,57 +71,33 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
     """Return milliseconds of each part of one frame, on this device, measured in turns.
 
     Args:
-        params: Weights of the network; None for the physics simulator.
+        params: Weights of the network; None without one.
         scene: Of `prepare_scene`.
-        config: Which simulator.
+        config: Network, iterations and tolerance.
     """
-    garment, material, parameters = scene.garment, scene.material, PhysicsParameters()
-    state = scene.start
+    state = scene.initial_state
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
-
-    def problem_of(state):
-        return frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters)
-
-    problem = jax.jit(problem_of)(state)
-    start = jax.jit(start_guess)(problem, garment)
-    gradient = jax.grad(potential)
+    problem = jax.jit(frame_problem)(scene, state, inputs)
+    guess = jax.jit(initial_guess)(problem)
+    stepper = make_stepper(params, config)
     parts: dict[str, tuple[Callable, tuple]] = {
-        "gradient of the potential": (lambda x: gradient(x, problem, garment, material), (start,)),
-        "preconditioner": (
-            lambda x: solve_stiffness(stiffness(problem, garment, material, x), x),
-            (start,),
-        ),
+        "gradient of the potential": (lambda x: evaluate(x, problem), (guess.position,)),
+        "preconditioner": (lambda x: solve_stiffness(stiffness(problem, x), x), (guess.position,)),
         f"solver, {_ITERATIONS} iterations": (
-            lambda x: (
-                solve(
-                    problem,
-                    garment,
-                    material,
-                    x,
-                    iterations=_ITERATIONS,
-                    memory=config.solver_memory,
-                    tolerance=0.0,
-                ).position
-            ),
-            (start,),
+            lambda guess: solve(problem, start_from_guess(problem, guess), iterations=_ITERATIONS).position,
+            (guess,),
         ),
         "whole frame": (
-            lambda state: step(params, garment, material, problem_of(state), state, config)[0],
+            lambda state: stepper(frame_problem(scene, state, inputs), state)[0],
             (state,),
         ),
     }
-    if scene.surface is not None:
-        parts["contact search"] = (
-            lambda x: find_both_sides(x, inputs.body, inputs.next_body, scene.surface),
-            (state.position,),
-        )
-    if config.simulator == "network":
-        assert config.model is not None
+    if scene.body is not None:
+        surface = scene.body.surface
+        parts["contact search"] = (lambda x: find_both_sides(x, *inputs.body, surface), (state.position,))
+    if config.model is not None:
         model = config.model
-        parts["network"] = (
-            lambda state: network_step(params, garment, material, problem, state, model)[0],
-            (state,),
-        )
+        parts["network"] = (lambda state: predict(params, problem, state, model).position, (state,))
     return take_turns(parts)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.motion import joint_transforms, skin_garment
+from eslr_jax.body.motion import joint_transforms, skin_frames
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.types import Body
 
@@ -68,7 +68,9 @@ def arm_postures(body: Body) -> list[Posture]:
         rotations[:, joint, 2] = side * np.radians(rest_angle - np.array(angles))
     translations = np.tile(joints[body.parents.index(-1)], (len(angles), 1))
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    posed = np.asarray(skin_garment(body, transforms), np.float64)
+    posed = np.asarray(
+        skin_frames(body.rest_positions, body.skin_weights, body.skin_indices, transforms), np.float64
+    )
     turned = [
         _posture(body, posed[k], np.asarray(transforms[k], np.float64), angle)
         for k, angle in enumerate(angles)

@@ -20,7 +20,6 @@ import jraph
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import ModelConfig
-from eslr_jax.errors import Status
 from eslr_jax.graph import features
 from eslr_jax.graph.inputs import GraphInputs
 from eslr_jax.types import Contacts, Garment, Material
@@ -85,7 +84,7 @@ def build_frame_graph(
     if inputs.contacts is not None:
         selected, slot, mask, overflow = select_world_edges(inputs.contacts, garment.vertex_mask, config)
         globals_["world_mask"], globals_["world_slot"] = mask, slot
-        globals_["status"] = jnp.where(overflow, int(Status.WORLD_EDGE_OVERFLOW), 0)
+        globals_["status"] = jnp.where(overflow, 2, 0)
         body, world = _world_rows(inputs, selected, is_hood)
         nodes["body"] = _mask_rows(body, mask)
         edges["world"] = _mask_rows(world, mask)

@@ -117,47 +117,61 @@ def bending_stiffnesses(garment: Garment, material: Material) -> Float[np.ndarra
 
 
 def vertex_blocks(
-    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
+    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return the Hessian of inertia, collision and friction per vertex [N/m]; all positive semi-definite."""
-    masses = np.asarray(material.density, np.float64) * np.asarray(garment.vertex_areas, np.float64)
-    timestep = float(problem.timestep)
+    masses, timestep = np.asarray(problem.masses, np.float64), float(problem.timestep)
     blocks = (masses / timestep**2)[:, None, None] * np.eye(3)
-    for contacts in (problem.contacts, problem.opposing):
-        if contacts is not None:
-            blocks = blocks + _collision_blocks(position, contacts, problem, garment)
-    if problem.contacts is None:
+    if problem.body is None:
         return blocks
-    return blocks + _friction_blocks(position, problem.contacts, problem)
+    for contacts in (problem.body.nearest, problem.body.opposing):
+        blocks = blocks + _collision_blocks(position, contacts, problem)
+    return blocks + _friction_blocks(position, problem)
 
 
 def _collision_blocks(
-    position: np.ndarray, contacts: Contacts, problem: FrameProblem, garment: Garment
+    position: np.ndarray, contacts: Contacts, problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return 6 k a depth n n^T per vertex."""
-    assert problem.collision_thickness is not None
     normal = np.asarray(contacts.next_normals, np.float64)
     height = np.sum((position - contacts.next_points) * normal, axis=1)
-    depth = np.where(contacts.is_near, np.maximum(float(problem.collision_thickness) - height, 0.0), 0.0)
-    stiffness = 6.0 * float(problem.parameters.collision_stiffness) * np.asarray(garment.vertex_areas) * depth
+    depth = np.where(contacts.is_near, np.maximum(float(problem.body.thickness) - height, 0.0), 0.0)
+    areas = np.asarray(problem.garment.vertex_areas)
+    stiffness = 6.0 * float(problem.constants.collision_stiffness) * areas * depth
     return stiffness[:, None, None] * normal[:, :, None] * normal[:, None, :]
 
 
-def _friction_blocks(
-    position: np.ndarray, contacts: Contacts, problem: FrameProblem
-) -> Float[np.ndarray, "vertices 3 3"]:
+def _friction_blocks(position: np.ndarray, problem: FrameProblem) -> Float[np.ndarray, "vertices 3 3"]:
     """Return mu N (I - n n^T - u u^T / l^2) / l per vertex, with l = sqrt(|u|^2 + s^2)."""
+    contacts, constants = problem.body.nearest, problem.constants
     normal = np.asarray(contacts.next_normals, np.float64)
     motion = (position - problem.position) - (contacts.next_points - contacts.points)
     tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
-    slip = float(problem.parameters.friction_speed) * float(problem.timestep)
+    slip = float(constants.friction_speed) * float(problem.timestep)
     length = np.sqrt(np.sum(tangential**2, axis=1) + slip**2)
     direction = tangential / length[:, None]
     # Unit normals are so up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
     outer = [vector[:, :, None] * vector[:, None, :] for vector in (normal, direction)]
     curvature = np.eye(3) - outer[0] - outer[1]
-    load = float(problem.parameters.friction_coefficient) * np.asarray(problem.friction_load, np.float64)
+    load = float(constants.friction_coefficient) * np.asarray(problem.body.friction_load, np.float64)
     return (load / length)[:, None, None] * curvature
+
+
+def layer_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
+    """Return the Hessian of the repulsion between layers per pair [N/m], shape [pairs, 12, 12]."""
+    if problem.layers is None:
+        return np.zeros((0, 12, 12))
+    stiffness, thickness = float(problem.constants.repulsion_stiffness), float(problem.layers.thickness)
+    return pair_blocks(position, problem.layers.pairs, stiffness, thickness)
+
+
+def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
+    """Return the Hessian of the contact with the body's tips per pair [N/m], shape [pairs, 9, 9]."""
+    if problem.body is None or problem.body.tips is None:
+        return np.zeros((0, 9, 9))
+    constants, tips = problem.constants, problem.body.tips
+    stiffness, thickness = float(constants.collision_stiffness), float(constants.collision_thickness)
+    return pair_blocks(position, tips.pairs, stiffness, thickness, tips.next_body)
 
 
 def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
@@ -171,7 +185,7 @@ def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndar
 
 def pair_blocks(
     position: Float[np.ndarray, "vertices 3"],
-    pairs: FacePairs | None,
+    pairs: FacePairs,
     stiffness: float,
     thickness: float,
     next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
@@ -180,15 +194,12 @@ def pair_blocks(
 
     Args:
         position: Vertex positions [m].
-        pairs: Points and faces; None gives no blocks.
+        pairs: Points and faces.
         stiffness: k [J/m^5].
         thickness: Distance kept [m].
         next_body: Body vertices at t + 1 [m], where the points are the body's and don't move.
     """
     is_cloth = next_body is None
-    if pairs is None:
-        size = 9 + 3 * is_cloth
-        return np.zeros((0, size, size))
     side = np.asarray(pairs.side, np.float64)
     is_used = side != 0
     points = (position if next_body is None else np.asarray(next_body, np.float64))[

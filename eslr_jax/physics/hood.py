@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import (
     components,
@@ -36,8 +36,7 @@ from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy, vertex_masses
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.potential import PotentialTerms
-from eslr_jax.types import Garment, Material
+from eslr_jax.types import Garment, Material, PotentialTerms
 
 Criterion = Literal["postcvpr", "cvpr", "metric"]
 
@@ -61,20 +60,27 @@ METRIC_PARAMETERS = HoodParameters(collision_weight=1.0, collision_thickness=1e-
 """Constants of HOOD's tables (configs/aux/metrics.yaml)."""
 
 
-class BodyFrames(NamedTuple):
-    """A body's vertices around one step [m]; all faces of the body take part, hands included."""
+@struct.dataclass
+class BodyFrames:
+    """A body around one step; all its faces take part, hands included."""
 
-    previous: Float[Array, "body_vertices 3"]  # at t - 1
-    current: Float[Array, "body_vertices 3"]  # at t
-    next: Float[Array, "body_vertices 3"]  # at t + 1
+    previous: Float[Array, "body_vertices 3"]  # at t - 1 [m]
+    current: Float[Array, "body_vertices 3"]  # at t [m]
+    next: Float[Array, "body_vertices 3"]  # at t + 1 [m]
+    faces: Int[Array, "body_faces 3"]  # counter-clockwise seen from outside
 
 
-class HoodMetrics(NamedTuple):
-    """What HOOD's evaluation reports of every frame from the third on."""
+@struct.dataclass
+class HoodProblem:
+    """What HOOD's losses of one step depend on besides the predicted positions."""
 
-    terms: PotentialTerms  # [J], each of shape [frames - 2]
-    penetrating_share: Float[Array, " steps"]  # of vertices within the thickness, HOOD's `perc`
-    gradient_norm: Float[Array, " steps"]  # mean over vertices of the total's gradient [N]
+    current: Float[Array, "vertices 3"]  # at t [m]
+    previous: Float[Array, "vertices 3"]  # at t - 1 [m]; `current` where HOOD starts with zero velocity
+    bodies: BodyFrames | None  # None: no body
+    garment: Garment
+    material: Material  # HOOD keeps the thickness at 0.47 mm whatever the fabric
+    timestep: Float[Array, ""] | float  # 1/30 s, and 1/3 s in HOOD's first step [s]
+    parameters: HoodParameters  # `METRIC_PARAMETERS` for the criterion `metric`
 
 
 def collision_weight(iteration: Int[Array, ""] | int) -> Float[Array, ""]:
@@ -141,179 +147,97 @@ def hood_depths(
     return jnp.maximum(thickness - height, 0.0)
 
 
+class _Motion(NamedTuple):
+    """How the body moves between the two frames that friction looks at."""
+
+    before: Float[Array, "body_vertices 3"]  # [m]
+    after: Float[Array, "body_vertices 3"]  # [m]
+
+
 def hood_friction_energy(
-    position: Float[Array, "vertices 3"],
-    start: Float[Array, "vertices 3"],
-    body_before: Float[Array, "body_vertices 3"],
-    body: Float[Array, "body_vertices 3"],
-    faces: Int[Array, "body_faces 3"],
-    masses: Float[Array, " vertices"],
-    parameters: HoodParameters,
+    position: Float[Array, "vertices 3"], problem: HoodProblem, criterion: Criterion
 ) -> Float[Array, ""]:
     """Return mu g sum_v m_v s_v |Delta_T| [J] over the vertices near the body.
 
-    Delta is the cloth's motion minus that of the body face nearest to it at first, Delta_T its part across
+    Delta is the cloth's motion minus that of the body face nearest to it at first. Delta_T is its part across
     the mean of that face's normal and the one nearest at last (not normalised again), and
     s = sqrt(|1 - cos^2(Delta_T, z)| + 1e-4).
 
     Args:
-        position: Predicted vertices [m].
-        start: Vertices one frame earlier [m].
-        body_before: Body at the start of its motion [m].
-        body: Body at the end of its motion [m].
-        faces: Of the body.
-        masses: [kg].
-        parameters: Coefficient mu, gravity g and radius.
+        position: Predicted vertices [m], shape [vertices, 3].
+        problem: The step, with a body.
+        criterion: Which frames of the body count; static.
     """
-    before, after = _face_planes(body_before, faces), _face_planes(body, faces)
-    first, first_squared = nearest_centroid(start, before.centers)
+    bodies, parameters = problem.bodies, problem.parameters
+    if bodies is None:
+        return jnp.zeros((), position.dtype)
+    is_metric = criterion == "metric"
+    motion_of = (
+        _Motion(bodies.current, bodies.next) if is_metric else _Motion(bodies.previous, bodies.current)
+    )
+    before = _face_planes(motion_of.before, bodies.faces)
+    after = _face_planes(motion_of.after, bodies.faces)
+    first, first_squared = nearest_centroid(problem.current, before.centers)
     last, last_squared = nearest_centroid(position, after.centers)
     is_near = (first_squared < parameters.friction_radius) & (last_squared < parameters.friction_radius)
-    motion = position - start - (after.centers[first] - before.centers[first])
+    motion = position - problem.current - (after.centers[first] - before.centers[first])
     normal = 0.5 * (before.normals[first] + after.normals[last])
     tangential = motion - jnp.sum(motion * normal, axis=-1, keepdims=True) * normal
     cosine = safe_normalize(tangential)[:, _FLOOR_AXIS]
     slope = jnp.sqrt(jnp.abs(1.0 - cosine * cosine) + _SINE_FLOOR)
-    per_vertex = masses * slope * safe_norm(tangential)
+    per_vertex = vertex_masses(problem.garment, problem.material) * slope * safe_norm(tangential)
     return parameters.friction_coefficient * parameters.gravity * masked_sum(per_vertex, is_near)
 
 
-def hood_terms(
-    position: Float[Array, "vertices 3"],
-    current: Float[Array, "vertices 3"],
-    previous: Float[Array, "vertices 3"],
-    bodies: BodyFrames | None,
-    body_faces: Int[Array, "body_faces 3"] | None,
-    garment: Garment,
-    material: Material,
-    timestep: Float[Array, ""] | float,
-    parameters: HoodParameters,
-    *,
-    criterion: Criterion = "postcvpr",
-) -> PotentialTerms:
-    """Return HOOD's six losses [J] of one step.
+def criterion_depths(
+    position: Float[Array, "vertices 3"], problem: HoodProblem, criterion: Criterion
+) -> Float[Array, " vertices"]:
+    """Return `hood_depths` [m] with the frames that the criterion looks at; zero without a body."""
+    bodies = problem.bodies
+    if bodies is None:
+        return jnp.zeros(position.shape[0], position.dtype)
+    query, search_body, body = {
+        "postcvpr": (problem.current, bodies.current, bodies.next),
+        "cvpr": (problem.current, bodies.previous, bodies.current),
+        "metric": (position, bodies.next, bodies.next),
+    }[criterion]
+    return hood_depths(
+        position, query, search_body, body, bodies.faces, problem.parameters.collision_thickness
+    )
 
-    Sums over vertices, faces and edges, without means; gravity counts from the world's origin. In the two
+
+def hood_terms(
+    position: Float[Array, "vertices 3"], problem: HoodProblem, *, criterion: Criterion = "postcvpr"
+) -> PotentialTerms:
+    """Return HOOD's six losses [J] of one step; repulsion, which HOOD lacks, is zero.
+
+    Sums go over vertices, faces and edges, without means; gravity counts from the world's origin. In the two
     training criteria pinned vertices have already moved when the losses are taken: they add a constant to
     inertia.
 
     Args:
-        position: Predicted vertices at t + 1 [m].
-        current: Vertices at t [m].
-        previous: Vertices at t - 1 [m]; `current` where HOOD starts with zero velocity.
-        bodies: The body around the step; None without one.
-        body_faces: Counter-clockwise seen from outside.
-        garment: Rest mesh.
-        material: Fabric; HOOD keeps thickness at 0.47 mm whatever the fabric.
-        timestep: 1/30 s, and 1/3 s in HOOD's first step [s].
-        parameters: Weights and thresholds; `METRIC_PARAMETERS` for `metric`.
+        position: Predicted vertices at t + 1 [m], shape [vertices, 3].
+        problem: The step.
         criterion: Which frames of the body count (see the module); static.
     """
+    garment, material, parameters = problem.garment, problem.material, problem.parameters
     masses = vertex_masses(garment, material)
     if criterion != "metric":
         is_pinned = garment.is_pinned[:, None]
-        previous = jnp.where(is_pinned, current, previous)
-        current = jnp.where(is_pinned, jax.lax.stop_gradient(position), current)
-        position = jnp.where(is_pinned, jax.lax.stop_gradient(position), position)
-    guess = current + (current - previous)
-    collision: Float[Array, ""] | float = 0.0
-    friction: Float[Array, ""] | float = 0.0
-    if bodies is not None:
-        assert body_faces is not None
-        depth = _criterion_depths(position, current, bodies, body_faces, parameters, criterion)
-        collision = parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask)
-        is_metric = criterion == "metric"
-        friction = hood_friction_energy(
-            position,
-            current,
-            bodies.current if is_metric else bodies.previous,
-            bodies.next if is_metric else bodies.current,
-            body_faces,
-            masses,
-            parameters,
+        fixed = jax.lax.stop_gradient(position)
+        problem = problem.replace(
+            previous=jnp.where(is_pinned, problem.current, problem.previous),
+            current=jnp.where(is_pinned, fixed, problem.current),
         )
+        position = jnp.where(is_pinned, fixed, position)
+    guess = problem.current + (problem.current - problem.previous)
+    depth = criterion_depths(position, problem, criterion)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material, use_current_length=True),
-        inertia=inertia_energy(position, guess, masses, jnp.asarray(timestep, position.dtype)),
+        inertia=inertia_energy(position, guess, masses, jnp.asarray(problem.timestep, position.dtype)),
         gravity=gravity_energy(position, None, masses, parameters.gravity),
-        collision=collision,
-        friction=friction,
+        collision=parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask),
+        friction=hood_friction_energy(position, problem, criterion),
+        repulsion=jnp.zeros((), position.dtype),
     )
-
-
-def _criterion_depths(
-    position: Float[Array, "vertices 3"],
-    current: Float[Array, "vertices 3"],
-    bodies: BodyFrames,
-    faces: Int[Array, "body_faces 3"],
-    parameters: HoodParameters,
-    criterion: Criterion,
-) -> Float[Array, " vertices"]:
-    """Return `hood_depths` with the frames that the criterion looks at."""
-    query, search_body, body = {
-        "postcvpr": (current, bodies.current, bodies.next),
-        "cvpr": (current, bodies.previous, bodies.current),
-        "metric": (position, bodies.next, bodies.next),
-    }[criterion]
-    return hood_depths(position, query, search_body, body, faces, parameters.collision_thickness)
-
-
-def hood_metrics(
-    positions: Float[Array, "frames vertices 3"],
-    body_positions: Float[Array, "frames body_vertices 3"],
-    body_faces: Int[Array, "body_faces 3"],
-    garment: Garment,
-    material: Material,
-    timestep: Float[Array, ""] | float,
-    *,
-    parameters: HoodParameters = METRIC_PARAMETERS,
-    criterion: Criterion = "metric",
-) -> HoodMetrics:
-    """Measure a trajectory as HOOD's tables do: every frame from the third on, with its two predecessors.
-
-    The paper's Total of a trajectory is the mean over frames of the sum of the terms. Its collision column is
-    most likely the training criterion at 5e3: `HoodParameters()` with "postcvpr".
-
-    Args:
-        positions: Garment vertices of all frames [m].
-        body_positions: Body vertices of the same frames [m].
-        body_faces: All faces of the body.
-        garment: Rest mesh.
-        material: Fabric; HOOD evaluates with `materials.COTTON`.
-        timestep: Duration of a frame [s].
-        parameters: Weights and thresholds.
-        criterion: Which frames of the body count; static.
-    """
-
-    def total(position, current, previous, bodies):
-        terms = hood_terms(
-            position,
-            current,
-            previous,
-            bodies,
-            body_faces,
-            garment,
-            material,
-            timestep,
-            parameters,
-            criterion=criterion,
-        )
-        terms = PotentialTerms(*(jnp.asarray(term, position.dtype) for term in terms))
-        return sum(terms), terms
-
-    def measure(frames):
-        (previous, current, position), bodies = frames
-        gradient, terms = jax.grad(total, has_aux=True)(position, current, previous, bodies)
-        depth = _criterion_depths(position, current, bodies, body_faces, parameters, criterion)
-        mask: Bool[Array, " vertices"] = garment.vertex_mask
-        count = jnp.sum(mask)
-        return HoodMetrics(
-            terms,
-            jnp.sum(mask & (depth > 0)) / count,
-            masked_sum(safe_norm(gradient), mask) / count,
-        )
-
-    cloth = (positions[:-2], positions[1:-1], positions[2:])
-    bodies = BodyFrames(body_positions[:-2], body_positions[1:-1], body_positions[2:])
-    return jax.lax.map(measure, (cloth, bodies))

@@ -9,19 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.physics.potential import Point
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
 _CAUTION = 400.0  # soft directions are underestimated: 99 % of frames keep what is asked, 83 % at 40
-
-
-class Point(NamedTuple):
-    """A place, and the energy there."""
-
-    position: Float[Array, "*shape"]  # [m]
-    value: Float[Array, ""]  # [J]
-    gradient: Float[Array, "*shape"]  # [N]
 
 
 class Minimum(NamedTuple):
@@ -31,6 +24,16 @@ class Minimum(NamedTuple):
     value: Float[Array, ""]  # [J]
     gradient: Float[Array, "vertices 3"]  # [N]
     iterations: Int[Array, ""]
+
+
+class Stop(NamedTuple):
+    """When a minimisation ends."""
+
+    iterations: int | Int[Array, ""]  # upper bound
+    # Share of what was gained since `reference`, below which the gap may fall. It is estimated by half the Newton
+    # decrement, g . H^-1 g / 2, with the recursion's own H^-1, times `_CAUTION`.
+    tolerance: Float[Array, ""] | float = 0.0
+    reference: Float[Array, ""] | float = 0.0  # energy [J] from which the gain counts
 
 
 class _State(NamedTuple):
@@ -68,45 +71,39 @@ def _direction(state: _State, inverse: Inverse) -> Float[Array, " n"]:
 
 def minimize(
     function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
-    start: Float[Array, "vertices 3"] | Point,
-    diagonal: Float[Array, " vertices"] | Stiffness,
+    start: Point,
+    stiffness: Stiffness,
+    stop: Stop,
     *,
-    iterations: int | Int[Array, ""],
     memory: int = 8,
-    residual_tolerance: Float[Array, ""] | float = 0.0,
-    gap_tolerance: Float[Array, ""] | float = 0.0,
-    reference_value: Float[Array, ""] | None = None,
-    earlier: Point | None = None,
+    previous: Point | None = None,
 ) -> Minimum:
-    """Minimise `function` from `start`.
+    """Minimise `function` from `start` by L-BFGS.
 
     Args:
-        function: Energy [J] of positions; differentiable.
-        start: Initial positions [m], or a point where the energy is known.
-        diagonal: The initial Hessian of the recursion up to a scale: positive stiffness per vertex [N/m], or
-            with springs between neighbours, which costs a quarter more per iteration and needs two to three
-            times fewer of them.
-        iterations: Upper bound of iterations.
-        memory: Pairs of steps and gradient changes kept; static.
-        residual_tolerance: Stop when the gradient norm [N] falls below it.
-        gap_tolerance: Stop when what is left to gain is estimated to be below this share of what was gained
-            since `reference_value`. The estimate is half the Newton decrement, g . H^-1 g / 2, with the
-            recursion's own H^-1, times `_CAUTION`.
-        reference_value: Energy [J] from which the gain counts; that of `start` by default.
-        earlier: A point from which somebody else came to `start`: the way is the history's first pair.
+        function: Differentiable energy [J] of positions [m], shape [vertices, 3].
+        start: Where to begin, with value and gradient.
+        stiffness: Initial Hessian of the recursion, up to a scale.
+        stop: When to end.
+        memory: Number of pairs of steps and gradient changes kept; static.
+        previous: A point from which something else came to `start`; the step between is the first pair.
+
+    Returns:
+        The lowest point that was reached, and the iterations it took.
 
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
-    if not isinstance(start, Point):
-        start = Point(start, *jax.value_and_grad(function)(start))
     shape = start.position.shape
-    inverse = _make_inverse(diagonal, start.position)
+
+    def inverse(force: Float[Array, " n"]) -> Float[Array, " n"]:
+        return solve_stiffness(stiffness, force.reshape(shape)).reshape(-1)
+
     value_and_gradient = jax.value_and_grad(lambda x: function(x.reshape(shape)))
 
     def is_running(state: _State) -> Array:
-        is_above = jnp.dot(state.gradient, state.gradient) > jnp.square(residual_tolerance)
-        is_far = _CAUTION * state.decrement > gap_tolerance * (reference - state.value)
-        return (state.iterations < iterations) & is_above & is_far & ~state.is_stuck
+        is_above = jnp.dot(state.gradient, state.gradient) > 0
+        is_far = _CAUTION * state.decrement > stop.tolerance * (stop.reference - state.value)
+        return (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
 
     def iterate(state: _State) -> _State:
         direction = _direction(state, inverse)
@@ -121,7 +118,6 @@ def minimize(
             is_stuck=~is_lower & jnp.all(state.curvatures == 0),
         )
 
-    reference = start.value if reference_value is None else reference_value
     first = _ravel(start)
     x = first.position
     history = jnp.zeros((memory, x.size), x.dtype)
@@ -138,17 +134,11 @@ def minimize(
         iterations=jnp.zeros((), jnp.int32),
         is_stuck=jnp.zeros((), bool),
     )
-    if earlier is not None:
-        before = _ravel(earlier)
+    if previous is not None:
+        before = _ravel(previous)
         initial = _advance(initial._replace(x=before.position, gradient=before.gradient), first, inverse)
     final = jax.lax.while_loop(is_running, iterate, initial)
     return Minimum(final.x.reshape(shape), final.value, final.gradient.reshape(shape), final.iterations)
-
-
-def lower_point(reached: Point, earlier: Point) -> Point:
-    """Return the lower of two points; the earlier one where they are level, the other where one is no number."""
-    is_lower = (reached.value < earlier.value) | jnp.isnan(earlier.value)
-    return jax.tree.map(lambda new, old: jnp.where(is_lower, new, old), reached, earlier)
 
 
 def _ravel(point: Point) -> Point:
@@ -175,16 +165,6 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
         head=head,
         scale=jnp.where(is_useful, curvature / jnp.where(weighted > 0, weighted, 1.0), state.scale),
     )
-
-
-def _make_inverse(
-    diagonal: Float[Array, " vertices"] | Stiffness, start: Float[Array, "vertices 3"]
-) -> Inverse:
-    """Return the map from forces to displacements, on raveled arrays."""
-    if isinstance(diagonal, Stiffness):
-        return lambda force: solve_stiffness(diagonal, force.reshape(start.shape)).reshape(-1)
-    inverse_diagonal = jnp.repeat(1.0 / diagonal, start.shape[1]).astype(start.dtype)
-    return lambda force: inverse_diagonal * force
 
 
 def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):

@@ -19,8 +19,8 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from eslr_jax.physics import hessian
 from eslr_jax.physics.potential import potential
-from eslr_jax.physics.problem import FrameProblem, start_guess
-from eslr_jax.types import Garment, Material, tree_cast
+from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
+from eslr_jax.types import tree_cast
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 40
@@ -47,8 +47,6 @@ class _Bands(NamedTuple):
 
 def minimize_newton(
     problem: FrameProblem,
-    garment: Garment,
-    material: Material,
     start: Float[np.ndarray, "vertices 3"] | None = None,
     *,
     tolerance: float = 1e-6,
@@ -57,32 +55,28 @@ def minimize_newton(
     """Minimise one frame's potential by projected Newton with an Armijo line search.
 
     Args:
-        problem: The frame's minimisation problem.
-        garment: Rest mesh.
-        material: Fabric.
-        start: Initial positions [m]; `start_guess` by default.
+        problem: The frame's problem.
+        start: Initial positions [m], shape [vertices, 3]; the pushed-out inertial guess by default.
         tolerance: Stop when the force norm falls below this share of the vertex weights' norm.
         max_iterations: Upper bound of factorisations.
 
     Source: Teran et al. 2005, doi 10.1145/1073368.1073394 (projected Newton).
     """
-    problem, garment, material = to_float64((problem, garment, material))
-    evaluate = _evaluator(problem, garment, material)
-    is_free = _free_vertices(problem, garment)
-    bands = _find_bands(garment, problem, is_free)
-    masses = material.density * garment.vertex_areas
-    weight = float(problem.parameters.gravity) * np.linalg.norm(masses)
+    problem = to_float64(problem)
+    evaluate = _evaluator(problem)
+    bands = _find_bands(problem)
+    weight = float(problem.constants.gravity) * np.linalg.norm(problem.masses)
 
     if start is None:
         with jax.enable_x64(True):
-            start = np.asarray(start_guess(problem, garment))
+            start = np.asarray(pushed_out_guess(problem))
     x = np.array(start, np.float64)
     if problem.pin_targets is not None:
-        x = np.where(np.asarray(garment.is_pinned)[:, None], problem.pin_targets, x)
+        x = np.where(np.asarray(problem.garment.is_pinned)[:, None], problem.pin_targets, x)
     value, gradient = evaluate(x)
     iterations = 0
     while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
-        direction = _newton_direction(x, gradient, problem, garment, material, bands)
+        direction = _newton_direction(x, gradient, problem, bands)
         found = _line_search(evaluate, x, value, gradient, direction)
         iterations += 1
         if found is None:
@@ -92,11 +86,9 @@ def minimize_newton(
     return NewtonMinimum(x, value, residual, iterations, residual <= tolerance)
 
 
-def potential_float64(
-    position: Float[Any, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
-) -> float:
-    """Return the potential at `position` in float64 [J]."""
-    return _evaluator(*to_float64((problem, garment, material)))(np.asarray(position, np.float64))[0]
+def potential_float64(position: Float[Any, "vertices 3"], problem: FrameProblem) -> float:
+    """Return the potential at positions [m], shape [vertices, 3], in float64 [J]."""
+    return _evaluator(to_float64(problem))(np.asarray(position, np.float64))[0]
 
 
 def to_float64(tree: Any) -> Any:
@@ -105,40 +97,40 @@ def to_float64(tree: Any) -> Any:
         return tree_cast(jax.tree.map(np.asarray, tree), np.float64)
 
 
-@jax.jit
-def _value_and_gradient(position, problem, garment, material):
-    return jax.value_and_grad(potential)(position, problem, garment, material)
+_value_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
-def _evaluator(problem: FrameProblem, garment: Garment, material: Material) -> Callable:
+def _evaluator(problem: FrameProblem) -> Callable:
     """Return a function from positions to the potential [J] and its gradient [N] in float64."""
     with jax.enable_x64(True):
-        constants = jax.device_put((problem, garment, material))
+        constant = jax.device_put(problem)
 
     def evaluate(position: np.ndarray) -> tuple[float, np.ndarray]:
         with jax.enable_x64(True):
-            value, gradient = _value_and_gradient(position, *constants)
+            value, gradient = _value_and_gradient(position, constant)
             return float(value), np.asarray(gradient)
 
     return evaluate
 
 
-def _free_vertices(problem: FrameProblem, garment: Garment) -> np.ndarray:
-    """Return which vertices may move: real ones that no pin holds."""
-    is_free = np.array(garment.vertex_mask, bool)
+def _free_vertices(problem: FrameProblem) -> np.ndarray:
+    """Return which vertices may move, shape [vertices]: real ones that no pin holds."""
+    is_free = np.array(problem.garment.vertex_mask, bool)
     if problem.pin_targets is not None:
-        is_free &= ~np.asarray(garment.is_pinned)
+        is_free &= ~np.asarray(problem.garment.is_pinned)
     return is_free
 
 
-def _find_bands(garment: Garment, problem: FrameProblem, is_free: np.ndarray) -> _Bands:
+def _find_bands(problem: FrameProblem) -> _Bands:
     """Order the free vertices so that the matrix has a narrow band, and map the blocks' entries to it."""
+    is_free = _free_vertices(problem)
     count = len(is_free)
+    tips = None if problem.body is None or problem.body.tips is None else problem.body.tips.pairs
     tables = (
-        np.asarray(garment.faces),
-        np.asarray(garment.hinges),
-        hessian.pair_table(problem.self_contacts),
-        hessian.pair_table(problem.tips, is_cloth=False),
+        np.asarray(problem.garment.faces),
+        np.asarray(problem.garment.hinges),
+        hessian.pair_table(None if problem.layers is None else problem.layers.pairs),
+        hessian.pair_table(tips, is_cloth=False),
         np.arange(count)[:, None],
     )
     rows, columns = (np.concatenate(part) for part in zip(*map(_couples, tables), strict=True))
@@ -170,32 +162,15 @@ def _dof_couples(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _newton_direction(
-    x: np.ndarray,
-    gradient: np.ndarray,
-    problem: FrameProblem,
-    garment: Garment,
-    material: Material,
-    bands: _Bands,
+    x: np.ndarray, gradient: np.ndarray, problem: FrameProblem, bands: _Bands
 ) -> np.ndarray:
     """Return minus the inverse of the projected Hessian times the gradient [m]; zero where fixed."""
-    parameters = problem.parameters
     blocks = (
-        hessian.stretch_blocks(x, garment, material),
-        hessian.bending_blocks(x, garment, material),
-        hessian.pair_blocks(
-            x,
-            problem.self_contacts,
-            float(parameters.repulsion_stiffness),
-            0.0 if problem.repulsion_thickness is None else float(problem.repulsion_thickness),
-        ),
-        hessian.pair_blocks(
-            x,
-            problem.tips,
-            float(parameters.collision_stiffness),
-            float(parameters.collision_thickness),
-            problem.next_body if problem.tips is not None else np.zeros((0, 3)),
-        ),
-        hessian.vertex_blocks(x, problem, garment, material),
+        hessian.stretch_blocks(x, problem.garment, problem.material),
+        hessian.bending_blocks(x, problem.garment, problem.material),
+        hessian.layer_blocks(x, problem),
+        hessian.tip_blocks(x, problem),
+        hessian.vertex_blocks(x, problem),
     )
     values = np.concatenate([block.ravel() for block in blocks])[bands.entries]
     size = bands.shape[0] * bands.shape[1]

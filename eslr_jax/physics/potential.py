@@ -17,119 +17,113 @@ published losses for its tables. Side by side, from x_t to x_{t+1}:
 | friction  | mu N (sqrt(u^2 + s^2) - s), N contact force   | mu m g s abs(u) within 5.5 cm, whatever the |
 |           | at t, u in the tangent plane                  | contact force; s a slope against the z axis |
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
-| repulsion | between layers of cloth, on request           | none                                        |
+| repulsion | between layers of cloth, where they can meet  | none                                        |
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import collision_energy, contact_forces
 from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
-from eslr_jax.physics.inertia import inertia_energy, vertex_masses
+from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.physics.problem import FrameProblem, pin
 from eslr_jax.physics.repulsion import repulsion_energy
-from eslr_jax.types import Garment, Material
+from eslr_jax.types import PotentialTerms
 
 
-class PotentialTerms(NamedTuple):
-    """The energies of one frame [J]."""
+class Point(NamedTuple):
+    """Positions with the potential and its gradient there, so that neither is computed twice."""
 
-    stretch: Float[Array, ""]
-    bending: Float[Array, ""]
-    inertia: Float[Array, ""]
-    gravity: Float[Array, ""]
-    collision: Float[Array, ""] | float
-    friction: Float[Array, ""] | float
-    repulsion: Float[Array, ""] | float = 0.0  # of self-contact
+    position: Float[Array, "*shape"]  # [m]
+    value: Float[Array, ""]  # [J]
+    gradient: Float[Array, "*shape"]  # [N]
 
 
-def potential_terms(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
-) -> PotentialTerms:
-    """Return every energy of the frame at `position` (set `consistent`).
+def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem) -> PotentialTerms:
+    """Return every energy of the frame [J] (set `consistent`).
 
     Args:
-        position: Candidate positions at t + 1 [m]; pinned vertices are put in place first, so that the
-            gradient vanishes there.
-        problem: What the frame holds constant.
-        garment: Rest mesh.
-        material: Fabric.
+        position: Candidate positions at t + 1 [m], shape [vertices, 3]. Pinned vertices are put in place first,
+            so that the gradient vanishes there.
+        problem: The frame's problem.
     """
-    position = pin(problem, garment, position)
-    parameters, contacts = problem.parameters, problem.contacts
-    masses = vertex_masses(garment, material)
-    collision: Float[Array, ""] | float = 0.0
-    friction: Float[Array, ""] | float = 0.0
-    if contacts is not None:
-        assert problem.friction_load is not None
-        assert problem.collision_thickness is not None
-        collision = collision_energy(
-            position, contacts, garment, parameters.collision_stiffness, problem.collision_thickness
-        )
-        if problem.opposing is not None:
-            collision = collision + collision_energy(
-                position,
-                problem.opposing,
-                garment,
-                parameters.collision_stiffness,
-                problem.collision_thickness,
-            )
-        if problem.tips is not None:
-            collision = collision + repulsion_energy(
-                position,
-                problem.tips,
-                parameters.collision_stiffness,
-                parameters.collision_thickness,
-                problem.next_body,
-            )
-        friction = friction_energy(
-            position,
-            problem.position,
-            contacts,
-            problem.friction_load,
-            parameters.friction_coefficient,
-            parameters.friction_speed * problem.timestep,
-        )
-    repulsion: Float[Array, ""] | float = 0.0
-    if problem.self_contacts is not None:
-        assert problem.repulsion_thickness is not None
-        repulsion = repulsion_energy(
-            position,
-            problem.self_contacts,
-            parameters.repulsion_stiffness,
-            problem.repulsion_thickness,
-        )
+    position = pin(problem, position)
+    garment, material, constants = problem.garment, problem.material, problem.constants
+    collision = friction = repulsion = jnp.zeros((), position.dtype)
+    if problem.body is not None:
+        collision, friction = _body_energies(position, problem)
+    if problem.layers is not None:
+        layers = problem.layers
+        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
-        inertia=inertia_energy(position, problem.inertial_guess, masses, problem.timestep),
-        gravity=gravity_energy(position, problem.position, masses, parameters.gravity),
+        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.timestep),
+        gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
         collision=collision,
         friction=friction,
         repulsion=repulsion,
     )
 
 
-def potential(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment, material: Material
-) -> Float[Array, ""]:
-    """Return the incremental potential [J]: the sum of all terms."""
-    return sum(potential_terms(position, problem, garment, material))  # type: ignore[return-value]
+def _body_energies(
+    position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the collision and the friction energy of a frame with a body [J]."""
+    body, constants = problem.body, problem.constants
+    if body is None:
+        raise ValueError("a frame without a body has no energies of contact with it")
+    collision = sum(
+        collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
+        for contacts in (body.nearest, body.opposing)
+    )
+    if body.tips is not None:
+        collision = collision + repulsion_energy(
+            position,
+            body.tips.pairs,
+            constants.collision_stiffness,
+            constants.collision_thickness,
+            body.tips.next_body,
+        )
+    friction = friction_energy(
+        position,
+        problem.position,
+        body.nearest,
+        body.friction_load,
+        constants.friction_coefficient,
+        constants.friction_speed * problem.timestep,
+    )
+    return jnp.asarray(collision), friction
 
 
-def next_friction_load(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, garment: Garment
-) -> Float[Array, " vertices"]:
-    """Return the contact force at t + 1 [N], which loads the next frame's friction."""
-    assert problem.contacts is not None
-    assert problem.collision_thickness is not None
-    parameters = problem.parameters
+def potential(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
+    """Return the incremental potential [J]: the sum of all terms at positions [m], shape [vertices, 3]."""
+    return sum(potential_terms(position, problem))  # type: ignore[return-value]
+
+
+def evaluate(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Point:
+    """Return positions [m], shape [vertices, 3], with the frame's potential and its gradient there."""
+    return Point(position, *jax.value_and_grad(potential)(position, problem))
+
+
+def contact_load(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
+    """Return the normal force of the body on every vertex [N]; it loads the next frame's friction.
+
+    Args:
+        position: Positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem; without a body the forces are zero.
+    """
+    if problem.body is None:
+        return jnp.zeros(position.shape[0], position.dtype)
+    body = problem.body
     return contact_forces(
-        position, problem.contacts, garment, parameters.collision_stiffness, problem.collision_thickness
+        position, body.nearest, problem.garment, problem.constants.collision_stiffness, body.thickness
     )

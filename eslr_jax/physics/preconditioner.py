@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components, scatter_corners
 from eslr_jax.physics.collision import penetration
-from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
@@ -44,46 +43,42 @@ def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " ver
 
 
 def hessian_diagonal(
-    problem: FrameProblem, garment: Garment, material: Material, position: Float[Array, "vertices 3"]
+    problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
     """Return a positive stiffness per vertex [N/m]: inertia, stretch, contacts and friction at `position`.
 
-    Padded and pinned vertices get one, so that dividing by it is safe.
+    Padded vertices get one, so that dividing by it is safe.
+
+    Args:
+        problem: The frame's problem.
+        position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
-    masses = vertex_masses(garment, material)
-    diagonal = masses / problem.timestep**2 + stretch_diagonal(garment, material)
-    if problem.contacts is not None:
-        assert problem.friction_load is not None
-        assert problem.collision_thickness is not None
-        parameters = problem.parameters
-        depth = penetration(position, problem.contacts, problem.collision_thickness)
-        if problem.opposing is not None:
-            depth = depth + penetration(position, problem.opposing, problem.collision_thickness)
-        slip = parameters.friction_speed * problem.timestep
-        if problem.tips is not None:
+    garment, constants = problem.garment, problem.constants
+    diagonal = problem.masses / problem.timestep**2 + stretch_diagonal(garment, problem.material)
+    if problem.body is not None:
+        body = problem.body
+        depth = penetration(position, body.nearest, body.thickness)
+        depth = depth + penetration(position, body.opposing, body.thickness)
+        slip = constants.friction_speed * problem.timestep
+        if body.tips is not None:
             diagonal = diagonal + repulsion_diagonal(
                 position,
-                problem.tips,
-                parameters.collision_stiffness,
-                parameters.collision_thickness,
-                problem.next_body,
+                body.tips.pairs,
+                constants.collision_stiffness,
+                constants.collision_thickness,
+                body.tips.next_body,
             )
         # The contact curvature acts along one of three axes, friction along two.
-        diagonal = diagonal + 2.0 * parameters.collision_stiffness * garment.vertex_areas * depth
-        diagonal = diagonal + parameters.friction_coefficient * problem.friction_load / (3.0 * slip)
-    if problem.self_contacts is not None:
+        diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
+        diagonal = diagonal + constants.friction_coefficient * body.friction_load / (3.0 * slip)
+    if problem.layers is not None:
         diagonal = diagonal + repulsion_diagonal(
-            position,
-            problem.self_contacts,
-            problem.parameters.repulsion_stiffness,
-            problem.repulsion_thickness,
+            position, problem.layers.pairs, constants.repulsion_stiffness, problem.layers.thickness
         )
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
 
 
-def stiffness(
-    problem: FrameProblem, garment: Garment, material: Material, position: Float[Array, "vertices 3"]
-) -> Stiffness:
+def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the diagonal at `position` with the springs that share out its membrane part.
 
     Every edge gets the smaller of what its two ends can give, so the matrix is symmetric and diagonally
@@ -91,18 +86,17 @@ def stiffness(
 
     Args:
         problem: The frame's problem.
-        garment: Rest mesh with its neighbour table.
-        material: Fabric.
-        position: Where contact and friction are linearised [m].
+        position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
+    garment = problem.garment
     is_free = garment.vertex_mask
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1), 1)
-    share = jnp.where(is_free, stretch_diagonal(garment, material) / degree, 0.0)
+    share = jnp.where(is_free, stretch_diagonal(garment, problem.material) / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(
-        diagonal=hessian_diagonal(problem, garment, material, position),
+        diagonal=hessian_diagonal(problem, position),
         neighbors=garment.neighbors,
         springs=jnp.where(garment.neighbor_mask, springs, 0.0),
     )

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.physics.potential import Point
+
 _MIN_CURVATURE = 1e-3  # of a combination, as a share of the directions' own: below it float32 holds noise
 
 
 def combine_directions(
     function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
-    position: Float[Array, "vertices 3"],
-    value: Float[Array, ""],
-    gradient: Float[Array, "vertices 3"],
+    point: Point,
     directions: Float[Array, "directions vertices 3"],
 ) -> Float[Array, "vertices 3"]:
-    """Return the displacement along `directions` that lowers `function` most [m], zero if none does.
+    """Return the displacement along `directions` that lowers `function` most [m], shape [vertices, 3]; zero if none does.
 
     The energy is taken as quadratic in the span; its curvature comes from one more gradient at the end of each
     direction. The result, the first direction alone, and staying are then compared by their energy, so that a
@@ -27,21 +27,23 @@ def combine_directions(
 
     Args:
         function: Energy [J] of positions; differentiable.
-        position: Where the directions start [m].
-        value: Energy there [J].
-        gradient: Gradient there [N].
-        directions: Displacements [m]; one that is zero everywhere is left out.
+        point: Where the directions begin.
+        directions: Displacements [m], shape [directions, vertices, 3]; one that is zero everywhere is left out.
 
     Source: sequential subspace optimisation, Narkiss and Zibulevsky 2005.
     """
     fixed = jax.lax.stop_gradient(directions)
-    changes = jax.vmap(lambda direction: jax.grad(function)(position + direction) - gradient)(fixed)
-    slopes = jnp.einsum("kij,ij->k", fixed, gradient)
+    changes = jax.vmap(lambda direction: jax.grad(function)(point.position + direction) - point.gradient)(
+        fixed
+    )
+    slopes = jnp.einsum("kij,ij->k", fixed, point.gradient)
     curvatures = jnp.einsum("kij,lij->kl", fixed, changes)
     weights = jax.lax.stop_gradient(_minimize_quadratic(slopes, 0.5 * (curvatures + curvatures.T)))
     combined = jnp.einsum("k,kij->ij", weights, directions)
     moves = jnp.stack([combined, directions[0], jnp.zeros_like(combined)])
-    values = jnp.stack([function(position + combined), function(position + directions[0]), value])
+    values = jnp.stack(
+        [function(point.position + combined), function(point.position + directions[0]), point.value]
+    )
     return moves[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
 
 

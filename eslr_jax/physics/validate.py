@@ -1,4 +1,4 @@
-"""Checks of materials, parameters and timesteps on the host, before anything is compiled."""
+"""Checks of materials, constants and timesteps on the host, before anything is compiled."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
-    from eslr_jax.physics.problem import PhysicsParameters
-    from eslr_jax.types import Garment, Material
+    from eslr_jax.types import Garment, Material, PhysicsConstants
 
 
 class Range(NamedTuple):
@@ -29,7 +28,7 @@ MATERIAL_RANGES = {
     "bending_stiffness": Range(0.0, 1.0, "J"),
     "thickness": Range(1e-6, 2e-2, "m"),
 }
-PARAMETER_RANGES = {
+CONSTANT_RANGES = {
     "gravity": Range(1e-2, 100.0, "m/s^2"),  # not zero: residuals are measured in weights
     "collision_stiffness": Range(0.0, 1e12, "J/m^5"),
     "collision_thickness": Range(0.0, 5e-2, "m"),
@@ -57,14 +56,14 @@ def validate_material(material: Material, garment: Garment | None = None) -> Non
             _check_shape(name, values, garment)
 
 
-def validate_parameters(parameters: PhysicsParameters) -> None:
+def validate_constants(constants: PhysicsConstants) -> None:
     """Check that the constants of a scene are finite scalars in their ranges.
 
     Raises:
         ConfigError: Names the parameter, its value and what is accepted.
     """
-    for name, value in vars(parameters).items():
-        accepted = PARAMETER_RANGES.get(name, Range(-np.inf, np.inf, ""))
+    for name, value in vars(constants).items():
+        accepted = CONSTANT_RANGES.get(name, Range(-np.inf, np.inf, ""))
         values = _check_range(name, value, accepted)
         if values.ndim:
             raise ConfigError(f"{name} has shape {values.shape}; give one number for the whole scene")

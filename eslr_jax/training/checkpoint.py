@@ -34,7 +34,7 @@ class Checkpoints:
 
         Source: orbax copies to the host before it returns, and renames the folder when it is whole.
         """
-        self._manager.save(int(state.iteration), args=ocp.args.StandardSave(_plain(state)))
+        self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
 
     def wait(self) -> None:
         """Wait for what is being written, and raise its error.
@@ -51,7 +51,7 @@ class Checkpoints:
             ) from error
 
     def latest(self) -> int | None:
-        """Return the iteration of the newest whole checkpoint."""
+        """Return the step of the newest whole checkpoint."""
         return self._manager.latest_step()
 
     def restore(self, example: TrainState) -> TrainState:

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
 from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
@@ -16,7 +16,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.numerics import vertex_normals
-from eslr_jax.scene import shared_surface
+from eslr_jax.scene.plan import shared_surface
 from eslr_jax.types import BodySurface, Garment
 
 _FPS = 30.0
@@ -60,20 +60,6 @@ class TrainingData:
         return lbs.skin(rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
 
 
-def clips_of(split: str) -> list[str]:
-    """Return the clips of a split.
-
-    Raises:
-        ConfigError: There is no such split, or it is empty.
-    """
-    clips = load_splits()["motions"]
-    if split not in clips or not clips[split]:
-        raise ConfigError(
-            f"no clips in split {split!r}; there are {', '.join(name for name in clips if clips[name])}"
-        )
-    return clips[split]
-
-
 def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     """Load the garments at one resolution and the clips of a training run.
 
@@ -86,8 +72,10 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
     surface = shared_surface(garments, body)
+    if surface is None:
+        raise ConfigError("none of the garments is near the body; train on garments that are worn")
     surface_rest = jnp.asarray(body.rest_positions[surface.vertex_ids])
-    motions = [load_motion(clip) for clip in clips_of(config.split)]
+    motions = [load_motion(clip) for clip in split_clips(config.split)]
     rotations, translations, frames_left = _join_clips(motions)
     return TrainingData(
         garments=stacked,

@@ -16,7 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CheckpointError, NonFiniteError
+from eslr_jax.errors import CapacityError, CheckpointError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
@@ -41,11 +41,12 @@ def train(
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial_params: Weights to start from instead of random ones.
-        on_progress: Called with iterations done, iterations in all, and the latest means.
+        on_progress: Called with steps done, steps in all, and the latest means.
 
     Raises:
         CheckpointError: `out` holds another run, or none to resume.
         NonFiniteError: Too many updates had to be skipped; the last good checkpoint is kept.
+        CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
     checkpoints = _open_run(config, ensure_output_dir(out), resume)
@@ -57,34 +58,40 @@ def train(
         state = state.replace(params={**state.params, **given})
     if resume:
         state = checkpoints.restore(state)
-        _forget_after(out / "metrics.jsonl", int(state.iteration))
-    steps = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
+        _forget_after(out / "metrics.jsonl", int(state.step))
+    step_functions = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
-    began, first = time.perf_counter(), int(state.iteration)
+    began, first = time.perf_counter(), int(state.step)
     metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
     with metrics_file.open("a") as log, _stop_requested() as is_stopping:
-        for iteration in range(first, config.iterations):
-            resolution = iteration % len(steps)
-            state, metrics = steps[resolution](state, datasets[resolution])
+        for step in range(first, config.steps):
+            resolution = step % len(step_functions)
+            state, metrics = step_functions[resolution](state, datasets[resolution])
             window.append(metrics)
-            done = iteration + 1
-            if done % config.log_every == 0 or done == config.iterations:
+            done = step + 1
+            if done % config.log_every == 0 or done == config.steps:
+                overflowed = any(float(entry["overflows"]) for entry in window)
                 means = _means(window)
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
-                record = {"iteration": done, "seconds": time.perf_counter() - began, "its": speed, **means}
+                record = {"step": done, "seconds": time.perf_counter() - began, "its": speed, **means}
                 log.write(json.dumps(record) + "\n")
                 log.flush()
-                on_progress(done, config.iterations, record)
+                on_progress(done, config.steps, record)
                 _check_skipped(state, config, checkpoints, out)
-            if done % config.checkpoint_every == 0 or done == config.iterations:
+                if overflowed:
+                    raise CapacityError(
+                        f"self-contact needed more room than its buffers have by step {done}; train with "
+                        "self_contact = false, or on a coarser mesh"
+                    )
+            if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
             if is_stopping(done):
                 if done % config.checkpoint_every:
                     checkpoints.save(state)
                 break
     checkpoints.close()
-    if int(state.iteration) >= config.iterations and is_first_process():
+    if int(state.step) >= config.steps and is_first_process():
         export(state, config, out)
     return state
 
@@ -92,7 +99,7 @@ def train(
 def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
     """Write the network of a run as npz and JSON, and return the npz file."""
     path = out / "model.npz"
-    training = {"iterations": int(state.iteration), "garments": config.garments, "vertices": config.vertices}
+    training = {"steps": int(state.step), "garments": config.garments, "vertices": config.vertices}
     write_weights(path, jax.device_get(state.params), config.model, training)
     return path
 
@@ -110,12 +117,12 @@ def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
     return Checkpoints(out)
 
 
-def _forget_after(metrics: Path, iteration: int) -> None:
-    """Drop the records of iterations that a killed run did after its last checkpoint: they come again."""
+def _forget_after(metrics: Path, step: int) -> None:
+    """Drop the records of steps that a killed run did after its last checkpoint: they come again."""
     if not is_first_process() or not metrics.exists():
         return
     lines = metrics.read_text().splitlines()
-    kept = [line for line in lines if line.endswith("}") and json.loads(line)["iteration"] <= iteration]
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
     with atomic_write(metrics) as temporary:
         temporary.write_text("".join(line + "\n" for line in kept))
 
@@ -142,7 +149,7 @@ def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoi
             **{str(i): leaf for i, leaf in enumerate(jax.tree.leaves(jax.device_get(state.pools)))},
         )
         raise NonFiniteError(
-            f"{skipped} updates were not finite by iteration {int(state.iteration)}; the last good checkpoint "
+            f"{skipped} updates were not finite by step {int(state.step)}; the last good checkpoint "
             f"is {last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
         )
 

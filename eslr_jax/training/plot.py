@@ -25,14 +25,14 @@ def plot_curves(folder: Path) -> Path | None:
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     if not records:
         return None
-    iterations = [record["iteration"] for record in records]
+    steps = [record["step"] for record in records]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    left.plot(iterations, [record["loss"] for record in records], label="loss")
+    left.plot(steps, [record["loss"] for record in records], label="loss")
     label = _CONTRACTION if read_run_config(folder).refinement_weights == "contraction" else _LOSS
-    left.set(xlabel="iteration", ylabel=label, yscale="symlog")
+    left.set(xlabel="step", ylabel=label, yscale="symlog")
     for term in _TERMS:
-        right.plot(iterations, [max(record[term], 1e-7) for record in records], label=term)
-    right.set(xlabel="iteration", ylabel="energy at the answer, median [J]", yscale="log")
+        right.plot(steps, [max(record[term], 1e-7) for record in records], label=term)
+    right.set(xlabel="step", ylabel="energy at the prediction, median [J]", yscale="log")
     right.legend()
     with atomic_write(folder / "curves.png") as temporary:
         figure.savefig(temporary, format="png", dpi=100)

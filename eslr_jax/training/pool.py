@@ -7,17 +7,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.body import lbs
 from eslr_jax.config import TrainConfig
-from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import initial_state, skin_frame
 from eslr_jax.training.data import TrainingData
 from eslr_jax.types import ClothState, Garment, Material
 
 _DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD)
-_PUSH_OUT_STEPS = 3
-_CLEARANCE = 2e-3  # [m], the collision thickness
+FPS = 30.0  # frames per second of training
 
 
 @struct.dataclass
@@ -69,35 +68,16 @@ def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: T
     frame = data.start_frames[jax.random.randint(keys[0], (), 0, data.start_frames.shape[0])]
     yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
     transforms, later = data.transforms(frame, yaw), data.transforms(frame + 1, yaw)
-    skinned = skin(garment, transforms)
-    velocity = (skin(garment, later) - skinned) * 30.0
+    skinned = skin_frame(garment, transforms)
+    velocity = (skin_frame(garment, later) - skinned) * FPS
     noise = config.noise * jax.random.normal(keys[2], skinned.shape)
     position = skinned + jnp.where(garment.is_pinned[:, None], 0.0, noise)
     girth = jax.random.uniform(keys[4], minval=-config.girth, maxval=config.girth)
     body = data.body(transforms, girth)
-
-    def project(_, position):
-        contacts = find_contacts(position, body, body, data.surface)
-        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
-        lift = jnp.where(contacts.is_near & ~garment.is_pinned, jnp.maximum(_CLEARANCE - height, 0.0), 0.0)
-        return position + lift[:, None] * contacts.normals
-
-    position = jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)
-    state = ClothState(
-        position=position,
-        velocity=velocity,
-        friction_load=jnp.zeros(position.shape[0]),
-        frame=jnp.int32(0),
-        status=jnp.int32(0),
-        first_bad_frame=jnp.int32(-1),
-    )
+    position = clear_of_body(position, body, data.surface, garment)
+    state = initial_state(position, velocity)
     material = sample_material(keys[3], config.material_probability)
     return Slot(state, frame.astype(jnp.int32), yaw, girth, jnp.int32(0), material, jnp.zeros((), bool))
-
-
-def skin(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
-    """Return the garment carried by the joints [m]."""
-    return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
 
 
 def sample_material(key: Array, probability: float) -> Material:

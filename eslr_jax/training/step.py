@@ -14,23 +14,25 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from eslr_jax.config import SimConfig, TrainConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax.config import TrainConfig
+from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import Normalizer
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
-from eslr_jax.physics.hood import BodyFrames, HoodParameters, collision_weight, hood_terms
+from eslr_jax.physics.hood import BodyFrames, HoodParameters, HoodProblem, collision_weight, hood_terms
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import potential_terms
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulate.network import graph_inputs
-from eslr_jax.simulate.step import FrameInput, frame_problem, next_state
+from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.scene.build import skin_frame
+from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
+from eslr_jax.simulation.network import graph_inputs
+from eslr_jax.simulation.stepper import next_state
 from eslr_jax.training.data import TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
-from eslr_jax.training.pool import Slot, empty_pool, skin, start_trajectory
-from eslr_jax.types import Garment
+from eslr_jax.training.pool import FPS, Slot, empty_pool, start_trajectory
+from eslr_jax.types import Garment, PhysicsConstants, Scene, SceneBody
 
-_TIMESTEP = 1 / 30  # [s]
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
 
@@ -43,7 +45,7 @@ class TrainState:
     optimizer: Any
     pools: tuple[Slot, ...]  # one per resolution
     key: Array
-    iteration: Int[Array, ""]
+    step: Int[Array, ""]  # of the optimiser
     skipped: Int[Array, ""]  # updates with a non-finite loss or gradient
 
 
@@ -54,8 +56,8 @@ def make_schedule(config: TrainConfig) -> optax.Schedule:
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=config.learning_rate,
-        warmup_steps=min(config.warmup, config.iterations - 1),
-        decay_steps=config.iterations,
+        warmup_steps=min(config.warmup, config.steps - 1),
+        decay_steps=config.steps,
         end_value=config.final_learning_rate,
     )
 
@@ -73,7 +75,7 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
         optimizer=make_optimizer(config).init(params["params"]),
         pools=tuple(empty_pool(data, config.slots_per_garment) for data in datasets),
         key=jax.random.key_data(jax.random.key(config.seed)),
-        iteration=jnp.int32(0),
+        step=jnp.int32(0),
         skipped=jnp.int32(0),
     )
 
@@ -122,11 +124,11 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
     def train_step(state: TrainState, data: TrainingData) -> tuple[TrainState, dict[str, Array]]:
         pool = state.pools[resolution]
         count, size = pool.is_done.shape[0], config.batch_size
-        turn = state.iteration // len(config.vertices)
+        turn = state.step // len(config.vertices)
         indices = (turn * size + jnp.arange(size)) % count
         key, start_key = jax.random.split(jax.random.wrap_key_data(state.key))
         slots = jax.tree.map(lambda leaf: leaf[indices], pool)
-        batch = (indices, jax.random.split(start_key, size), slots)
+        batch = _Entry(indices, jax.random.split(start_key, size), slots)
         run = partial(_batch_gradient, config=config)
         if mesh is not None:
             run = jax.shard_map(
@@ -136,7 +138,7 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
                 out_specs=(PartitionSpec(), PartitionSpec(BATCH)),
                 check_vma=False,
             )
-        gradient, samples = run(state.params, data, state.iteration, batch)
+        gradient, samples = run(state.params, data, state.step, batch)
         norm = optax.tree.norm(gradient)
         is_good = jnp.isfinite(norm) & jnp.all(jnp.isfinite(samples.metrics["loss"]))
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
@@ -154,7 +156,7 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
                 optimizer=keep(optimizer, state.optimizer),
                 pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
                 key=jax.random.key_data(key),
-                iteration=state.iteration + 1,
+                step=state.step + 1,
                 skipped=state.skipped + ~is_good,
             ),
             {**metrics, "gradient_norm": norm},
@@ -163,11 +165,19 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
     return train_step
 
 
+class _Entry(NamedTuple):
+    """One trajectory of a batch."""
+
+    index: Int[Array, ""]  # in the pool
+    key: Array  # of the random numbers with which it starts anew
+    slot: Slot
+
+
 def _batch_gradient(
     params: Any,
     data: TrainingData,
-    iteration: Int[Array, ""],
-    batch: tuple[Int[Array, " batch"], Array, Slot],
+    step: Int[Array, ""],
+    batch: _Entry,
     *,
     config: TrainConfig,
     axis: str | None = None,
@@ -178,7 +188,7 @@ def _batch_gradient(
     """
 
     def add(total, entry):
-        gradient, sample = _sample_gradient(params, data, iteration, *entry, config=config)
+        gradient, sample = _sample_gradient(params, data, step, entry, config=config)
         return jax.tree.map(jnp.add, total, gradient), sample
 
     zeros = jax.tree.map(jnp.zeros_like, params["params"])
@@ -189,48 +199,55 @@ def _batch_gradient(
 
 
 def _sample_gradient(
-    params: Any,
-    data: TrainingData,
-    iteration: Int[Array, ""],
-    index: Int[Array, ""],
-    key: Array,
-    slot: Slot,
-    *,
-    config: TrainConfig,
+    params: Any, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
 ) -> tuple[Any, _Sample]:
     """Return one trajectory's gradient, and move it on by a frame."""
-    garment = data.garment(index % data.num_garments)
-    slot = jax.lax.cond(slot.is_done, lambda: start_trajectory(key, data, garment, config), lambda: slot)
+    garment = data.garment(entry.index % data.num_garments)
+    slot = jax.lax.cond(
+        entry.slot.is_done,
+        lambda: start_trajectory(entry.key, data, garment, config),
+        lambda: entry.slot,
+    )
     problem = _problem(slot, data, garment, config)
     terms_of = potential_terms
     if config.energy_set == "hood":
-        terms_of = _hood_terms(slot, data, iteration // config.horizon)
+        terms_of = _hood_terms(slot, data, step // config.horizon)
 
     def loss_of(trained):
-        weights = {**params, "params": trained}
-        return physics_loss(weights, garment, slot.material, problem, slot.state, config, terms_of)
+        return physics_loss({**params, "params": trained}, problem, slot.state, config, terms_of)
 
     (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(params["params"])
     statistics = {}
     if params["statistics"]:
-        statistics = _statistics(params, slot, problem, garment, config)
-    slot = _advance(slot, problem, garment, report, data, config, iteration)
-    resets = slot.is_done.astype(jnp.float32)
-    terms = {name: jnp.asarray(value) for name, value in report.terms._asdict().items()}
-    metrics = {"loss": loss, "start": report.start, "resets": resets, **terms}
+        statistics = _statistics(params, slot, problem, config)
+    slot = _advance(slot, problem, report, data, _horizon(config, step))
+    metrics = {
+        "loss": loss,
+        "inertial_energy": report.inertial_energy,
+        "resets": slot.is_done.astype(jnp.float32),
+        "overflows": (slot.state.status & Status.SELF_CONTACT_OVERFLOW > 0).astype(jnp.float32),
+        **report.terms._asdict(),
+    }
     return gradient, _Sample(slot, metrics, statistics)
 
 
-def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig):
+def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig) -> FrameProblem:
     """Pose the body at both ends of the frame and state the frame's problem."""
     transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
-    frame = FrameInput(data.body(transforms, slot.girth), data.body(later, slot.girth), skin(garment, later))
-    parameters = PhysicsParameters(collision_stiffness=config.collision_stiffness)
-    scene = SimConfig(self_contact=config.self_contact)
-    problem = frame_problem(
-        garment, slot.state, frame, data.surface, jnp.float32(_TIMESTEP), parameters, scene
+    body = BodyStep(data.body(transforms, slot.girth), data.body(later, slot.girth))
+    scene = Scene(
+        garment=garment,
+        material=slot.material,
+        constants=PhysicsConstants(collision_stiffness=config.collision_stiffness),
+        timestep=jnp.float32(1.0 / FPS),
+        initial_state=slot.state,
+        body=SceneBody(data.surface, body.start[None, :0]),
+        pin_targets=None,
+        num_frames=0,
+        self_contact=default_capacity(garment.vertex_mask.shape[0]) if config.self_contact else None,
     )
-    return jax.lax.stop_gradient(problem)
+    inputs = FrameInput(body, skin_frame(garment, later))
+    return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))
 
 
 def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> EnergyTerms:
@@ -239,56 +256,60 @@ def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> 
     last = jnp.maximum(slot.frame - 1, 0)
     before = jnp.where(data.frames_left[last] > data.frames_left[slot.frame], last, slot.frame)
     frames = (before, slot.frame, slot.frame + 1)
-    bodies = BodyFrames(*(data.body(data.transforms(frame, slot.yaw), slot.girth) for frame in frames))
+    bodies = BodyFrames(
+        *(data.body(data.transforms(frame, slot.yaw), slot.girth) for frame in frames), data.surface.faces
+    )
     parameters = HoodParameters(collision_weight=collision_weight(num_samples))
     state = slot.state
 
-    def terms_of(position, problem, garment, material):
-        previous = state.position - problem.timestep * state.velocity
-        faces = data.surface.faces
-        return hood_terms(
-            position,
-            state.position,
-            previous,
-            bodies,
-            faces,
-            garment,
-            material,
-            problem.timestep,
-            parameters,
+    def terms_of(position, problem: FrameProblem):
+        around = HoodProblem(
+            current=state.position,
+            previous=state.position - problem.timestep * state.velocity,
+            bodies=bodies,
+            garment=problem.garment,
+            material=problem.material,
+            timestep=problem.timestep,
+            parameters=parameters,
         )
+        return hood_terms(position, around)
 
     return terms_of
 
 
+class _Horizon(NamedTuple):
+    """When a trajectory ends."""
+
+    frames: Int[Array, ""]
+    reset_stretch: float
+    reset_displacement: float  # [m]
+
+
+def _horizon(config: TrainConfig, step: Int[Array, ""]) -> _Horizon:
+    """Return how long trajectories are by now, and what counts as astray."""
+    frames = jnp.minimum(config.horizon, 1 + step // config.horizon_growth)
+    return _Horizon(frames, config.reset_stretch, config.reset_displacement)
+
+
 def _advance(
-    slot: Slot,
-    problem,
-    garment: Garment,
-    report: LossReport,
-    data: TrainingData,
-    config: TrainConfig,
-    iteration: Int[Array, ""],
+    slot: Slot, problem: FrameProblem, report: LossReport, data: TrainingData, horizon: _Horizon
 ) -> Slot:
-    """Move the trajectory on with the network's answer; mark it done where it ends or has gone astray."""
-    state = next_state(report.answer, problem, garment, slot.state, jnp.int32(0))
-    stretch = jnp.max(principal_stretches(report.answer, garment)[0])
-    moved = jnp.max(jnp.abs(report.answer - slot.state.position))
-    is_astray = ~(stretch < config.reset_stretch) | ~(moved < config.reset_displacement)
-    horizon = jnp.minimum(config.horizon, 1 + iteration // config.horizon_growth)
+    """Move the trajectory on with the network's prediction; mark it done where it ends or has gone astray."""
+    state = next_state(report.onward, problem, slot.state, jnp.int32(0))
+    stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
+    moved = jnp.max(jnp.abs(report.onward - slot.state.position))
+    is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
     age, frame = slot.age + 1, slot.frame + 1
-    is_done = is_astray | (age >= horizon) | (data.frames_left[frame] < 1)
+    is_done = is_astray | (age >= horizon.frames) | (data.frames_left[frame] < 1)
     return slot.replace(state=state, frame=frame, age=age, is_done=is_done)
 
 
-def _statistics(
-    params: Any, slot: Slot, problem, garment: Garment, config: TrainConfig
-) -> dict[str, Normalizer]:
-    """Return what the normalisers see in this frame (HOOD); accelerations are those of the frame's start."""
-    inputs = graph_inputs(problem, garment, slot.material, slot.state)
-    graph = build_graph(garment, slot.material, inputs, config.model)
+def _statistics(params: Any, slot: Slot, problem: FrameProblem, config: TrainConfig) -> dict[str, Normalizer]:
+    """Return what the normalisers see in this frame (HOOD); accelerations are those of the skinned garment."""
+    inputs = graph_inputs(problem, slot.state)
+    graph = build_graph(problem.garment, problem.material, inputs, config.model)
     acceleration = None
     if config.model.output == "acceleration":
         guess = problem.pin_targets if problem.pin_targets is not None else problem.inertial_guess
         acceleration = guess - problem.inertial_guess
-    return measure_statistics(config.model, params, graph, garment, acceleration)
+    return measure_statistics(config.model, params, graph, problem.garment, acceleration)

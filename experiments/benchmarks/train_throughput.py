@@ -21,7 +21,7 @@ from eslr_jax.evaluation.calibrate import device_name
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulate.step import FrameInput, frame_problem
+from eslr_jax.simulation.step import FrameInput, frame_problem
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.pool import skin, start_trajectory

@@ -23,9 +23,9 @@ from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.models.registry import MODELS, count_parameters, init_model
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
-from eslr_jax.simulate.network import network_step
-from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import frame_problem
+from eslr_jax.simulation.network import network_step
+from eslr_jax.simulation.scan import frame_inputs
+from eslr_jax.simulation.step import frame_problem
 
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10")
 TRAINED = (default_model(), START_MODEL, *ABLATION)

@@ -27,7 +27,7 @@ from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
 from eslr_jax.scene import prepare_scene
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")

@@ -21,7 +21,7 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.hood import HoodParameters, hood_metrics
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scenes
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides, find_contacts, nearest_point
-from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.geometry.surface import prepare_surface
 
 
 @pytest.fixture(scope="module")

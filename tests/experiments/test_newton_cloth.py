@@ -26,7 +26,7 @@ from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import contact_forces
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 from eslr_jax.types import Contacts
 
 SOLVERS = [Setting("vbd", 2, 10), Setting("style3d", 2, 10), Setting("xpbd", None, 1)]

@@ -24,7 +24,7 @@ from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.physics.repulsion import pair_heights, repulsion_energy
 from eslr_jax.scene import initial_state
-from eslr_jax.simulate.step import FrameInput, frame_problem
+from eslr_jax.simulation.step import FrameInput, frame_problem
 
 
 def assemble(blocks, table, count):

@@ -15,7 +15,7 @@ from eslr_jax.geometry.validate import validate_body
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import check_scene, more_room, raise_for_status, rollout
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.scan import simulate_scene
 
 
 def level_sheet(**options):

@@ -12,8 +12,8 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import raise_for_status, rollout_batch
 from eslr_jax.scene import SceneOptions, prepare_scene, prepare_scenes, shared_surface
-from eslr_jax.simulate.batch import simulate_scenes, stack_scenes
-from eslr_jax.simulate.scan import simulate_scene
+from eslr_jax.simulation.batch import simulate_scenes, stack_scenes
+from eslr_jax.simulation.scan import simulate_scene
 
 QUICK = SimConfig(simulator="physics", solver_iterations=5)
 EARLY = 4  # frames

@@ -12,8 +12,8 @@ from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.physics.start import solver_start
-from eslr_jax.simulate.scan import frame_inputs
-from eslr_jax.simulate.step import frame_problem, step
+from eslr_jax.simulation.scan import frame_inputs
+from eslr_jax.simulation.step import frame_problem, step
 
 CONFIG = MODELS["smooth-small"]
 

@@ -13,8 +13,8 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import more_room, raise_for_status, rollout, rollout_in_chunks
 from eslr_jax.scene import SceneOptions, prepare_scene
-from eslr_jax.simulate.scan import simulate_scene
-from eslr_jax.simulate.step import frame_problem
+from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.simulation.step import frame_problem
 
 PHYSICS = SimConfig(simulator="physics", solver_iterations=200)
 SMALL = dataclasses.replace(MODELS["eslr-small"], refinement_steps=2)

@@ -13,7 +13,6 @@ import numpy as np
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.errors import Status
 from eslr_jax.evaluation.colliders import Capsule, Collider, Sphere
 from eslr_jax.evaluation.gap import trajectory_states
@@ -40,6 +39,7 @@ from eslr_jax.evaluation.hard_cases.measures import (
 )
 from eslr_jax.evaluation.hard_cases.simulators import Run, StressScene, simulate
 from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene import SceneOptions, prepare_scene
 from eslr_jax.types import Material

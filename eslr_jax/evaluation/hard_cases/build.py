@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from eslr_jax.contact.surface import prepare_surface
 from eslr_jax.evaluation.colliders import Collider
 from eslr_jax.evaluation.hard_cases.simulators import StressScene
 from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import initial_state

@@ -22,7 +22,7 @@ from eslr_jax.physics.membrane import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import hessian_diagonal
 from eslr_jax.physics.problem import FrameProblem, PhysicsParameters, make_problem, pin, start_guess
-from eslr_jax.simulate.step import frame_problem, solve
+from eslr_jax.simulation.step import frame_problem, solve
 from eslr_jax.types import Garment, Material
 
 MM = 1e3  # millimetres per metre

@@ -15,7 +15,7 @@ from eslr_jax.errors import EslrError, Status
 from eslr_jax.evaluation.colliders import Collider
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.rollout import more_room
-from eslr_jax.simulate.scan import frame_inputs, join_frames, scan_frames
+from eslr_jax.simulation.scan import frame_inputs, join_frames, scan_frames
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 _CHUNK = 10  # frames per call of the compiled scan, so that scenes of any length share it

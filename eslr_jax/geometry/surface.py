@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
+from eslr_jax.geometry.topology import incidence_table
 from eslr_jax.types import BodySurface
 
 _PATCH_SIZE = 16  # most vertices per patch; more make the first level cheaper and the second dearer
@@ -30,7 +31,7 @@ def prepare_surface(
     return BodySurface(
         vertex_ids=jnp.asarray(vertex_ids, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
-        face_incidence=jnp.asarray(_corner_incidence(faces, len(positions)), jnp.int32),
+        face_incidence=jnp.asarray(incidence_table(faces, len(positions)), jnp.int32),
         patch_centers=jnp.asarray(centers, jnp.int32),
         patch_vertices=jnp.asarray(patch_vertices, jnp.int32),
         vertex_faces=jnp.asarray(_candidate_faces(positions, faces), jnp.int32),
@@ -54,17 +55,6 @@ def _patches(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for ids in members
     ]
     return np.array(centers), np.stack([np.resize(ids, max(map(len, members))) for ids in members])
-
-
-def _corner_incidence(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """For each vertex the positions in `faces.T.ravel()` that name it, padded with `faces.size`."""
-    flat = faces.T.ravel()
-    order = np.argsort(flat, kind="stable")
-    degree = np.bincount(flat, minlength=num_vertices)
-    slot = np.arange(len(flat)) - np.concatenate([[0], np.cumsum(degree)[:-1]])[flat[order]]
-    table = np.full((num_vertices, degree.max()), len(flat))
-    table[flat[order], slot] = order
-    return table
 
 
 def _candidate_faces(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Decide what a scene needs; what it does not need is absent from the compiled step."""
+"""Decide what a scene models, from what is there (host)."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.motion import skin_garment
-from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.contact.surface import prepare_surface
+from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import MotionError
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
+from eslr_jax.scene.build import ScenePlan, build_scene, skin_garment
+from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
 REACH = 0.08
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 _SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
-_PUSH_OUT_STEPS = 8  # tangent-plane projections that take the skinned start out of the body
-_START_CLEARANCE = 2e-3  # [m]; the collision thickness
+_build = jax.jit(build_scene)
+_skin = jax.jit(skin_garment)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,27 +33,26 @@ class SceneOptions:
     reach: float = REACH  # [m], besides how far the garment hangs from the body at rest
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
+    self_contact: bool = False  # keep layers of cloth apart
 
 
-def prepare_scene(
+def plan_scene(
     garment: Garment,
     poses: BodyMotion,
     *,
-    material: Material = COTTON,
+    constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
     surface: BodySurface | None = None,
-) -> Scene:
-    """Collect what a rollout reads, and leave out what it does not need.
-
-    Frame 0 is the garment skinned to the first pose and pushed out of the body.
+) -> ScenePlan:
+    """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
     Args:
         garment: A prepared garment.
         poses: The body in motion.
-        material: Fabric.
+        constants: Physical constants.
         options: What to leave out or add.
-        surface: Search this part of the body instead of what the garment can reach, so that several scenes
-            share one compiled rollout; see `shared_surface`.
+        surface: Body faces to search instead of those in reach, so that several scenes share one compiled
+            rollout; see `shared_surface`.
 
     Raises:
         MotionError: The motion has fewer than two frames.
@@ -63,77 +61,97 @@ def prepare_scene(
     num_frames = poses.joint_transforms.shape[0]
     if num_frames < 2:
         raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
-    skinned = skin_garment(garment, poses.joint_transforms)
-    if surface is None and options.has_body:
-        is_near = reachable_vertices(garment, skinned, poses, options.reach)
-        surface = _surface_near(is_near, poses)
-    body_positions = None if surface is None else poses.positions[:, surface.vertex_ids]
-    position = skinned[0]
-    if surface is not None:
-        assert body_positions is not None
-        position = _clear_of_body(position, garment, body_positions[0], surface)
-    velocity = (skinned[1] - skinned[0]) / poses.timestep
-    if options.start_at_rest:
-        velocity = jnp.zeros_like(velocity)
-    return Scene(
-        garment=garment,
-        material=material,
-        start=initial_state(position, velocity),
-        timestep=poses.timestep,
+    if not options.has_body:
+        surface = None
+    elif surface is None:
+        skinned = np.asarray(_skin(garment, poses.joint_transforms))
+        surface = _surface_near(reachable_vertices(garment, skinned, poses, options.reach), poses)
+    return ScenePlan(
         surface=surface,
-        body_positions=body_positions,
-        pin_targets=skinned if bool(np.any(garment.is_pinned)) else None,
-        num_frames=num_frames,
+        constants=constants or PhysicsConstants(),
+        has_pins=bool(np.any(garment.is_pinned)),
+        starts_at_rest=options.start_at_rest,
+        self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
     )
+
+
+def prepare_scene(
+    garment: Garment,
+    poses: BodyMotion,
+    *,
+    material: Material = COTTON,
+    constants: PhysicsConstants | None = None,
+    options: SceneOptions | None = None,
+    surface: BodySurface | None = None,
+) -> Scene:
+    """Return the scene of a garment on a moving body, without what it does not need.
+
+    Frame 0 is the garment skinned to the first pose and pushed out of the body.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion.
+        material: Fabric.
+        constants: Physical constants.
+        options: What to leave out or add.
+        surface: Body faces to search, see `plan_scene`.
+
+    Raises:
+        MotionError: The motion has fewer than two frames.
+    """
+    plan = plan_scene(garment, poses, constants=constants, options=options, surface=surface)
+    return _build(garment, poses, material, plan)
 
 
 def prepare_scenes(
     garments: Sequence[Garment],
     poses: Sequence[BodyMotion],
+    materials: Sequence[Material],
     *,
-    material: Material = COTTON,
+    constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
 ) -> list[Scene]:
-    """Prepare scenes that can be stacked: padded to one bucket, over one part of the body.
+    """Return scenes that can be stacked: padded to one bucket, over one part of the body.
 
     What one of them needs, all of them model: pins, and the body faces near any garment at rest, whatever the
-    motion: other motions of the same garments then run the same compiled rollout.
+    motion. Other motions of the same garments then run the same compiled rollout.
 
     Args:
         garments: Unpadded garments of like sizes.
         poses: As many motions of bodies with the same faces and of the same length.
-        material: Fabric of all.
+        materials: As many fabrics.
+        constants: Physical constants of all.
         options: What to leave out or add.
+
+    Raises:
+        MotionError: A motion has fewer than two frames.
     """
     options = options or SceneOptions()
-    bucket = common_bucket([choose_bucket(garment) for garment in garments])
-    padded = pad_alike(garments, bucket)
+    padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
     surface = shared_surface(padded, poses[0]) if options.has_body else None
-    scenes = [
-        prepare_scene(garment, motion, material=material, options=options, surface=surface)
+    plans = [
+        plan_scene(garment, motion, constants=constants, options=options, surface=surface)
         for garment, motion in zip(padded, poses, strict=True)
     ]
-    if all(scene.pin_targets is None for scene in scenes):
-        return scenes
+    has_pins = any(plan.has_pins for plan in plans)
     return [
-        scene.replace(pin_targets=skin_garment(scene.garment, motion.joint_transforms))
-        for scene, motion in zip(scenes, poses, strict=True)
+        _build(garment, motion, material, plan.replace(has_pins=has_pins))
+        for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
     ]
 
 
-def initial_state(position: jax.Array, velocity: jax.Array) -> ClothState:
-    """Return a cloth state without history."""
-    return ClothState(
-        position=position,
-        velocity=velocity,
-        friction_load=jnp.zeros(position.shape[0], position.dtype),
-        frame=jnp.int32(0),
-        status=jnp.int32(0),
-        first_bad_frame=jnp.int32(-1),
+def first_frames(scene: Scene, num_frames: int) -> Scene:
+    """Return the first frames of a scene, at most all of them."""
+    num_frames = min(num_frames, scene.num_frames)
+    body, pins = scene.body, scene.pin_targets
+    return scene.replace(
+        body=None if body is None else body.replace(positions=body.positions[:num_frames]),
+        pin_targets=None if pins is None else pins[:num_frames],
+        num_frames=num_frames,
     )
 
 
-def reachable_vertices(garment: Garment, skinned: jax.Array, poses: BodyMotion, reach: float) -> np.ndarray:
+def reachable_vertices(garment: Garment, skinned: np.ndarray, poses: BodyMotion, reach: float) -> np.ndarray:
     """Return which body vertices the skinned garment can reach in a sample of frames.
 
     A T-shirt's scene then searches no legs, no head and no feet.
@@ -185,18 +203,3 @@ def _within(radii: np.ndarray, centers: np.ndarray, points: np.ndarray) -> np.nd
     for hits in cKDTree(points).query_ball_point(centers, radii):
         is_within[hits] = True
     return is_within
-
-
-@jax.jit
-def _clear_of_body(position: jax.Array, garment: Garment, body: jax.Array, surface: BodySurface) -> jax.Array:
-    """Move vertices that lie within the clearance of the body onto it; pinned ones stay."""
-
-    def project(_, position):
-        contacts = find_contacts(position, body, body, surface)
-        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
-        height = jnp.minimum(height, contacts.distances)
-        lift = jnp.where(contacts.is_near, jnp.maximum(_START_CLEARANCE - height, 0.0), 0.0)
-        lift = jnp.where(garment.is_pinned, 0.0, lift)
-        return position + lift[:, None] * contacts.normals
-
-    return jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)

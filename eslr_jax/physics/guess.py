@@ -1,0 +1,69 @@
+"""Where the minimisation of a frame begins when no network predicts it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from eslr_jax.numerics import scatter_corners
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.problem import FrameProblem, pin, pushed_out_guess
+
+_COLLAPSED = 1e-6  # of a face's rest area, below which its normal means nothing
+_OFFSET = 1e-6  # [m] by which the corners of collapsed faces are spread
+
+
+class InitialGuess(NamedTuple):
+    """Where the solver and the networks begin a frame."""
+
+    position: Float[Array, "vertices 3"]  # [m]
+    inertial_energy: Float[
+        Array, ""
+    ]  # [J] at the pushed-out inertial guess, from which the initial gap counts
+
+
+def initial_guess(problem: FrameProblem) -> InitialGuess:
+    """Return the lower of two guesses, with collapsed faces opened a little.
+
+    The inertial guess suits cloth that rests or hangs. The ballistic guess suits cloth that falls: there it is
+    the optimum, which L-BFGS misses by millimetres a second, since its first steps bend what only has to move.
+    The potential decides.
+    """
+    inertial = pushed_out_guess(problem)
+    fall = problem.constants.gravity * problem.timestep * problem.timestep
+    falling = problem.inertial_guess - jnp.array([[0.0, 1.0, 0.0]], inertial.dtype) * fall
+    ballistic = pushed_out_guess(problem.replace(inertial_guess=falling))
+    guesses = jnp.stack([inertial, ballistic])
+    values = jax.lax.map(lambda guess: potential(guess, problem), guesses)
+    lower = jnp.where(values[1] < values[0], ballistic, inertial)
+    return InitialGuess(spread_collapsed(lower, problem), values[0])
+
+
+def spread_collapsed(
+    position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> Float[Array, "vertices 3"]:
+    """Return positions [m], shape [vertices, 3], with vertices of collapsed faces moved by a micrometre.
+
+    The angle at a hinge without area is zero by convention, and jumps as soon as it has any. From cloth pressed
+    flat onto a line every step is uphill, and a line search would stay there for ever.
+    """
+    garment = problem.garment
+    corners = position[garment.faces]
+    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    squared = jnp.sum(normal * normal, axis=-1)  # four times the area, squared
+    is_open = squared > jnp.square(2.0 * _COLLAPSED * garment.rest_areas)
+    is_real = garment.rest_areas > 0
+    open_faces = scatter_corners(
+        jnp.broadcast_to((is_open & is_real)[:, None], garment.faces.shape).astype(position.dtype),
+        garment.face_incidence,
+    )
+    row = jnp.arange(position.shape[0], dtype=position.dtype)
+    # The golden angle and its like: offsets without a pattern along the mesh's numbering.
+    offset = jnp.stack(
+        [jnp.sin(2.399963 * row), jnp.sin(3.883222 * row + 1.0), jnp.cos(5.083204 * row)], axis=-1
+    )
+    is_collapsed = (open_faces == 0) & garment.vertex_mask
+    return pin(problem, jnp.where(is_collapsed[:, None], position + _OFFSET * offset, position))

@@ -1,0 +1,1 @@
+"""Scenes: what a rollout models, and all that it reads."""

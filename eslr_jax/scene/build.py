@@ -1,0 +1,108 @@
+"""From a garment, a moving body and a plan to the scene that a rollout reads; pure, fit for jit, vmap and grad."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from eslr_jax.body import lbs
+from eslr_jax.contact.nearest import clear_of_body
+from eslr_jax.types import (
+    BodyMotion,
+    BodySurface,
+    ClothState,
+    Garment,
+    Material,
+    PairCapacity,
+    PhysicsConstants,
+    Scene,
+    SceneBody,
+)
+
+
+@struct.dataclass
+class ScenePlan:
+    """What a scene models, with which constants, and how large its buffers are."""
+
+    surface: BodySurface | None  # body faces that are searched for contacts; None: no body
+    constants: PhysicsConstants = PhysicsConstants()
+    has_pins: bool = struct.field(pytree_node=False, default=True)
+    starts_at_rest: bool = struct.field(
+        pytree_node=False, default=False
+    )  # else frame 0 moves as the body does
+    self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
+
+
+def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: ScenePlan) -> Scene:
+    """Return the scene of a garment on a moving body.
+
+    Frame 0 is the garment skinned to the first pose and pushed out of the body.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion, two frames or more.
+        material: Fabric.
+        plan: What to model.
+    """
+    skinned = skin_garment(garment, poses.joint_transforms)
+    position, body = skinned[0], None
+    if plan.surface is not None:
+        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids])
+        position = clear_of_body(position, body.positions[0], plan.surface, garment)
+    velocity = (skinned[1] - skinned[0]) / poses.timestep
+    if plan.starts_at_rest:
+        velocity = jnp.zeros_like(velocity)
+    return Scene(
+        garment=garment,
+        material=material,
+        constants=plan.constants,
+        initial_state=initial_state(position, velocity),
+        timestep=poses.timestep,
+        body=body,
+        pin_targets=skinned if plan.has_pins else None,
+        num_frames=skinned.shape[0],
+        self_contact=plan.self_contact,
+    )
+
+
+def safe_plan(poses: BodyMotion) -> ScenePlan:
+    """Return the plan that holds whatever the values are: the whole body is searched, and pins are modelled."""
+    return ScenePlan(surface=poses.surface)
+
+
+def skin_garment(
+    garment: Garment, transforms: Float[Array, "frames joints 3 4"]
+) -> Float[Array, "frames vertices 3"]:
+    """Return the garment carried by the joints [m], shape [frames, vertices, 3].
+
+    Frame by frame: a vmap would hold frames x vertices x influences matrices at once.
+
+    Args:
+        garment: Rest mesh with its skin weights.
+        transforms: Maps from rest to posed points, shape [frames, joints, 3, 4].
+    """
+    return jax.lax.map(lambda frame: skin_frame(garment, frame), transforms)
+
+
+def skin_frame(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
+    """Return the garment carried by the joints of one frame [m], shape [vertices, 3]."""
+    return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
+
+
+def initial_state(position: Float[Array, "vertices 3"], velocity: Float[Array, "vertices 3"]) -> ClothState:
+    """Return a state without history.
+
+    Args:
+        position: Vertex positions [m], shape [vertices, 3].
+        velocity: Vertex velocities [m/s], shape [vertices, 3].
+    """
+    return ClothState(
+        position=position,
+        velocity=velocity,
+        friction_load=jnp.zeros(position.shape[0], position.dtype),
+        frame=jnp.int32(0),
+        status=jnp.int32(0),
+        first_bad_frame=jnp.int32(-1),
+    )

@@ -1,0 +1,152 @@
+"""Several scenes at once: one compiled function for all, on one device or on many (host)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.padding import choose_bucket
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.simulation.rollout import check_network, rollout_scene
+from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, try_simulate
+from eslr_jax.types import BodyMotion, Garment, Material, PhysicsConstants, Scene, Trajectory
+
+SCENES = "scenes"  # axis of the device mesh
+
+
+def simulate_batch(
+    params: Any,
+    garments: Sequence[Garment],
+    poses: Sequence[BodyMotion],
+    *,
+    config: SimConfig | None = None,
+    material: Material | Sequence[Material] = COTTON,
+    constants: PhysicsConstants | None = None,
+    options: SceneOptions | None = None,
+    batch_size: int = 1,
+    devices: Sequence[Any] | None = None,
+) -> list[Trajectory]:
+    """Simulate garment i on motion i for every i; scenes of like size share one compiled rollout.
+
+    Garments are padded to the bucket of their vertex count, and those of one bucket are simulated together. A
+    scene whose buffers were too small is simulated again by itself.
+
+    Args:
+        params: Weights of the network; None without one.
+        garments: Of `load_garment` or `prepare_garment`; any sizes.
+        poses: As many motions, of `pose_body`.
+        config: Network, iterations and tolerance; the solver alone by default.
+        material: Fabric of all, or one for each.
+        constants: Physical constants of all.
+        options: What the scenes leave out or add.
+        batch_size: Scenes per step on a device, see `rollout_scenes`.
+        devices: Of `jax.devices()`, to spread the scenes over; by default the first alone.
+
+    Returns:
+        Trajectories in the order given, with the vertices of each garment. Their status is not checked, since
+        one bad scene shall not cost the others; see `raise_for_status`.
+
+    Raises:
+        ConfigError: There are not as many motions or fabrics as garments; or the network lacks weights; or a
+            fabric, a constant or a timestep is out of its physical range.
+        CheckpointError: The weights are for another architecture.
+        MotionError: A motion has fewer than two frames.
+    """
+    config = config or SimConfig()
+    check_network(params, config)
+    materials = [material] * len(garments) if isinstance(material, Material) else list(material)
+    if not len(garments) == len(poses) == len(materials):
+        raise ConfigError(
+            f"{len(garments)} garments, {len(poses)} motions and {len(materials)} fabrics; give one motion, and "
+            "one fabric or as many, for the garments"
+        )
+    devices = list(devices or [])
+    mesh = Mesh(np.array(devices), (SCENES,)) if len(devices) > 1 else None
+    done: dict[int, Trajectory] = {}
+    for group in _group_alike(garments, poses):
+        scenes = prepare_scenes(
+            *([parts[i] for i in group] for parts in (garments, poses, materials)),
+            constants=constants,
+            options=options,
+        )
+        for scene in scenes:
+            check_scene(scene)
+        # Devices get equal shares: the last scene is repeated, and what is simulated twice is dropped.
+        missing = -len(scenes) % max(len(devices), 1)
+        stacked = stack_scenes(scenes + scenes[-1:] * missing)
+        together = rollout_scenes(params, stacked, config, batch_size=batch_size, mesh=mesh)
+        for row, (i, scene) in enumerate(zip(group, scenes, strict=True)):
+            one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
+            if (larger := enlarge_buffers(scene, one)) is not None:
+                one = try_simulate(params, larger, config=config).trajectory
+            done[i] = _first_vertices(one, garments[i].vertex_mask.shape[0])
+    return [done[i] for i in range(len(garments))]
+
+
+def _first_vertices(trajectory: Trajectory, count: int) -> Trajectory:
+    """Return a trajectory without the rows that padding added."""
+    return trajectory.replace(
+        positions=trajectory.positions[:, :count],
+        velocities=trajectory.velocities[:, :count],
+        friction_loads=trajectory.friction_loads[:, :count],
+    )
+
+
+def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> list[list[int]]:
+    """Group scenes that can be stacked: like vertex counts, frame counts and bodies."""
+    groups: dict[tuple, list[int]] = {}
+    for i, (garment, motion) in enumerate(zip(garments, poses, strict=True)):
+        body = hash(np.asarray(motion.faces).tobytes())
+        key = (choose_bucket(garment).vertices, motion.positions.shape[0], body)
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())
+
+
+def stack_scenes(scenes: list[Scene]) -> Scene:
+    """Stack scenes along a new leading axis.
+
+    Args:
+        scenes: Garments padded to one bucket, one searched body surface, like frame counts; either all have
+            pin targets, or none.
+
+    Raises:
+        ValueError: The scenes differ in structure or in shape.
+    """
+    first = jax.tree.structure(scenes[0])
+    if any(jax.tree.structure(scene) != first for scene in scenes):
+        raise ValueError("scenes differ in what they model or in their number of frames; stack like ones")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+
+
+@partial(jax.jit, static_argnames=("config", "batch_size", "mesh"))
+def rollout_scenes(
+    params: Any, scenes: Scene, config: SimConfig, *, batch_size: int = 1, mesh: Mesh | None = None
+) -> Trajectory:
+    """Simulate stacked scenes; the trajectories come back stacked.
+
+    Args:
+        params: Weights of the network; None without one.
+        scenes: Of `stack_scenes`.
+        config: Network, iterations and tolerance; static.
+        batch_size: Scenes that go through a step together (vmap); the others wait (lax.map). One is fastest
+            on a CPU, whose cores one garment keeps busy; a GPU wants as many as its memory holds.
+        mesh: Devices to spread the scenes over evenly, with one axis named `SCENES`; static.
+    """
+
+    def run(params: Any, scenes: Scene) -> Trajectory:
+        return jax.lax.map(lambda scene: rollout_scene(params, scene, config), scenes, batch_size=batch_size)
+
+    if mesh is None:
+        return run(params, scenes)
+    spread, everywhere = PartitionSpec(SCENES), PartitionSpec()
+    sharded = jax.shard_map(run, mesh=mesh, in_specs=(everywhere, spread), out_specs=spread, check_vma=False)
+    return sharded(params, scenes)

@@ -1,0 +1,92 @@
+"""From a scene and the cloth's state to the minimisation problem of one frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from eslr_jax.contact.nearest import find_both_sides
+from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
+from eslr_jax.physics.problem import BodyContact, FrameProblem, SelfContact, TipContact, contact_thickness
+from eslr_jax.types import ClothState, Scene
+
+
+class BodyStep(NamedTuple):
+    """Where the searched part of the body is at both ends of a frame."""
+
+    start: Float[Array, "surface_vertices 3"]  # at t [m]
+    end: Float[Array, "surface_vertices 3"]  # at t + 1 [m]
+
+
+class FrameInput(NamedTuple):
+    """What the outside world does during one frame; None is not modelled."""
+
+    body: BodyStep | None
+    pin_targets: Float[Array, "vertices 3"] | None  # at t + 1 [m]
+
+
+def frame_inputs(scene: Scene) -> FrameInput:
+    """Return the inputs of all frames, stacked along a leading axis of num_frames - 1."""
+    return FrameInput(
+        body=None if scene.body is None else BodyStep(scene.body.positions[:-1], scene.body.positions[1:]),
+        pin_targets=None if scene.pin_targets is None else scene.pin_targets[1:],
+    )
+
+
+def without_tracks(scene: Scene) -> Scene:
+    """Return what of a scene stays constant: scenes of any length then share a compiled program."""
+    return scene.replace(
+        body=None if scene.body is None else scene.body.replace(positions=scene.body.positions[:0]),
+        pin_targets=None if scene.pin_targets is None else scene.pin_targets[:0],
+        initial_state=jax.tree.map(jnp.zeros_like, scene.initial_state),
+        num_frames=0,
+    )
+
+
+def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameProblem:
+    """Find the frame's contacts and state its minimisation problem.
+
+    Args:
+        scene: Its constant parts; what moves is read from `inputs`.
+        state: Cloth at t.
+        inputs: The outside world from t to t + 1.
+    """
+    problem = FrameProblem(
+        garment=scene.garment,
+        material=scene.material,
+        constants=scene.constants,
+        timestep=scene.timestep,
+        position=state.position,
+        inertial_guess=state.position + scene.timestep * state.velocity,
+        pin_targets=inputs.pin_targets,
+    )
+    if scene.body is not None and inputs.body is not None:
+        problem = problem.replace(body=_body_contact(scene, state, inputs.body))
+    if scene.self_contact is not None:
+        pairs = find_self_contacts(state.position, problem.inertial_guess, scene.garment, scene.self_contact)
+        thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)
+        problem = problem.replace(layers=SelfContact(pairs, thickness))
+    return problem
+
+
+def _body_contact(scene: Scene, state: ClothState, step: BodyStep) -> BodyContact:
+    """Return the contact of a frame with the scene's body."""
+    if scene.body is None:
+        raise ValueError("a scene without a body has no contact with it")
+    nearest, opposing = find_both_sides(state.position, step.start, step.end, scene.body.surface)
+    tips = None
+    if scene.body.is_sharp:
+        guess = state.position + scene.timestep * state.velocity
+        tips = TipContact(
+            find_tip_contacts(state.position, guess, step.start, step.end, scene.garment), step.end
+        )
+    return BodyContact(
+        nearest=nearest,
+        opposing=opposing,
+        friction_load=state.friction_load,
+        thickness=contact_thickness(scene.garment, scene.constants.collision_thickness),
+        tips=tips,
+    )

@@ -1,0 +1,146 @@
+"""Rollouts: one scan over frames. Everything here is pure, for `jax.jit`, `jax.vmap` and `jax.grad`."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.models.registry import check_params
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper
+from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
+
+
+def rollout(
+    params: Any,
+    garment: Garment,
+    poses: BodyMotion,
+    *,
+    config: SimConfig | None = None,
+    material: Material = COTTON,
+    plan: ScenePlan | None = None,
+) -> Trajectory:
+    """Simulate a garment on a moving body.
+
+    A pure function: it compiles under `jax.jit` (`config` is static), maps under `jax.vmap` and differentiates
+    under `jax.grad`. It checks shapes alone and raises nothing for what happens in a frame: see the trajectory's
+    `status`, or `simulate`, which checks values, shows progress and raises.
+
+    Args:
+        params: Weights of the network, of `load_model`; None without one.
+        garment: Of `load_garment` or `prepare_garment`.
+        poses: Of `pose_body`.
+        config: Network, iterations and tolerance; the solver alone by default.
+        material: Fabric.
+        plan: What is modelled, of `plan_scene`, which looks at values and leaves out what they don't need. By
+            default the whole body is searched, pins are modelled, and layers of cloth pass through each other.
+
+    Returns:
+        The trajectory; frame 0 is the garment skinned to the first pose and pushed out of the body.
+
+    Raises:
+        ConfigError: A network is asked for without weights.
+        CheckpointError: The weights are for another architecture.
+    """
+    config = config or SimConfig()
+    check_network(params, config)
+    return rollout_scene(params, build_scene(garment, poses, material, plan or safe_plan(poses)), config)
+
+
+def check_network(params: Any, config: SimConfig) -> None:
+    """Check that weights and architecture are there and fit each other.
+
+    Args:
+        params: Weights of the network; None without one.
+        config: Holds the architecture.
+
+    Raises:
+        ConfigError: The network is asked for without weights.
+        CheckpointError: The weights are for another architecture.
+    """
+    if config.model is None:
+        return
+    if params is None:
+        raise ConfigError("config.model is given without weights; get both from load_model")
+    check_params(config.model, params)
+
+
+@partial(jax.jit, static_argnames="config")
+def rollout_scene(
+    params: Any, scene: Scene, config: SimConfig, iterations: Int[Array, ""] | int | None = None
+) -> Trajectory:
+    """Simulate every frame of a scene; pure.
+
+    Args:
+        params: Weights of the network; None without one.
+        scene: Of `build_scene` or `prepare_scene`.
+        config: Network, iterations and tolerance; static.
+        iterations: Bound of iterations in place of the configuration's, see `make_stepper`.
+    """
+    stepper = make_stepper(params, config, iterations)
+    end, frames = scan_frames(stepper, scene, scene.initial_state, frame_inputs(scene))
+    return join_frames(scene.initial_state, frames, end)
+
+
+class Frames(NamedTuple):
+    """What a scan leaves behind, frame by frame, along a leading axis."""
+
+    positions: Float[Array, "frames vertices 3"]  # [m]
+    velocities: Float[Array, "frames vertices 3"]  # [m/s]
+    friction_loads: Float[Array, "frames vertices"]  # [N]
+    reports: FrameReport
+
+
+def scan_frames(
+    stepper: Stepper, scene: Scene, state: ClothState, inputs: FrameInput
+) -> tuple[ClothState, Frames]:
+    """Simulate the frames of `inputs` from `state`.
+
+    Args:
+        stepper: Of `make_stepper`.
+        scene: Its constant parts.
+        state: Where to begin.
+        inputs: The outside world, along a leading axis; without body and pins one frame of a falling cloth is
+            like the next, and `scene.num_frames - 1` are simulated.
+
+    Returns:
+        The last state, and what every frame left behind.
+    """
+
+    def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
+        state, report = stepper(frame_problem(scene, state, frame), state)
+        return state, Frames(state.position, state.velocity, state.friction_load, report)
+
+    has_tracks = bool(jax.tree.leaves(inputs))
+    return jax.lax.scan(advance, state, inputs, length=None if has_tracks else scene.num_frames - 1)
+
+
+def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajectory:
+    """Return the trajectory of an initial state, the frames after it, and the state it ended in."""
+
+    def with_start(first: Array, values: Array) -> Array:
+        return jnp.concatenate([first[None], values])
+
+    def after_nothing(values: Array) -> Array:
+        return jnp.concatenate([jnp.zeros_like(values[:1]), values])
+
+    reports = jax.tree.map(after_nothing, frames.reports)
+    return Trajectory(
+        positions=with_start(start.position, frames.positions),
+        velocities=with_start(start.velocity, frames.velocities),
+        friction_loads=with_start(start.friction_load, frames.friction_loads),
+        terms=reports.terms,
+        residuals=reports.residual,
+        iterations=reports.iterations,
+        pair_demand=reports.pair_demand,
+        status=end.status,
+        first_bad_frame=end.first_bad_frame,
+    )

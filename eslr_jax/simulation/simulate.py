@@ -1,0 +1,226 @@
+"""The host's door: check, simulate in chunks, enlarge buffers, raise."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import CapacityError, EslrError, MotionError, NonFiniteError, Status
+from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
+from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
+from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
+
+_HEADROOM = 1.25  # of a buffer made larger: with it, cloth moves on a little differently and may need more
+_CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
+
+Pace = Callable[[int, float], int]
+"""From the iterations per frame and the milliseconds that a frame took to the iterations of the next chunk."""
+
+
+class Timing(NamedTuple):
+    """Where the time of a simulation went."""
+
+    compile_s: float
+    frame_ms: float  # mean of the simulated frames
+
+
+class Simulation(NamedTuple):
+    """What came of a scene."""
+
+    trajectory: Trajectory
+    timing: Timing
+    scene: Scene  # with the buffers that sufficed
+
+
+def simulate(
+    params: Any,
+    scene: Scene,
+    *,
+    config: SimConfig | None = None,
+    pace: Pace | None = None,
+    on_frames: Callable[[int, int], None] = lambda done, total: None,
+) -> Simulation:
+    """Simulate a scene; check it first, enlarge buffers that are too small, and raise what goes wrong.
+
+    Args:
+        params: Weights of the network, of `load_model`; None without one.
+        scene: Of `prepare_scene`.
+        config: Network, iterations and tolerance; the solver alone by default.
+        pace: Chooses the iterations of every chunk; by default all take the configuration's.
+        on_frames: Called with the number of frames done and the number in all.
+
+    Raises:
+        ConfigError: A network is asked for without weights, or the fabric, a constant or the timestep is out of
+            its physical range.
+        CheckpointError: The weights are for another architecture.
+        NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
+        CapacityError: A buffer was too small and can't be enlarged.
+        MotionError: The body is too fast to follow.
+    """
+    simulation = try_simulate(params, scene, config=config, pace=pace, on_frames=on_frames)
+    raise_for_status(simulation.trajectory)
+    return simulation
+
+
+def try_simulate(
+    params: Any,
+    scene: Scene,
+    *,
+    config: SimConfig | None = None,
+    pace: Pace | None = None,
+    on_frames: Callable[[int, int], None] = lambda done, total: None,
+) -> Simulation:
+    """Simulate a scene as `simulate` does, but leave what went wrong in the trajectory's status.
+
+    The arguments are those of `simulate`. The trajectory ends with the chunk of its first bad frame.
+
+    Raises:
+        ConfigError: As `simulate`.
+        CheckpointError: As `simulate`.
+    """
+    config = config or SimConfig()
+    check_network(params, config)
+    check_scene(scene)
+    larger: Scene | None = scene
+    while larger is not None:
+        scene = larger
+        trajectory, timing = _in_chunks(params, scene, config, pace, on_frames)
+        larger = enlarge_buffers(scene, trajectory)
+    return Simulation(trajectory, timing, scene)
+
+
+def _in_chunks(
+    params: Any, scene: Scene, config: SimConfig, pace: Pace | None, on_frames: Callable[[int, int], None]
+) -> tuple[Trajectory, Timing]:
+    """Simulate a scene a few frames at a time, and time compilation apart."""
+    total = scene.num_frames - 1
+    chunk = min(_CHUNK, total)
+    inputs, constant = frame_inputs(scene), without_tracks(scene).replace(num_frames=chunk + 1)
+
+    def part(first: int) -> FrameInput:
+        # The last chunk repeats its last frame; what it simulates beyond the end is dropped.
+        frames = np.minimum(np.arange(first, first + chunk), total - 1)
+        return jax.tree.map(lambda leaf: leaf[frames], inputs)
+
+    iterations = config.iterations
+    state, done, seconds, compile_s = scene.initial_state, [], 0.0, 0.0
+    for first in range(0, total, chunk):
+        bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
+        arguments = (params, constant, state, part(first), bound)
+        program, took = _compiled(config, arguments)
+        compile_s += took
+        began = time.perf_counter()
+        end, frames = jax.block_until_ready(program(*arguments))
+        took = time.perf_counter() - began
+        seconds += took
+        if pace is not None:
+            iterations = pace(iterations, took * 1e3 / chunk)
+        count = min(chunk, total - first)
+        done.append(jax.tree.map(lambda leaf, count=count: leaf[:count], frames))
+        is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
+        if count == chunk or is_bad:
+            state = end
+        on_frames(first + count, total)
+        if is_bad:
+            break
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
+    trajectory = join_frames(scene.initial_state, joined, state)
+    return trajectory, Timing(compile_s, seconds * 1e3 / (chunk * len(done)))
+
+
+def _scan(
+    params: Any,
+    scene: Scene,
+    state: ClothState,
+    inputs: FrameInput,
+    iterations: Int[Array, ""] | None,
+    *,
+    config: SimConfig,
+) -> tuple[ClothState, Frames]:
+    """Simulate one chunk."""
+    return scan_frames(make_stepper(params, config, iterations), scene, state, inputs)
+
+
+def _compiled(config: SimConfig, arguments: tuple) -> tuple[Callable, float]:
+    """Return the compiled chunk for arguments of these shapes, and the seconds that compiling took."""
+    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
+    began = time.perf_counter()
+    program = _compile(config, structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+    return lambda *given: program(*jax.tree.map(jnp.asarray, given)), time.perf_counter() - began
+
+
+@lru_cache(maxsize=32)
+def _compile(config: SimConfig, structure: Any, shapes: tuple) -> Callable:
+    """Compile a chunk once for every configuration and every set of shapes."""
+    described = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+    return jax.jit(partial(_scan, config=config)).lower(*jax.tree.unflatten(structure, described)).compile()
+
+
+def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
+    """Return the scene with larger buffers where a rollout had too little room for self-contact, else None.
+
+    A buffer gets what the fullest frame asked for and a quarter more.
+
+    Args:
+        scene: The scene that was simulated.
+        trajectory: What came of it.
+    """
+    status = Status(int(jax.device_get(trajectory.status)))
+    if (
+        Status.SELF_CONTACT_OVERFLOW not in status
+        or trajectory.pair_demand is None
+        or scene.self_contact is None
+    ):
+        return None
+    pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.pair_demand), axis=0))
+    before = scene.self_contact
+    capacity = PairCapacity(
+        pairs=math.ceil(_HEADROOM * pairs) if pairs > before.pairs else before.pairs,
+        faces=math.ceil(_HEADROOM * faces) if faces > before.faces else before.faces,
+    )
+    return None if capacity == before else scene.replace(self_contact=capacity)
+
+
+def check_scene(scene: Scene) -> None:
+    """Check that the fabric, the constants and the timestep of a scene are physical.
+
+    Raises:
+        ConfigError: Names the value and what is accepted.
+    """
+    validate_material(scene.material, scene.garment)
+    validate_constants(scene.constants)
+    validate_timestep(scene.timestep)
+
+
+def raise_for_status(trajectory: Trajectory) -> None:
+    """Raise the error that a trajectory's status bits stand for.
+
+    Raises:
+        NonFiniteError: Positions became NaN or infinite.
+        CapacityError: A buffer was too small.
+        MotionError: The body moved too fast to follow.
+    """
+    status = Status(int(jax.device_get(trajectory.status)))
+    if status == Status.OK:
+        return
+    message = f"frame {int(trajectory.first_bad_frame)}: {status.describe()}"
+    if Status.SELF_CONTACT_OVERFLOW in status and trajectory.pair_demand is not None:
+        pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.pair_demand), axis=0))
+        message += f": {pairs} pairs and {faces} faces or more"
+    error: type[EslrError] = CapacityError
+    if Status.NON_FINITE in status:
+        error = NonFiniteError
+    elif Status.BODY_TOO_FAST in status:
+        error = MotionError
+    raise error(message)

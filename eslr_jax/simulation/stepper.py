@@ -1,0 +1,146 @@
+"""One frame: from the cloth's state and its problem to the next state, by the solver, a network, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import MAX_APPROACH, approach
+from eslr_jax.errors import Status
+from eslr_jax.numerics import safe_norm
+from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.lbfgs import Minimum
+from eslr_jax.physics.potential import contact_load, evaluate, potential_terms
+from eslr_jax.physics.problem import FrameProblem, pin, separate, weight_norm
+from eslr_jax.physics.solve import Start, lower_point, solve, start_from_guess
+from eslr_jax.simulation.network import predict
+from eslr_jax.types import ClothState, PotentialTerms
+
+
+class FrameReport(NamedTuple):
+    """How a frame went."""
+
+    terms: PotentialTerms  # energies that it ended with [J]
+    residual: Float[Array, ""]  # force norm over weight
+    iterations: Int[Array, ""]  # of the solver
+    pair_demand: Int[Array, " capacities"] | None  # see Trajectory
+
+
+Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
+"""Advances the cloth by one frame; the one contract of the solver, of networks, and of both."""
+
+
+def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | int | None = None) -> Stepper:
+    """Return the stepper that a configuration describes.
+
+    Args:
+        params: Weights of the network; None without one.
+        config: Network, iterations and tolerance; static.
+        iterations: Bound of iterations per frame in place of the configuration's. It may be traced, so that all
+            numbers share a program.
+    """
+
+    def step(problem: FrameProblem, state: ClothState) -> tuple[ClothState, FrameReport]:
+        start, status = find_start(params, problem, state, config)
+        if config.iterations or iterations is not None:
+            minimum = solve(
+                problem,
+                start,
+                iterations=config.iterations if iterations is None else iterations,
+                tolerance=config.tolerance,
+                memory=config.memory,
+            )
+        else:
+            minimum = Minimum(*start.point, iterations=jnp.int32(0))
+        position = pin(problem, minimum.position)
+        report = FrameReport(
+            terms=potential_terms(position, problem),
+            residual=safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem),
+            iterations=minimum.iterations,
+            pair_demand=_pair_demand(problem),
+        )
+        return next_state(position, problem, state, status), report
+
+    return step
+
+
+def find_start(
+    params: Any, problem: FrameProblem, state: ClothState, config: SimConfig
+) -> tuple[Start, Int[Array, ""]]:
+    """Return where the solver begins a frame, and status bits.
+
+    Without a network that is the solver's own guess. With one it is the prediction, or the point that the
+    prediction was refined from where that is lower.
+
+    Args:
+        params: Weights of the network; None without one.
+        problem: The frame's problem.
+        state: Cloth at t.
+        config: Says whether there is a network; static.
+    """
+    if config.model is None:
+        return start_from_guess(problem, initial_guess(problem)), jnp.int32(Status.OK)
+    prediction = predict(params, problem, state, config.model)
+    point = evaluate(separate(problem, prediction.position), problem)
+    if prediction.previous is not None:
+        point = lower_point(point, prediction.previous)
+    guess = prediction.guess
+    if guess is None:
+        # Without a tolerance nobody asks, and the compiler drops it.
+        guess = initial_guess(problem)
+    # A solver that starts elsewhere would hide a prediction that is not a number.
+    return Start(point, guess.inertial_energy, prediction.previous), _finiteness(prediction.position)
+
+
+def _pair_demand(problem: FrameProblem) -> Int[Array, " capacities"] | None:
+    """Return the capacities that self-contact needed, for pairs and for faces in a search column."""
+    if problem.layers is None:
+        return None
+    return jnp.stack([problem.layers.pairs.count, problem.layers.pairs.listed])
+
+
+def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:
+    """Return the status bits of positions [m], shape [vertices, 3]."""
+    return jnp.where(jnp.all(jnp.isfinite(position)), int(Status.OK), int(Status.NON_FINITE))
+
+
+def next_state(
+    position: Float[Array, "vertices 3"], problem: FrameProblem, state: ClothState, status: Int[Array, ""]
+) -> ClothState:
+    """Return the state at t + 1, with the velocity that brought the cloth there (semi-implicit Euler).
+
+    Args:
+        position: Positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem.
+        state: Cloth at t.
+        status: Bits that the frame has raised so far.
+    """
+    status = state.status | status | problem_status(problem) | _finiteness(position)
+    frame = state.frame + 1
+    return ClothState(
+        position=position,
+        velocity=(position - problem.position) / problem.timestep,
+        friction_load=contact_load(position, problem),
+        frame=frame,
+        status=status,
+        first_bad_frame=jnp.where((state.status == 0) & (status != 0), frame, state.first_bad_frame),
+    )
+
+
+def problem_status(problem: FrameProblem) -> Int[Array, ""]:
+    """Return the status bits of a frame's contacts: too small a buffer, too fast a body."""
+    status = jnp.int32(Status.OK)
+    if problem.layers is not None:
+        status = status | problem.layers.pairs.status
+    if problem.body is not None:
+        contacts = problem.body.nearest
+        moved = approach(contacts.points, contacts.next_points, contacts.normals)
+        is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & problem.garment.vertex_mask)
+        status = status | jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
+        if problem.body.tips is not None:
+            status = status | problem.body.tips.pairs.status
+    return status
