@@ -35,7 +35,7 @@ CONFIG = TrainConfig(
 def one_clip_and_one_compilation():
     """Train on one clip, and let the runs of this file share data and compiled steps."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(data, "clips_of", lambda split: ["cmu_016_32"])
+    patch.setattr(data, "split_clips", lambda split: ["cmu_016_32"])
     loaded = data.load_training_data(CONFIG, "1k")
     patch.setattr(loop, "load_training_data", lambda config, vertices: loaded)
     steps = {}
