@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 
@@ -60,7 +62,7 @@ def make_limb() -> Body:
     """Return an ellipsoid on one joint."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     count = len(ball.vertices)
-    return Body(
+    limb = Body(
         rest_positions=np.float32(ball.vertices * LIMB_RADII),
         shape_directions=np.zeros((count, 3, 0), np.float32),
         joint_rest_positions=np.zeros((1, 3), np.float32),
@@ -72,13 +74,18 @@ def make_limb() -> Body:
         parents=(-1,),
         joint_names=("limb",),
     )
+    return jax.tree.map(jnp.asarray, limb)
 
 
-def swing(body: Body, num_frames: int, *, sway: float = 0.02) -> BodyMotion:
-    """Return the limb as it moves sideways and turns, by up to `sway` metres a frame."""
+def swing_motion(body: Body, num_frames: int, *, sway: float = 0.02) -> Motion:
+    """Return a motion of the limb sideways and round, by up to `sway` metres a frame."""
     time = np.arange(num_frames)
     rotations = np.zeros((num_frames, 1, 3))
     rotations[:, 0, 2] = 2 * sway * time
     translations = np.stack([sway * np.sin(0.8 * time), 0.2 * sway * time, 0 * time], axis=1)
-    motion = Motion("swing", rotations, translations, 30.0, body.joint_names, arm_abduction=0.0)
-    return pose_body(body, motion)
+    return Motion("swing", rotations, translations, 30.0, body.joint_names, arm_abduction=0.0)
+
+
+def swing(body: Body, num_frames: int, *, sway: float = 0.02) -> BodyMotion:
+    """Return the limb on its way, see `swing_motion`."""
+    return pose_body(body, swing_motion(body, num_frames, sway=sway))
