@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from eslr_jax.simulation.step import FrameInput, frame_problem, solve
 
 from eslr_jax.assets import load_garment_file
 from eslr_jax.cli.runs import render
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
 from eslr_jax.io.garment import write_garment_npz
 from eslr_jax.io.run import read_run
@@ -29,6 +28,7 @@ from eslr_jax.physics.potential import PotentialTerms, potential, potential_term
 from eslr_jax.physics.problem import PhysicsParameters, start_guess
 from eslr_jax.render.colors import color_scale
 from eslr_jax.scene import initial_state
+from eslr_jax.simulation.step import FrameInput, frame_problem, solve
 
 
 def make_run(folder, body, name, scale=1.0):
