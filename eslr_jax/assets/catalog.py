@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, ConfigError
 
 
 @dataclasses.dataclass(frozen=True)

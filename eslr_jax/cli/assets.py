@@ -125,15 +125,16 @@ def _show_scene(
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
-    from eslr_jax.scene import prepare_scene
+    from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
-    config = SimConfig(simulator=simulator, model=architecture, self_contact=self_contact)
+    config = SimConfig(model=architecture)
+    options = SceneOptions(self_contact=self_contact)
     with stderr.status("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))
-        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses)
+        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses, options=options)
         parts = describe_scene(scene, poses, config)
         costs = time_parts(params, scene, config)
     if as_json:

@@ -80,7 +80,7 @@ class RoundedCone:
         """
         offset = _float64(points) - self.apex
         along = offset @ _float64(self.axis)
-        opposing = np.linalg.norm(offset - along[..., None] * self.axis, axis=-1)
+        across = np.linalg.norm(offset - along[..., None] * self.axis, axis=-1)
         sine, cosine = np.sin(self.half_angle), np.cos(self.half_angle)
         is_before_apex = across * sine + along * cosine < 0
         flank = across * cosine - along * sine

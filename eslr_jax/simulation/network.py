@@ -99,7 +99,8 @@ def refine(
         problem: The frame's problem.
         state: Cloth at t.
         config: Architecture with any `output` but "acceleration"; static.
-        detach: Stop gradients between steps, so that each is trained to do its best from where it begins.
+        detach: Stop gradients between steps, and those of the weights that combine directions: each step is then
+            trained to do its best from where it begins.
     """
     garment, material = problem.garment, problem.material
     inputs = graph_inputs(problem, state)
@@ -122,7 +123,9 @@ def refine(
             directions = jnp.stack([move, inputs.step, inputs.correction])
             if problem.pin_targets is not None:
                 directions = jnp.where(garment.is_pinned[:, None], 0.0, directions)
-            move = combine_directions(lambda x: potential(x, problem), point, directions)
+            move = combine_directions(
+                lambda x: potential(x, problem), point, directions, fixed_weights=detach
+            )
         position = pin(problem, inputs.guess + move)
         onward = jax.lax.stop_gradient(position) if detach else position
         return next_refinement(inputs, onward, point.gradient), (position, point)
