@@ -27,7 +27,6 @@ from eslr_jax.body.sequence import pose_sequence
 from eslr_jax.errors import EslrError
 from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.fbx import read_fbx_body
 from eslr_jax.io.gltf_rig import read_gltf_body, read_gltf_motion
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
 from eslr_jax.io.motion import read_motion_archive
@@ -45,7 +44,6 @@ QUICK = settings(
 THOROUGH = settings(
     QUICK, max_examples=200, derandomize=False
 )  # ten readers of bytes and arrays: 2,000 and more
-FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 watched = {"is_on": False, "seen": []}
 
@@ -372,26 +370,6 @@ def test_two_thousand_damaged_files(tmp_path):
         fuzz(kind, folder, THOROUGH)
     (tmp_path / "tables").mkdir()
     fuzz_tables(tmp_path / "tables", THOROUGH)
-
-
-@pytest.mark.slow
-def test_damaged_fbx(tmp_path):
-    pytest.importorskip("ufbx")
-    good, path = (FIXTURES / "huesitos.fbx").read_bytes(), tmp_path / "file.fbx"
-
-    @settings(QUICK, max_examples=30)
-    @given(EDITS)
-    def attempt(edits):
-        path.write_bytes(damage(good, edits))
-        text = ""
-        try:
-            read_fbx_body(path)
-        except EslrError as error:
-            text = str(error)
-        assert "\n" not in text
-        assert os.listdir(tmp_path) == ["file.fbx"]
-
-    attempt()
 
 
 def test_a_damaged_motion_moves_the_body_or_is_refused(tmp_path, body):
