@@ -83,7 +83,7 @@ BROKEN = [
     ("npz", lambda data: npz(positions=POSITIONS, faces=FACES.astype(float)), "integer vertex indices"),
     ("npz", lambda data: npz(positions=POSITIONS[:, :2], faces=FACES), "vertices, 3"),
     ("npz", lambda data: npz(positions=POSITIONS, faces=FACES + 9), "outside 0..4"),
-    ("npz", lambda data: npz(positions=np.array([{}, 1], object), faces=FACES), "damaged"),
+    ("npz", lambda data: npz(positions=np.array([{}, 1], object), faces=FACES), "impossible header"),
     ("pkl", half, "can't be read as a pickle"),
     ("pkl", lambda data: pickle.dumps([1, 2]), "no garments by name"),
     ("pkl", lambda data: pickle.dumps({"a": {}, "b": {}}), "name one, as in"),
@@ -95,7 +95,7 @@ BROKEN = [
     ("fitted.npz", lambda data: npz(rest_positions=POSITIONS), "lacks faces, skin_weights"),
     ("fitted.npz", lambda data: npz(**FITTED | {"skin_weights": np.ones((4, 1))}), "skin_weights is"),
     ("fitted.npz", lambda data: npz(**FITTED, sewn_positions=POSITIONS[:3]), "sewn_positions is"),
-    ("fitted.npz", lambda data: npz(**FITTED, face_parts=np.array([0, 1, 2])), "part 2 of 0"),
+    ("fitted.npz", lambda data: npz(**FITTED, face_parts=np.array([0, 1, 2])), "names 2 of 0 parts"),
     ("fitted.npz", lambda data: npz(**FITTED, metadata=np.array("{")), "damaged metadata"),
 ]  # fmt: skip
 

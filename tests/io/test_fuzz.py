@@ -31,10 +31,9 @@ from eslr_jax.io.gltf_rig import read_gltf_body, read_gltf_motion
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import write_arrays
-from eslr_jax.io.point_cache import read_mdd, read_pc2, write_mdd, write_pc2
 from eslr_jax.io.skeleton import Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.io.smpl import read_amass, read_smpl_body, read_smpl_pickle
-from eslr_jax.io.trajectory import read_trajectory, write_trajectory
+from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 
 MAX_SECONDS = 10.0
 MAX_MEMORY = 1 << 30  # [bytes] that the process may grow by
@@ -257,8 +256,6 @@ BYTES = {
     "hood pkl": (lambda: content(write_hood, POSES, PELVIS), ".pkl", read_smpl_pickle),
     "vto pkl": (lambda: content(write_vto, POSES, PELVIS), ".pkl", read_smpl_pickle),
     "glb": (character, ".glb", lambda p: (make_body(read_gltf_body(p)), read_gltf_motion(p))),
-    "pc2": (lambda: content(write_pc2, GRID), ".pc2", read_pc2),
-    "mdd": (lambda: content(write_mdd, GRID, 0.1), ".mdd", read_mdd),
     "joint map": (lambda: b'{"LeftArm": "left_shoulder", "Head": ""}', ".json", read_joint_map),
     "amass bytes": (lambda: content(write_amass, POSES, PELVIS, 30.0, suffix=".npz"), ".npz", read_amass),
 }
@@ -285,10 +282,10 @@ ARRAYS = {
         read_body,
     ),
     "trajectory": (
-        lambda: arrays_of(content(
-            write_trajectory, positions=GRID, velocities=GRID, faces=FACES, timestep=0.1, body_positions=GRID,
-            body_faces=FACES, suffix=".npz",
-        )),
+        lambda: arrays_of(content(write_trajectory, TrajectoryFile(
+            GRID, GRID, FACES, 0.1, body=BodyTrack(GRID, FACES, GRID[0], FACES[:2], np.arange(3)),
+            friction_loads=GRID[..., 0],
+        ), suffix=".npz")),
         read_trajectory,
     ),
 }  # fmt: skip
