@@ -23,6 +23,7 @@ from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.validate import validate_body
 from eslr_jax.io.body import read_body
+from eslr_jax.io.asf import read_amc
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.garment import (
     GarmentFile,
@@ -283,7 +284,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     """Read a motion with the skeleton of its file.
 
     Args:
-        file: .bvh, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
+        file: .bvh, .amc with its .asf, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
         clip: Which of several animations.
 
     Raises:
@@ -294,7 +295,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
         return read_gltf_motion(file, clip)
-    readers = {".bvh": read_bvh, ".npz": read_amass, ".pkl": read_smpl_pickle}
+    readers = {".bvh": read_bvh, ".amc": read_amc, ".npz": read_amass, ".pkl": read_smpl_pickle}
     if suffix not in readers:
         raise _unknown_suffix("motion", file, (*readers, *GLTF_SUFFIXES))
     return readers[suffix](file)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from eslr_jax.errors import MeshError, MotionError
 
 _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
+_FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
 _NEGLIGIBLE_WEIGHT = (
     1e-6  # a skin weight that moves a vertex by less than float32 resolves over a body's size
 )
@@ -122,13 +123,23 @@ def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: 
     """
     weights, indices = influences(skin)
     rows = np.repeat(np.arange(len(rest)), weights.shape[1])
-    shape = (len(rest), len(skin.parents))
-    blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), shape)
-    result, is_needed = np.zeros(np.shape(positions), np.float32), False
-    for frame, transforms in enumerate(np.asarray(skin.joint_transforms, np.float64)):
-        blended = (blend @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
-        away = positions[frame] - np.einsum("vab,vb->va", blended[..., :3], rest) - blended[..., 3]
-        is_needed |= bool(np.linalg.norm(away, axis=1).max() > tolerance)
-        # Where opposite rotations cancel no offset helps: the pseudoinverse keeps it small.
-        result[frame] = np.einsum("vab,vb->va", np.linalg.pinv(blended[..., :3], rcond=1e-2), away)
-    return result if is_needed else None
+    blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), (len(rest), len(skin.parents)))
+    transforms = np.asarray(skin.joint_transforms, np.float64).reshape(len(positions), -1, 12)
+
+    def blended(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return each vertex's matrix, and what the joints leave of its way."""
+        matrices = (blend @ transforms[frame]).reshape(-1, 3, 4)
+        moved = np.einsum("vab,vb->va", matrices[..., :3], rest) + matrices[..., 3]
+        return matrices[..., :3], positions[frame] - moved
+
+    frames = range(len(positions))
+    if all(np.linalg.norm(blended(frame)[1], axis=1).max() <= tolerance for frame in frames):
+        return None
+    result = np.zeros(np.shape(positions), np.float32)
+    for frame in frames:
+        matrices, away = blended(frame)
+        # Where opposite rotations cancel, no offset helps: a blend of rotations near zero counts as the identity.
+        is_flat = np.abs(np.linalg.det(matrices)) < _FLAT
+        matrices[is_flat] = np.eye(3)
+        result[frame] = np.linalg.solve(matrices, away[..., None])[..., 0]
+    return result
