@@ -22,8 +22,8 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.validate import validate_body
-from eslr_jax.io.body import read_body
 from eslr_jax.io.asf import read_amc
+from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.garment import (
     GarmentFile,

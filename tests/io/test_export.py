@@ -324,6 +324,7 @@ def test_point_caches_of_nothing_are_not_written(tmp_path, points):
     assert not os.listdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_exports_a_run(tmp_path, run):
     write_trajectory(tmp_path / "trajectory.npz", run)
     command = [
