@@ -166,11 +166,13 @@ def _check_ply_header(path: Path) -> None:
 
 
 def _read_stl(path: Path) -> MeshFile:
-    """Read an STL file and share the corners that have bit-identical positions."""
+    """Read an STL file and share its vertices."""
     with path.open("rb") as stream:
         content = load_stl(stream)
     content = next(iter(content.get("geometry", {}).values()), content)  # text files nest their solids
-    return MeshFile(*share_vertices(np.asarray(content["vertices"]), np.asarray(content["faces"], np.int64)))
+    positions = np.asarray(content["vertices"]).reshape(-1, 3)
+    kept, place = shared_vertices(positions)
+    return MeshFile(positions[kept], place[np.asarray(content["faces"], np.int64).reshape(-1, 3)])
 
 
 def _read_glb(path: Path) -> MeshFile:
@@ -197,10 +199,12 @@ def _read_glb(path: Path) -> MeshFile:
     known = [
         uv for uv, points in zip(uvs, positions, strict=True) if uv is not None and len(uv) == len(points)
     ]
-    faces = np.concatenate(corners)
+    points, faces = np.concatenate(positions), np.concatenate(corners)
+    kept, place = shared_vertices(points)
     face_parts, part_names = _parts([names, materials])
     return MeshFile(
-        *share_vertices(np.concatenate(positions), faces),
+        points[kept],
+        place[faces],
         corner_uvs=np.concatenate(known)[faces] if len(known) == len(uvs) else None,
         face_parts=face_parts,
         part_names=part_names,
@@ -219,22 +223,19 @@ def _read_npz(path: Path) -> MeshFile:
     return MeshFile(arrays[key], arrays["faces"])
 
 
-def share_vertices(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make vertices at bit-identical positions one, which exporters split where normals differ.
+def shared_vertices(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find vertices at bit-identical positions, which exporters split where normals or textures differ.
 
     Args:
         positions: Vertex positions, shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
 
     Returns:
-        The positions that are left, in order of first appearance, and the faces.
+        Indices of the vertices to keep, in their order, and the place of every vertex among them.
     """
-    if not len(positions):
-        return positions.reshape(-1, 3), faces.reshape(-1, 3)
-    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(positions.reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return positions[np.sort(first)], rank[inverse.ravel()][faces]
+    return np.sort(first), rank[inverse.ravel()]
 
 
 _READERS: dict[str, Callable[[Path], MeshFile]] = {

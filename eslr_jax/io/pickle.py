@@ -30,7 +30,7 @@ class _Stub:
     """
 
     __slots__ = ("arguments", "state")
-    convert: Callable[[_Stub, _Plain], Any]
+    convert: Any  # of a class for one global: the function from stub and `plain` to plain data
 
     def __new__(cls, *arguments: Any) -> Any:
         stub = object.__new__(cls)

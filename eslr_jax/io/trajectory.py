@@ -160,14 +160,15 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         raise AssetError(f"trajectory {path} has metadata that is no table; {_REMEDY}")
     body = skin = material = None
     if "body_skin_weights" in arrays:
-        values = {field: arrays[name] for field, name in _SKIN.items()}
+        values: dict[str, Any] = {field: arrays[name] for field, name in _SKIN.items()}
         values["parents"] = tuple(int(parent) for parent in values["parents"])
         values["joint_names"] = tuple(str(name) for name in values["joint_names"])
         skin = Skin(**values)
     if "body_positions" in arrays:
         body = BodyTrack(**{field: arrays[name] for field, name in _BODY.items()}, skin=skin)
     if "material_density" in arrays:
-        material = Material(**{field: arrays[name] for field, name in _MATERIAL.items()})
+        fabric: dict[str, Any] = {field: arrays[name] for field, name in _MATERIAL.items()}
+        material = Material(**fabric)
     return TrajectoryFile(
         arrays["positions"],
         arrays["velocities"],

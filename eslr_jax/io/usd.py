@@ -83,11 +83,10 @@ def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
     """Add a mesh: bound to a skeleton where that moves it exactly, as points otherwise."""
     from pxr import Sdf, UsdGeom, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
-    positions, rest = np.asarray(mesh.positions, np.float32), mesh.rest_positions
-    is_bound = False
-    if mesh.skin is not None and rest is not None:
-        is_bound = corrections(mesh.skin, rest, positions, TOLERANCE) is None
-    if is_bound:
+    positions, rest, skin = np.asarray(mesh.positions, np.float32), mesh.rest_positions, mesh.skin
+    if skin is not None and rest is not None and corrections(skin, rest, positions, TOLERANCE) is not None:
+        skin = None  # joints alone don't do
+    if skin is not None:
         UsdSkel.Root.Define(stage, path)
         prim = UsdGeom.Mesh.Define(stage, f"{path}/mesh")
     else:
@@ -107,9 +106,9 @@ def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
         primvar = UsdGeom.PrimvarsAPI(prim.GetPrim()).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
         primvar.Set(Vt.Vec2fArray.FromNumpy(uvs))
     _add_material(stage, f"{path}_material", mesh.color, prim)
-    if is_bound:
+    if skin is not None:
         _set_points(prim, np.asarray(rest, np.float32), faces)
-        _bind(stage, path, prim, mesh.skin)
+        _bind(stage, path, prim, skin)
         return
     for frame, points in enumerate(positions):
         velocities = None if mesh.velocities is None else mesh.velocities[frame]
