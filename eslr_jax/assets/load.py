@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -22,9 +22,9 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.validate import validate_body
+from eslr_jax.io.asf import read_amc
 from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.fbx import fbx_clip_names, read_fbx_body, read_fbx_motion
 from eslr_jax.io.garment import (
     GarmentFile,
     garment_arrays,
@@ -56,7 +56,7 @@ def load_body(name: str | Path = "anny") -> Body:
 
     Args:
         name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
-            character (.gltf, .glb, .vrm, .fbx), or an npz file in the bundled format. `FILE#MESH,MESH` picks
+            character (.gltf, .glb, .vrm), or an npz file in the bundled format. `FILE#MESH,MESH` picks
             the meshes of a character that make up the body.
 
     Raises:
@@ -71,14 +71,22 @@ def load_body(name: str | Path = "anny") -> Body:
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
         return make_body(read_gltf_body(file, meshes))
-    if suffix == ".fbx":
-        return make_body(read_fbx_body(file, meshes))
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
         return make_body(read_smpl_body(file))
     if suffix == ".npz":
         return _closed(read_body(file), Path(file).name)
-    raise AssetError(
-        f"body file {file} has the unknown suffix {suffix!r}; give .npz, .pkl, .glb, .gltf or .fbx"
+    raise _unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
+
+
+def _unknown_suffix(content: str, file: str | Path, known: Iterable[str]) -> AssetError:
+    """Return the error for a file of an unknown kind."""
+    suffix = Path(file).suffix.lower()
+    if suffix == ".fbx":
+        return AssetError(
+            f"{content} file {file}: FBX is not read; export it as glTF (in Blender: File > Export > glTF 2.0)"
+        )
+    return AssetError(
+        f"{content} file {file} has the unknown suffix {suffix!r}; give one of {', '.join(known)}"
     )
 
 
@@ -222,7 +230,7 @@ def load_motion(
 
     Args:
         name: Name of a bundled clip, or turn, jump or swing, which are computed; or path of a motion: .bvh,
-            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm, .fbx), or an archive in
+            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm), or an archive in
             the bundled format. `FILE#CLIP` picks one of several clips.
         body: The body that is to move; the bundled one by default.
         joint_map: Changes to the map of joints, the body's to the motion's; "" keeps a joint still.
@@ -254,7 +262,7 @@ def own_motion(body: str) -> str:
     """Return the motion that a body comes with: the animation in its file, or else a bundled walk."""
     file, _ = _split_name(body)
     suffix = Path(file).suffix.lower()
-    if (suffix in GLTF_SUFFIXES and gltf_clip_names(file)) or (suffix == ".fbx" and fbx_clip_names(file)):
+    if suffix in GLTF_SUFFIXES and gltf_clip_names(file):
         return file
     return DEFAULT_MOTION
 
@@ -276,7 +284,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     """Read a motion with the skeleton of its file.
 
     Args:
-        file: .bvh, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb, .vrm or .fbx.
+        file: .bvh, .amc with its .asf, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
         clip: Which of several animations.
 
     Raises:
@@ -287,12 +295,9 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
         return read_gltf_motion(file, clip)
-    if suffix == ".fbx":
-        return read_fbx_motion(file, clip)
-    readers = {".bvh": read_bvh, ".npz": read_amass, ".pkl": read_smpl_pickle}
+    readers = {".bvh": read_bvh, ".amc": read_amc, ".npz": read_amass, ".pkl": read_smpl_pickle}
     if suffix not in readers:
-        known = ", ".join([*readers, *GLTF_SUFFIXES, ".fbx"])
-        raise AssetError(f"motion file {file} has the unknown suffix {suffix!r}; give one of {known}")
+        raise _unknown_suffix("motion", file, (*readers, *GLTF_SUFFIXES))
     return readers[suffix](file)
 
 

@@ -24,7 +24,7 @@ def joints(
     """Show which joint of a motion moves which joint of a body.
 
     Args:
-        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), glTF or FBX.
+        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), or glTF.
         body: Name of a bundled body, or a body file.
         joint_map: JSON file of changes: the body's joint to the motion's, "" to keep it still.
         out: Write the map here, to change it and give it to `eslr simulate --joint-map`.

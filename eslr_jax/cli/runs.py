@@ -82,7 +82,9 @@ def render(
             f"{color}: dark {field.low:.3g} to yellow {field.high:.3g} {field.unit}", highlight=False
         )
     angle: str | float = float(camera) if camera.lstrip("-").replace(".", "", 1).isdigit() else camera
-    meshes = trajectory.body_positions, trajectory.body_faces, trajectory.positions, trajectory.faces
+    body = trajectory.body
+    body_mesh = (None, None) if body is None else (body.positions, body.faces)
+    meshes = *body_mesh, trajectory.positions, trajectory.faces
     if out.suffix.lower() == ".png":
         size = (width or 280, round((width or 280) * 10 / 7))
         count = frames or 8

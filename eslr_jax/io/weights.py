@@ -1,4 +1,4 @@
-"""Exported network weights: arrays in an npz archive, the configuration in JSON beside it."""
+"""Read and write network weights: arrays in an npz archive, and the configuration in JSON beside it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.npz import read_arrays, write_arrays
 
-FORMAT = 1  # raise when a reader of today could not read the file
+FORMAT = 1  # increase when older versions can no longer read the file
 
 
 def write_weights(
     path: str | Path, params: Mapping[str, Any], config: ModelConfig, training: dict[str, Any]
 ) -> None:
-    """Write a network: `path` (npz) and the same name with suffix .json.
+    """Write a network to an npz file, and to a JSON file of the same name.
 
     Args:
-        path: npz file to write.
-        params: Nested dict of arrays.
-        config: Architecture.
-        training: How it was trained and how good it is; plain values.
+        path: Path of the npz file.
+        params: Weights, a nested dict of arrays.
+        config: Architecture of the network.
+        training: Record of how the network was trained and how good it is; values of JSON.
 
     Raises:
         AssetError: A file can't be written.
@@ -40,10 +40,13 @@ def write_weights(
 
 
 def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[str, Any]]:
-    """Read a network written by `write_weights`.
+    """Read a network that `write_weights` wrote.
+
+    Args:
+        path: Path of the npz file.
 
     Returns:
-        Nested dict of arrays, architecture, and the training record.
+        Weights as a nested dict of arrays, the architecture, and the training record.
 
     Raises:
         AssetError: The archive is missing or damaged.

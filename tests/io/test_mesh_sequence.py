@@ -78,10 +78,10 @@ BROKEN = {
     "no faces": ({"faces": None}, "lacks faces"),
     "no positions": ({"positions": None}, "positions"),
     "one frame without the axis": ({"positions": MOVING[0]}, "frames, vertices, 3"),
-    "a face beyond": ({"faces": FACES + 10_000}, "names vertex"),
+    "a face beyond": ({"faces": FACES + 10_000}, "vertices"),
     "not finite": ({"positions": np.full_like(MOVING, np.nan)}, "frame 0"),
     "no rate": ({"fps": np.array(0.0)}, "frames per second"),
-    "a rate of words": ({"fps": np.array("fast")}, "frame rate"),
+    "a rate of words": ({"fps": np.array("fast")}, "one number"),
     "faces of floats": ({"faces": FACES.astype(float)}, "faces"),
 }
 
