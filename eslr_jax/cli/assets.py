@@ -61,7 +61,7 @@ def _export_body(path: Path, name: str) -> None:
 
     from eslr_jax.assets import load_body
     from eslr_jax.io.atomic import atomic_write
-    from eslr_jax.io.export import obj_text
+    from eslr_jax.io.mesh_sequence import obj_text
 
     if path.suffix.lower() != ".obj":
         raise AssetError(

@@ -62,8 +62,8 @@ def fit(
         )
         if "fit" not in stored.metadata:
             raise AssetError(
-                f"{garment} needs no fit, it is a garment file or a bundled garment; give it to eslr simulate, or "
-                "give eslr fit a mesh"
+                f"{garment} needs no fit: it is bundled or already fitted; give it to eslr simulate, or give "
+                "eslr fit a mesh"
             )
         stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
         garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)

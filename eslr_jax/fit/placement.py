@@ -19,7 +19,7 @@ _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from
 _SLIDE_STEP = 0.04  # [m] between tried heights
 _NEAR, _MIN_NEAR = 0.06, 0.03  # [m]; share of points nearer than that to the body below which nothing fits
 # What is usual costs less: factors on the cost of a fit.
-_PLACES = {"floor": 1.0, "body": 1.05, "kept": 1.0, "found": 1.3}
+_PLACES = {"floor": 1.0, "body": 1.05, "found": 1.3}
 _TURNED = 1.6  # the front is not the one that usually goes with the up axis
 _RAISED = 1.1  # arms at another angle than the body's
 _INCHES = 1.1
@@ -50,7 +50,7 @@ class Placement:
     posture: int  # index of the posture that the garment was modelled on
     up: str
     front: str
-    origin: str  # of the file: "floor", "body", "found" (anywhere) or "kept" (as asked)
+    origin: str  # of the file: "floor" (between the feet), "body" (the body's own) or "found" (elsewhere)
     cost: float  # of the fit, times that of what is unusual
     confidence: float = 1.0  # that no other placement is meant, 0 to 1
     warnings: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Placement:
         places = {"floor": "feet at the origin", "body": "the body's origin", "found": "moved along the body"}
         return (
             f"{self.factor:g} m per unit{f' ({unit})' * bool(unit)}, {self.up} up, {self.front} front, "
-            f"{places.get(self.origin, 'place kept')}"
+            f"{places[self.origin]}"
         )
 
 
@@ -97,7 +97,7 @@ def find_placement(
         units: Unit of the file, or metres per unit.
         up: Axis of the file that points up.
         front: Axis of the file that the wearer faces.
-        keep_place: Take the body's origin for the file's, and do not move the garment.
+        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own.
         name: Name of the garment in messages.
 
     Raises:
@@ -106,14 +106,13 @@ def find_placement(
     """
     factors = _factors(positions, postures[0], units, name)
     orientations = [
-        Placement(factor, rotation, np.zeros(3), 0, *axes, "kept", weight * (1.0 if is_usual else _TURNED))
+        Placement(factor, rotation, np.zeros(3), 0, *axes, "floor", weight * (1.0 if is_usual else _TURNED))
         for (factor, weight), (rotation, axes, is_usual) in itertools.product(
             factors.items(), _rotations(up, front)
         )
     ]
     sample = sample_garment(positions, faces)
-    places = ("kept",) if keep_place else ("floor", "body")
-    known = list(_known_candidates(sample, orientations, postures, places))
+    known = list(_known_candidates(sample, orientations, postures))
     best, rival = _choose(known, sample, postures)
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
@@ -142,10 +141,10 @@ def find_placement(
 
 
 def _known_candidates(
-    sample: Sample, orientations: list[Placement], postures: list[Posture], places: tuple[str, ...]
+    sample: Sample, orientations: list[Placement], postures: list[Posture]
 ) -> Iterable[Placement]:
     """Yield every orientation at the known origins, in every posture."""
-    for start, (k, posture), place in itertools.product(orientations, enumerate(postures), places):
+    for start, (k, posture), place in itertools.product(orientations, enumerate(postures), ("floor", "body")):
         offset = np.array([0.0, posture.floor if place == "floor" else 0.0, 0.0])
         yield _scored(start, sample, postures, posture=k, translation=offset, origin=place)
 
