@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from eslr_jax.fit.postures import shoulder_height
 from eslr_jax.geometry.topology import boundary_loops, vertex_components
@@ -13,7 +14,7 @@ from eslr_jax.types import Body
 
 WAISTBAND = 0.03  # [m] width of the band below the loop that is held, as an elastic waistband
 _CROTCH = 0.45  # of the body's height: a loop below it goes around legs
-_PART_AREA = 0.02  # share of the vertices from which a part is cloth and no button
+_PART_SHARE = 0.02  # of the vertices; a smaller part is a button or a label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,14 +44,14 @@ def find_waist(
     is_held, falling, heights = np.zeros(len(positions), bool), False, []
     for part in range(count):
         own = np.flatnonzero(component == part)
-        if positions[own, 1].max() > shoulders or len(own) < _PART_AREA * len(positions):
+        if positions[own, 1].max() > shoulders or len(own) < _PART_SHARE * len(positions):
             continue
         around = [loop for loop in loops if component[loop[0]] == part]
         if not around:
             falling = True
             continue
         loop = max(around, key=lambda ring: positions[ring, 1].mean())
-        gaps = np.linalg.norm(positions[own][:, None] - positions[loop], axis=2).min(axis=1)
+        gaps, _ = KDTree(positions[loop]).query(positions[own])
         is_held[own[gaps <= WAISTBAND]] = True
         heights.append(float(positions[loop, 1].mean()) - float(np.asarray(body.rest_positions)[:, 1].min()))
     if heights:
