@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.motion import joint_transforms, skin_garment
+from eslr_jax.body.motion import joint_transforms
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.types import Body
 
@@ -74,7 +74,7 @@ class Posture:
 
 def rest_posture(body: Body) -> Posture:
     """Return the body in its rest pose."""
-    return _posture(body, body.rest_positions, np.tile(np.eye(3, 4), (len(body.parents), 1, 1)), None)
+    return _posture(body, np.tile(np.eye(3, 4), (len(body.parents), 1, 1)), None)
 
 
 def arm_postures(body: Body) -> list[Posture]:
@@ -90,10 +90,10 @@ def arm_postures(body: Body) -> list[Posture]:
     for (joint, _), bone, rest_angle in zip(arms, bones, rest_angles, strict=True):
         rotations[:, joint, 2] = np.sign(bone[0]) * np.radians(rest_angle - np.array(angles))
     translations = np.tile(joints[body.parents.index(-1)], (len(angles), 1))
-    transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    posed = skin_garment(body, transforms)
-    turned = [_posture(body, posed[k], transforms[k], angle) for k, angle in enumerate(angles)]
-    return [rest_posture(body), *turned]
+    transforms = np.asarray(
+        joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
+    )
+    return [rest_posture(body), *(_posture(body, *pair) for pair in zip(transforms, angles, strict=True))]
 
 
 def find_arms(body: Body) -> list[tuple[int, int]] | None:
@@ -143,16 +143,27 @@ def unpose(
     Returns:
         The rest positions that the blended maps take to `positions` [m].
     """
-    blended = np.einsum("vi,vixy->vxy", skin_weights, transforms[skin_indices])
+    blended = _blend(skin_weights, skin_indices, transforms)
     return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
 
 
-def _posture(body: Body, positions, transforms, angle: float | None) -> Posture:
-    """Return a posture of a body, given its posed vertices and joint maps."""
+def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Return the blended map of every vertex, shape [vertices, 3, 4]."""
+    return np.einsum("vi,vixy->vxy", weights, transforms[indices])
+
+
+def _posture(body: Body, transforms: np.ndarray, angle: float | None) -> Posture:
+    """Return the posture of a body under joint maps."""
     transforms = np.asarray(transforms, np.float64)
+    rest = np.asarray(body.rest_positions, np.float64)
     rest_joints = np.asarray(body.joint_rest_positions, np.float64)
+    weights, indices = np.asarray(body.skin_weights, np.float64), np.asarray(body.skin_indices)
+    posed = rest
+    if angle is not None:
+        blended = _blend(weights, indices, transforms)
+        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], rest) + blended[:, :, 3]
     return Posture(
-        positions=np.asarray(positions, np.float64),
+        positions=posed,
         transforms=transforms,
         joints=np.einsum("jxy,jy->jx", transforms[:, :, :3], rest_joints) + transforms[:, :, 3],
         parents=body.parents,
