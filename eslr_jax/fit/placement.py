@@ -119,11 +119,11 @@ def find_placement(
     is_given = keep_place and "auto" not in (units, up, front)
     near = np.abs(postures[best.posture].heights(best.apply(sample.points))) < _NEAR
     if near.mean() < _MIN_NEAR and not is_given:
-        missing = [f"--{key}" for key, value in zip(("units", "up", "front"), (units, up, front), strict=True)
-                   if value == "auto"]  # fmt: skip
+        options = {"--units": units, "--up": up, "--front": front, "--keep-place": keep_place or "auto"}
+        missing = [option for option, value in options.items() if value == "auto"]
         raise MeshError(
             f"{name}: does not fit the body in any unit, axis or place that was tried; give "
-            f"{' and '.join(missing) or '--keep-place'}, or model it on the body of eslr assets --export body.obj"
+            f"{' and '.join(missing)}, or model it on the body of eslr assets --export body.obj"
         )
     margin = np.inf if rival is None else rival.cost - best.cost
     confidence = float(1.0 / (1.0 + np.exp(-margin / _COST_SPREAD)))
@@ -166,7 +166,7 @@ def _choose(
     That cost is expensive, so it is added in the order of the other costs until no candidate can be better.
     """
     done: list[Placement] = []
-    best, rival = None, None
+    rival = None
     for candidate in sorted(candidates, key=lambda placement: placement.cost):
         if rival is not None and candidate.cost > rival.cost:
             break
@@ -176,9 +176,7 @@ def _choose(
         best = min(done, key=lambda placement: placement.cost)
         rivals = [other for other in done if _is_rival(best, other, sample)]
         rival = min(rivals, key=lambda placement: placement.cost, default=None)
-    if best is None:
-        raise MeshError("there is no placement to choose from")
-    return best, rival
+    return min(done, key=lambda placement: placement.cost), rival
 
 
 def _is_rival(best: Placement, other: Placement, sample: Sample) -> bool:

@@ -9,6 +9,8 @@ LARGE = 30_000  # vertices from which the cost is told before it is paid
 
 def describe_fit(report: dict[str, Any]) -> str:
     """Return the report in `GarmentFile.metadata["fit"]` as a few lines."""
+    if "pinned_by" not in report:
+        return "fitted by an older version; fit the mesh again for a report"
     place, mesh, inside = report["placement"], report["mesh"], report["penetration"]
     moved = ", ".join(f"{100 * value:.1f}" for value in place["moved_m"])
     arms = place["arms_below_horizontal_deg"]

@@ -8,6 +8,7 @@ from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dr
 from eslr_jax.errors import ConfigError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
+from eslr_jax.fit.report import describe_cost, describe_fit
 from eslr_jax.fit.waist import WAISTBAND, find_waist
 
 
@@ -82,9 +83,12 @@ def test_pins_replace_the_waistband(body):
 
     default = fit()
     assert default.metadata["fit"]["pinned"] == default.is_pinned.sum() > 50
+    text = describe_fit(default.metadata["fit"])
+    assert "feet at the origin" in text
+    assert "pinned: 100 vertices (waistband at 1.10 m above the floor" in text
     free = fit("none")
     assert not free.is_pinned.any()
-    assert "nothing holds the garment up" in free.metadata["fit"]["warnings"][0]
+    assert "warning: nothing holds the garment up" in describe_fit(free.metadata["fit"])
     loop = fit("loop:top")
     assert loop.is_pinned.sum() == 50
     both = fit("waist", "vertices:0")
@@ -94,3 +98,8 @@ def test_pins_replace_the_waistband(body):
     shirt = bundled("tshirt_1k")
     with pytest.raises(ConfigError, match="'waist' holds no vertex: it hangs from the shoulders"):
         fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(pin=("waist",), arms="rest"))
+
+
+def test_cost_is_told_for_large_meshes_only():
+    assert describe_cost(10_000) is None
+    assert describe_cost(251_000).startswith("251,000 vertices are many: fitting takes about 75 s")
