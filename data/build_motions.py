@@ -47,13 +47,10 @@ CMU_SIDE = {
     "{s}Hand": "hand", "{i}Thumb": "thumb", "{s}FingerBase": "hand", "{s}HandFinger1": "fingers",
 }  # fmt: skip
 CMU_BONE_ENDS = {"femur": "tibia", "tibia": "foot", "humerus": "radius", "radius": "wrist"}
-CMU_ACTOR_LEG = (
-    0.864  # [m] thigh and shank that make the standing foot slide least, the same in all walks; the XML
-)
-# humanoid has 0.821, the bodies in the 2020 file are 1.2 times as large, and neither fits the root's steps
-CMU_WORLD = np.array(
-    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-)  # Z up -> Y up; its rest pose is Y up
+# Thigh and shank that make the standing foot slide least, equal in all walks [m]. The XML humanoid has 0.821 and
+# the bodies in the 2020 file are 1.2 times as large; neither fits the root's steps.
+CMU_ACTOR_LEG = 0.864
+CMU_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # Z up -> Y up
 
 # DeepMimic joints in file order with the number of columns: quaternion (w x y z) or angle about +z.
 DEEPMIMIC_JOINTS = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.garment import (
     GarmentFile,
+    GarmentSource,
     garment_arrays,
     garment_from_arrays,
     is_garment_file,
@@ -42,7 +43,7 @@ from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
 DEFAULT_MOTION = "cmu_016_32"
-START_MODEL = "smooth-small"  # the network that was trained as a start for the solver
+START_MODEL = "smooth-small"  # the network that was trained to give the solver an initial guess
 Resolution = Literal["1k", "4k", "10k"]
 
 
@@ -60,7 +61,7 @@ def load_body(name: str | Path = "anny") -> Body:
             the meshes of a character that make up the body.
 
     Raises:
-        AssetError: There is no such body, the file is damaged, or it is no rigged body in metres.
+        AssetError: There is no such body, or the file is damaged or holds no rigged body in metres.
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body in the bundled format is not closed, or inside out.
     """
@@ -118,14 +119,14 @@ def load_garment(
     """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation.
 
     Args:
-        name: Name of a bundled garment; or path of a file that `eslr fit` wrote; or of a mesh (obj, ply, stl,
-            glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`), which is fitted first.
+        name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
+            or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
         vertices: Resolution of a bundled garment.
         body: Body that a mesh is fitted to; the bundled one by default.
-        fit: How a mesh is fitted, where that is not left to recognition.
+        fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
-        cache: Keep what was computed for the next time.
-        options: Passed on to `prepare_garment`.
+        cache: Keep the result for the next time.
+        options: Arguments of `prepare_garment`.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
@@ -142,14 +143,26 @@ def load_garment_file(
     body: Body | None = None,
     fit: FitOptions | None = None,
     cache: bool = True,
+    on_source: Callable[[GarmentSource], None] | None = None,
 ) -> GarmentFile:
-    """Load a garment as arrays on the host, fitted to the body if it is a mesh; see `load_garment`."""
+    """Load a garment as arrays on the host, fitted to the body if it is a mesh.
+
+    Args:
+        name: Garment; see `load_garment`, also for the other arguments.
+        vertices: Resolution of a bundled garment.
+        body: Body that a mesh is fitted to.
+        fit: Options of the fit.
+        cache: Keep the result for the next time.
+        on_source: Function that is told of a mesh before it is fitted.
+    """
     if not _is_path(str(name)):
         return read_garment_npz(find_asset("garment", f"{name}_{vertices}"))
     path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
     if path.is_file() and is_garment_file(path):
         return read_garment_npz(path)
     source = read_garment_source(name)
+    if on_source is not None:
+        on_source(source)
     rig, options = load_body() if body is None else body, fit or FitOptions()
     if not cache:
         return fit_garment(source, rig, options)
@@ -164,11 +177,11 @@ def prepare_stored(
     """Prepare a garment file for simulation.
 
     Args:
-        stored: Of `load_garment_file`.
+        stored: Garment of `load_garment_file`.
         pad: Pad to a bucket of sizes.
-        cache: Keep what was computed for the next time.
-        name: What messages call the garment.
-        options: Passed on to `prepare_garment`.
+        cache: Keep the result for the next time.
+        name: Name of the garment in messages.
+        options: Arguments of `prepare_garment`.
 
     Raises:
         MeshError: The mesh can't be simulated.
@@ -198,19 +211,17 @@ def prepare_stored(
 
 
 def _body_arrays(body: Body) -> list[np.ndarray]:
-    """Return what of a body a fit depends on."""
-    return [
-        np.asarray(array)
-        for array in (
-            body.rest_positions,
-            body.faces,
-            body.skin_weights,
-            body.skin_indices,
-            body.is_obstacle,
-            body.joint_rest_positions,
-            np.array(body.parents),
-        )
-    ]
+    """Return the arrays of a body that a fit depends on."""
+    names = (
+        "rest_positions",
+        "faces",
+        "skin_weights",
+        "skin_indices",
+        "is_obstacle",
+        "joint_rest_positions",
+        "parents",
+    )
+    return [np.asarray(getattr(body, name)) for name in names]
 
 
 @lru_cache(maxsize=4)
@@ -233,8 +244,8 @@ def load_motion(
             AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm), or an archive in
             the bundled format. `FILE#CLIP` picks one of several clips.
         body: The body that is to move; the bundled one by default.
-        joint_map: Changes to the map of joints, the body's to the motion's; "" keeps a joint still.
-        up: Axis that points up in a BVH file; by default the one along which its figure stands.
+        joint_map: Changes to the map from the body's joints to the motion's; "" keeps a joint still.
+        up: Axis that points up in a BVH file; by default the one along which the figure stands.
 
     Raises:
         AssetError: There is no such motion, or the file is damaged.
@@ -249,7 +260,7 @@ def load_motion(
         motion = _bundled_motion(text)
         if body is None or (_is_made_for(motion, body, is_bundled=not _is_path(text)) and not joint_map):
             return motion
-        # An archive tells no skeleton: it is the bundled body's.
+        # An archive holds no skeleton, so that of the bundled body is used.
         return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
     source = read_skeleton_motion(file, clip)
     is_bvh = Path(file).suffix.lower() == ".bvh"
@@ -259,7 +270,7 @@ def load_motion(
 
 
 def own_motion(body: str) -> str:
-    """Return the motion that a body comes with: the animation in its file, or else a bundled walk."""
+    """Return the animation in a body's file, or a bundled walk if it has none."""
     file, _ = _split_name(body)
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES and gltf_clip_names(file):
@@ -268,7 +279,7 @@ def own_motion(body: str) -> str:
 
 
 def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
-    """Tell whether a clip moves this body as it is; a user's own archive is taken at its joints' names."""
+    """Tell whether a clip can move this body without retargeting; a user's archive by its joint names."""
     if motion.joint_names != body.joint_names:
         return False
     rest = np.asarray(body.joint_rest_positions)
@@ -323,14 +334,14 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     """Load a trained network.
 
     Args:
-        name: Name of a bundled model, or path of an exported npz file; `NAME:STEPS` takes more or fewer passes
-            per frame than it was trained with, for less error or less time.
+        name: Name of a bundled model, or path of an exported npz file. `NAME:STEPS` changes the number of
+            refinement steps per frame, for less error or less time.
 
     Returns:
         Its weights and its architecture.
 
     Raises:
-        AssetError: There is no such model, it can't take so many passes, or the file is damaged.
+        AssetError: There is no such model, it can't take so many refinement steps, or the file is damaged.
         CheckpointError: The file is for another architecture or a newer version.
     """
     parts = re.fullmatch(r"(.+):(\d+)", str(name))
