@@ -56,6 +56,7 @@ for _finger in _FINGERS:
     for _word in (_finger, f"hand{_finger}", f"f{_finger}"):
         _SIDED_WORDS[_word] = _finger
 _SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
+HAND = ("hand", "fingers", *_FINGERS)  # parts that continue the forearm's bone
 _FALLBACKS = {"fingers": ("middle", "index"), "hip_joint": (), "toe": ()} | {
     finger: ("fingers",) for finger in _FINGERS[1:]
 }
