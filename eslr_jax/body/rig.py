@@ -111,7 +111,7 @@ def _shared_vertices(positions: NDArray) -> tuple[NDArray, NDArray]:
     """Join vertices at bit-identical positions, which exporters split where texture coordinates differ.
 
     Returns:
-        The vertices kept, in their order, and the place of every vertex among them.
+        The vertices that are kept, in their order, and the index among them of every vertex.
     """
     _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
@@ -120,7 +120,7 @@ def _shared_vertices(positions: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: Skeleton) -> NDArray:
-    """Tell the faces that cloth may touch: all but those that follow the hands, which cut themselves."""
+    """Return which faces cloth may touch: all but those of the hands, which intersect themselves."""
     is_hand = np.zeros(len(skeleton), bool)
     for (_, chain), joints in find_parts(skeleton).items():
         is_hand[joints] |= chain in HAND
@@ -131,10 +131,10 @@ def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: S
 
 
 def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
-    """Hang a skeleton on its hips, since a motion's translation is that of joint 0.
+    """Make the hips of a skeleton joint 0, since a motion's translation is that of joint 0.
 
     Returns:
-        The skeleton with the hips as joint 0, and the old index of each of its joints.
+        The skeleton, and the old index of each of its joints.
     """
     hips = find_parts(skeleton)["", "hips"][0]
     neighbors: dict[int, list[int]] = {}
@@ -150,7 +150,7 @@ def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
                 seen.add(other)
                 order.append(other)
                 parents.append(place)
-    if hips == 0:  # as the file has it
+    if hips == 0:
         return skeleton, np.arange(len(skeleton))
     names = tuple(skeleton.joint_names[joint] for joint in order)
     return Skeleton(names, tuple(parents), skeleton.rest_positions[order]), np.array(order)
@@ -168,8 +168,8 @@ def make_motion(
     Args:
         source: The motion of a file.
         body: The body to move.
-        joint_map: Changes to the map of joints, the body's to the source's; "" keeps a joint still.
-        up: Axis that points up in the source: "y", "z", or "auto" to see it from how the source stands.
+        joint_map: Changes to the joint map, from joints of the body to joints of the source; "" keeps one still.
+        up: Axis that points up in the source: "y", "z", or "auto" to judge by how the source stands.
 
     Raises:
         MotionError: No joint is known to both, or the source does not stand at rest.
@@ -181,7 +181,7 @@ def make_motion(
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
     is_model = _is_body_model(target, source)
-    if is_model:  # told by name; joints that the parameters lack rest
+    if is_model:  # joints follow by name, and rest where the parameters have none
         changed = joint_map or {}
         followed = [
             other if name in changed or mapping.get(name) == name else -1
@@ -224,7 +224,7 @@ def make_motion(
 
 
 def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
-    """Return a body's motion as its moving skeleton: the inverse of `make_motion` on the same rig.
+    """Return the moving skeleton of a body's motion: the inverse of `make_motion` on the same rig.
 
     Raises:
         MotionError: The motion is for another rig.
@@ -240,7 +240,7 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
 
 
 def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:
-    """Return a motion in other axes: every vector v becomes `axes` v."""
+    """Return a motion in other axes, to which `axes`, shape [3, 3], turns every vector."""
     skeleton = motion.skeleton
     return SkeletonMotion(
         motion.name,
@@ -269,13 +269,20 @@ def _stands_along_z(motion: SkeletonMotion) -> bool:
 
 
 def _is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
-    """Tell whether a motion is the parameters of a body model, and the body is of that family."""
+    """Tell whether a motion holds parameters of the body model that the body is of."""
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
     return source.root_axes is not None and len(shared) >= MODEL_JOINTS
 
 
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:
-    """Return the translations with the start above the origin and the soles on the floor."""
+    """Return root positions [m] that start above the origin, with the soles on the floor, shape [frames, 3].
+
+    Args:
+        turned: Rotation matrices of the body's joints since the rest pose, shape [frames, joints, 3, 3].
+        translations: Root positions [m], shape [frames, 3].
+        target: Joints of the body at rest.
+        body: The body.
+    """
     translations = translations - translations[0] * [1.0, 0.0, 1.0]
     parts = find_parts(target)
     feet = [

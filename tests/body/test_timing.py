@@ -75,7 +75,7 @@ def test_a_repeated_walk_goes_on_without_a_jump(body):
     length = (len(motion.rotations) - 1) / motion.fps
     looped = loop_motion(motion, 3 * length)
     assert len(looped.rotations) == round(3 * length * motion.fps) + 1
-    once, thrice = (np.asarray(pose_body(body, each).positions) for each in (motion, looped))
+    once, thrice = (skeleton_motion(each, body).positions for each in (motion, looped))
     steps, longest = (
         np.linalg.norm(np.diff(positions, axis=0), axis=-1).max() for positions in (thrice, once)
     )
