@@ -98,7 +98,7 @@ def pose_body(
         strangers = [name for name in motion.joint_names if name not in body.joint_names]
         raise MotionError(
             f"motion {motion.name} is for another skeleton ({len(motion.joint_names)} joints, "
-            f"unknown: {', '.join(strangers[:4]) or 'order differs'}); retarget it to this body first"
+            f"unknown: {', '.join(strangers[:4]) or 'order differs'}); load it with this body"
         )
     rotations, translations = resample(motion.rotations, motion.translations, motion.fps, fps)
     if num_frames is not None:

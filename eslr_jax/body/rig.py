@@ -231,7 +231,8 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
     """
     if motion.joint_names != body.joint_names:
         raise MotionError(
-            f"motion {motion.name} is not for this body; its joints are {motion.joint_names[:4]}"
+            f"motion {motion.name} is for another skeleton ({', '.join(motion.joint_names[:4])}, ...); load it "
+            "with this body"
         )
     skeleton = body_skeleton(body)
     turned = global_rotations(motion.rotations, skeleton.parents)
