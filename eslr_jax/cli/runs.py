@@ -103,7 +103,7 @@ def render(
     if color != "fabric":
         field = run_field(content, color)
         colors = color_scale(field.values, field.low, field.high)
-        bar = (field.low, field.high, f"{color} {field.unit}".strip())
+        bar = (field.low, field.high, f"{color} [{field.unit}]" if field.unit else color)
     angle: str | float = float(camera) if camera.lstrip("-").replace(".", "", 1).isdigit() else camera
     meshes = trajectory.body_positions, trajectory.body_faces, trajectory.positions, trajectory.faces
     look: dict[str, Any] = {

@@ -40,7 +40,7 @@ def add_color_bar(picture: np.ndarray, low: float, high: float, title: str) -> n
         sRGB picture, uint8, shape [height + bar, width, 3].
     """
     width = picture.shape[1]
-    height = int(np.clip(width // 24, 10, 24))  # of the text and of the bar [pixels]
+    height = int(np.clip(width // 24, 10, 16))  # of the text and of the bar [pixels]
     margin = height // 2
     strip = np.full((3 * height + 2 * (height % 2), width, 3), _PAPER, np.uint8)
     ramp = color_scale(np.linspace(0.0, 1.0, width - 2 * margin), 0.0, 1.0)
