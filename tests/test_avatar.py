@@ -72,6 +72,7 @@ def test_a_mesh_in_motion_is_a_body(avatar, tmp_path, body, walk):
     assert json.loads(result.stdout)["finite"]
 
 
+@pytest.mark.slow
 def test_what_contradicts_is_refused_in_one_line(avatar, tmp_path, body):
     np.savez(tmp_path / "body.npz", positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
     cases = (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -13,9 +14,10 @@ import numpy as np
 
 from eslr_jax.assets.cache import cached_arrays, content_key
 from eslr_jax.assets.catalog import asset_names, find_asset
-from eslr_jax.body.motion import Motion
+from eslr_jax.body.motion import Motion, shape_body
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_body, make_motion, skeleton_motion
+from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.fit.fit import fit_garment
@@ -52,28 +54,36 @@ def _is_path(name: str) -> bool:
     return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).exists()
 
 
-def load_body(name: str | Path = "anny") -> Body:
-    """Load a rigged body.
+def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Sequence[float] = ()) -> Body:
+    """Load a rigged body; warn if the unit of its file is a guess.
 
     Args:
         name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
             character (.gltf, .glb, .vrm), or an npz file in the bundled format. `FILE#MESH,MESH` picks
             the meshes of a character that make up the body.
+        units: Unit of the file: m, dm, cm, mm, in, ft, or metres per unit; by default recognised.
+        betas: Shape coefficients [standard deviations] of a body with shapes, such as a SMPL model.
 
     Raises:
-        AssetError: There is no such body, or the file is damaged or holds no rigged body in metres.
+        AssetError: There is no such body, the file is damaged, or its unit is unknown.
+        ConfigError: The body has fewer shapes than betas.
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body in the bundled format is not closed, or inside out.
     """
-    text = str(name)
+    body = _read_body(str(name), units)
+    return shape_body(body, betas) if len(betas) else body
+
+
+def _read_body(text: str, units: str | None) -> Body:
+    """Return a body by name or file, in its average shape."""
     if not _is_path(text):
         return _closed(read_body(find_asset("body", text)), text)
     file, meshes = _split_name(text)
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
-        return make_body(read_gltf_body(file, meshes))
+        return make_body(read_gltf_body(file, meshes), units=units)
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
-        return make_body(read_smpl_body(file))
+        return make_body(read_smpl_body(file), units=units)
     if suffix == ".npz":
         return _closed(read_body(file), Path(file).name)
     raise _unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
@@ -239,6 +249,8 @@ def load_motion(
 ) -> Motion:
     """Load a motion, for the bundled body or carried over to another one.
 
+    A T-pose before the motion of a file is skipped with a warning.
+
     Args:
         name: Name of a bundled clip, or turn, jump or swing, which are computed; or path of a motion: .bvh,
             AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm), or an archive in
@@ -262,7 +274,9 @@ def load_motion(
             return motion
         # An archive holds no skeleton, so that of the bundled body is used.
         return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
-    source = read_skeleton_motion(file, clip)
+    source, skipped = skip_start_pose(read_skeleton_motion(file, clip))
+    if skipped:
+        warnings.warn(skipped, stacklevel=2)
     is_bvh = Path(file).suffix.lower() == ".bvh"
     return make_motion(
         source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"

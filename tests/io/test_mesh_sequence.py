@@ -7,7 +7,8 @@ from broken import refuses
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.sequence import pose_sequence
-from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.body.units import UnitsWarning
+from eslr_jax.errors import MotionError
 from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, obj_text, read_mesh_sequence
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
@@ -69,9 +70,14 @@ def test_frames_between_frames_lie_on_straight_lines():
         pose_sequence(MeshSequence("body", MOVING, FACES, 15.0), num_frames=30)
 
 
-def test_other_units_are_refused():
-    with pytest.raises(AssetError, match="metres"):
-        pose_sequence(MeshSequence("body", 100 * MOVING, FACES, 30.0))
+def test_other_units_are_recognised_or_named():
+    sequence = MeshSequence("body", 100 * MOVING, FACES, 30.0)
+    _, expected = pose_sequence(MeshSequence("body", MOVING, FACES, 30.0))
+    with pytest.warns(UnitsWarning, match="in cm"):
+        _, guessed = pose_sequence(sequence)
+    _, named = pose_sequence(sequence, units="cm")
+    for found in (guessed, named):
+        np.testing.assert_allclose(found.positions, expected.positions, atol=1e-6)
 
 
 BROKEN = {
