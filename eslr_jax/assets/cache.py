@@ -22,7 +22,8 @@ from eslr_jax.errors import AssetError
 from eslr_jax.io.npz import read_arrays, write_arrays
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
-_CODE = ("geometry", "fit", "io/mesh.py", "io/garment.py", "types.py")  # changes here make entries stale
+# A change in these makes every entry stale.
+_CODE = ("geometry", "fit", "io/mesh.py", "io/gltf_document.py", "io/garment.py", "types.py")
 
 
 def user_cache() -> Path:
