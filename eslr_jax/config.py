@@ -79,7 +79,7 @@ class ModelConfig:
             )
         if self.refinement_steps > 1 and self.output == "acceleration":
             raise ValueError(
-                'refinement_steps > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
+                'refinement_steps > 1 needs output "correction", "descent" or "subspace"; an acceleration has one'
             )
         if not self.edge_latents and self.features != "gradient":
             raise ValueError(

@@ -98,8 +98,8 @@ def gather_corners(
     )  # type: ignore[return-value]
 
 
-# A pair of linear maps that are each other's transpose, as primitives of JAX: a `custom_vjp` would rule out forward
-# mode, and would be left behind by a second derivative.
+# Two linear maps, each the other's transpose, as primitives of JAX. A `custom_vjp` would rule out forward mode,
+# and a second derivative would leave it behind.
 _gather_flat = Primitive("gather_flat")
 _sum_flat = Primitive("sum_flat")
 

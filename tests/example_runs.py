@@ -6,7 +6,7 @@ import numpy as np
 
 from eslr_jax.assets import load_garment_file
 from eslr_jax.io.garment import write_garment_npz
-from eslr_jax.io.trajectory import write_trajectory
+from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
 
 
 def write_run(folder, body, name, scale=1.0):
@@ -21,16 +21,17 @@ def write_run(folder, body, name, scale=1.0):
     body_positions = np.repeat(
         np.asarray(body.rest_positions)[None] + np.array([[0, 0.82, 0]], np.float32), len(frames), 0
     )
+    track = BodyTrack(
+        positions=body_positions,
+        faces=np.asarray(body.faces),
+        rest_positions=np.asarray(body.rest_positions),
+        contact_faces=np.asarray(body.faces)[np.asarray(body.is_obstacle)],
+        contact_boundary=np.empty(0, np.int32),
+    )
+    velocities = np.gradient(frames, 1 / 30, axis=0)
     write_trajectory(
         folder / "trajectory.npz",
-        positions=frames,
-        velocities=np.gradient(frames, 1 / 30, axis=0),
-        faces=garment.faces,
-        timestep=1 / 30,
-        body_positions=body_positions,
-        body_faces=np.asarray(body.faces),
-        body_rest_positions=np.asarray(body.rest_positions),
-        contact_faces=np.asarray(body.faces)[np.asarray(body.is_obstacle)],
+        TrajectoryFile(frames, velocities, garment.faces, timestep=1 / 30, body=track),
     )
     (folder / "report.json").write_text(json.dumps({"self_contact": True}))
     write_garment_npz(folder / "garment.npz", garment)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from eslr_jax.simulation.scan import simulate_scene
 
 from eslr_jax.assets import load_garment, load_motion
 from eslr_jax.body.motion import pose_body
@@ -10,7 +11,6 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.scene import prepare_scene
-from eslr_jax.simulation.scan import simulate_scene
 
 
 @pytest.mark.parametrize("name", ["dress", "tshirt"])

@@ -75,7 +75,6 @@ def is_intact(asset: Asset) -> bool:
     return hashlib.sha256((data_folder() / asset.file).read_bytes()).hexdigest() == asset.sha256
 
 
-@cache
 def split_clips(split: str) -> tuple[str, ...]:
     """Return the names of a split's clips.
 
@@ -89,6 +88,7 @@ def split_clips(split: str) -> tuple[str, ...]:
     return tuple(motions[split])
 
 
+@cache
 def load_splits() -> dict[str, Any]:
     """Return the split of clips and garments into train, validation, test and unseen."""
     return json.loads((data_folder() / "splits.json").read_text())

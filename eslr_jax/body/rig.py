@@ -14,6 +14,7 @@ from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
 from eslr_jax.body.units import metres_per_unit
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.mesh import shared_vertices
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.types import Body
 
@@ -42,7 +43,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     """
     _check_mesh(mesh)
     scale = metres_per_unit(f"body {mesh.name}", float(np.ptp(mesh.positions, axis=0).max()), units)
-    vertices, places = _shared_vertices(mesh.positions)
+    vertices, places = shared_vertices(mesh.positions)
     faces = places[mesh.faces]
     corners = np.sort(faces, axis=1)
     faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
@@ -105,18 +106,6 @@ def _check_mesh(mesh: RiggedMesh) -> None:
         raise AssetError(
             f"body {mesh.name}: vertex {np.argmax(is_bad)} has no or negative skin weights; bind it to a joint"
         )
-
-
-def _shared_vertices(positions: NDArray) -> tuple[NDArray, NDArray]:
-    """Join vertices at bit-identical positions, which exporters split where texture coordinates differ.
-
-    Returns:
-        The vertices that are kept, in their order, and the index among them of every vertex.
-    """
-    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return np.sort(first), rank[inverse.ravel()]
 
 
 def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: Skeleton) -> NDArray:

@@ -1,9 +1,9 @@
 """One frame, solved: from a starting point to the minimum of its potential, and how the minimum moves.
 
 The minimum x* of the potential P(x, theta) is a function of everything the problem holds. Differentiating
-grad P(x*, theta) = 0 gives dx*/dtheta = -H^-1 d(grad P)/dtheta with the Hessian H = d^2 P / dx^2. So derivatives
-cost one linear system, whatever the solver did on its way, and the starting point drops out. They are exact at the
-minimum; where the solver stops early they are off in the order of what was left of the gradient.
+grad P(x*, theta) = 0 gives dx*/dtheta = -H^-1 d(grad P)/dtheta with the Hessian H = d^2 P / dx^2. So a derivative
+costs one linear system, whatever the solver did on its way, and the starting point drops out. It is exact at the
+minimum; where the solver stops early it is off in the order of the gradient that was left.
 
 Source: Griewank and Walther 2008, Evaluating Derivatives, section 15 (implicit functions).
 """

@@ -137,7 +137,7 @@ def refine(
 def descent_step(
     problem: FrameProblem, point: Point, longest: Float[Array, ""]
 ) -> Float[Array, "vertices 3"]:
-    """Return the preconditioned step down the gradient [m], shape [vertices, 3], no vertex farther than `longest`.
+    """Return the preconditioned step down the gradient [m], shape [vertices, 3], bounded by `longest`.
 
     The stretch energy grows with the fourth power of a displacement: from a torn-up state, full steps would
     overshoot further each time. The bound is a trust region of one mesh spacing.

@@ -157,7 +157,7 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
     """
     scene, trajectory = view.server.scene, run.trajectory
     wireframe = bool(view.controls["wireframe"].value)
-    subject = trajectory.positions if trajectory.body_positions is None else trajectory.body_positions
+    subject = trajectory.positions if trajectory.body is None else trajectory.body.positions
     walked = (subject[frame].mean(axis=0) - subject[0].mean(axis=0)) * [1.0, 0.0, 1.0]
     # Where the subjects walk, the runs walk beside each other, or on the spot if the page follows.
     offset = np.array([_SPACING * k, 0.0, 0.0]) - (walked if view.controls["follow"].value else 0.0)
@@ -178,11 +178,11 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
             points, trajectory.faces, vertex_colors=np.round(255 * colors).astype(np.uint8), process=False
         )
         scene.add_mesh_trimesh(name, mesh)
-    if trajectory.body_positions is not None:
+    if trajectory.body is not None:
         scene.add_mesh_simple(
             f"/runs/{k}/body",
-            (trajectory.body_positions[frame] + offset).astype(np.float32),
-            trajectory.body_faces,
+            (trajectory.body.positions[frame] + offset).astype(np.float32),
+            trajectory.body.faces,
             color=_bytes(BODY_COLOR),
             visible=bool(view.controls["body"].value),
         )

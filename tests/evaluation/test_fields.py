@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from eslr_jax.simulate.step import FrameInput, frame_problem, solve
 from example_runs import write_run
 
 from eslr_jax.config import SimConfig
@@ -18,7 +19,6 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
 from eslr_jax.physics.problem import PhysicsParameters, start_guess
 from eslr_jax.scene import initial_state
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from eslr_jax.simulation.scan import simulate_scene
 from newton_cloth import (
     NewtonCloth,
     Setting,
@@ -26,7 +27,6 @@ from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import contact_forces
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulation.scan import simulate_scene
 from eslr_jax.types import Contacts
 
 SOLVERS = [Setting("vbd", 2, 10), Setting("style3d", 2, 10), Setting("xpbd", None, 1)]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from eslr_jax.simulation.step import FrameInput, frame_problem
 from physics_cases import make_case, make_garment, make_sheet
 
 from eslr_jax.config import SimConfig
@@ -24,7 +25,6 @@ from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.physics.repulsion import pair_heights, repulsion_energy
 from eslr_jax.scene import initial_state
-from eslr_jax.simulation.step import FrameInput, frame_problem
 
 
 def assemble(blocks, table, count):
