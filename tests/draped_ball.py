@@ -1,4 +1,4 @@
-"""The smallest garment on the smallest moving body: a square of cloth over a ball that drifts, with two joints."""
+"""The smallest garment on the smallest moving body: a square of cloth over a ball that drifts."""
 
 from __future__ import annotations
 

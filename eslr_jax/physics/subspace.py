@@ -68,7 +68,7 @@ def _minimize_quadratic(
 def _inverse_absolute(matrix: Float[Array, "rows rows"]) -> Float[Array, "rows rows"]:
     """Return f(matrix) with f(x) = 1 / max(|x|, least) on the eigenvalues of a symmetric matrix."""
     values, vectors = jnp.linalg.eigh(matrix)
-    return (vectors / jnp.maximum(jnp.abs(values), _MIN_CURVATURE)) @ vectors.T
+    return (vectors / jnp.maximum(jnp.abs(values), _MIN_CURVATURE)[None, :]) @ vectors.T
 
 
 @_inverse_absolute.defjvp
@@ -88,4 +88,4 @@ def _inverse_absolute_jvp(primals, tangents):
         0.5 * (slope[:, None] + slope[None, :]),
     )
     change = vectors @ (divided * (vectors.T @ tangents[0] @ vectors)) @ vectors.T
-    return (vectors * inverse) @ vectors.T, change
+    return (vectors * inverse[None, :]) @ vectors.T, change
