@@ -46,7 +46,6 @@ class Status(enum.IntFlag):
 
     OK = 0
     NON_FINITE = 1
-    WORLD_EDGE_OVERFLOW = 2
     SELF_CONTACT_OVERFLOW = 4
     BODY_TOO_FAST = 8
 
@@ -55,7 +54,6 @@ class Status(enum.IntFlag):
         texts = {
             Status.NON_FINITE: "positions became NaN or infinite; use the physics simulator, more corrector "
             "steps, or a smaller timestep",
-            Status.WORLD_EDGE_OVERFLOW: "more world edges than their capacity; raise world_edge_capacity",
             Status.SELF_CONTACT_OVERFLOW: "more self-contact than its capacities hold; "
             "raise self_contact_capacity",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "

@@ -51,6 +51,16 @@ class Material:
 
 
 @struct.dataclass
+class Normalizer:
+    """Mean and spread of a set of features over every row seen so far; see `graph.normalizer`."""
+
+    count: Float[Array, ""]  # rows seen
+    mean: Float[Array, " features"]
+    squared_deviations: Float[Array, " features"]  # sum over rows of (x - mean)^2
+    num_updates: Int[Array, ""]  # graphs seen
+
+
+@struct.dataclass
 class Body:
     """A rigged body in its rest pose."""
 
