@@ -21,6 +21,7 @@ class ModelConfig:
 
     message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
     smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
+    hierarchical: bool = False  # True: HOOD's coarse levels, see models.hood
     edge_latents: bool = True  # False: no messages, only smoothing, see models.smoothing
     attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
     latent_size: int = 128  # HOOD
@@ -78,6 +79,14 @@ class ModelConfig:
         if not self.edge_latents and self.features != "gradient":
             raise ValueError(
                 'edge_latents = false needs features = "gradient", which tell a vertex its force'
+            )
+        if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % 5):
+            raise ValueError(
+                "hierarchical = true needs smoothing_steps = 0 and message_passing_steps in fives"
+            )
+        if self.hierarchical and not (self.update_body and self.features == "hood" and self.edge_latents):
+            raise ValueError(
+                'hierarchical = true needs update_body = true, edge_latents = true and features = "hood"'
             )
         if self.output in ("descent", "subspace") and self.features != "gradient":
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')

@@ -13,6 +13,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 @struct.dataclass
+class CoarseEdges:
+    """One coarse level of a garment's edges, see `geometry.coarse`."""
+
+    senders: Int[Array, " coarse_edges"]  # directed, both directions
+    receivers: Int[Array, " coarse_edges"]  # sorted ascending
+    reverse_edges: Int[Array, " coarse_edges"]  # index of the opposite directed edge
+    edge_mask: Bool[Array, " coarse_edges"]
+    is_kept: Bool[Array, " vertices"]  # vertices that these edges join
+
+
+@struct.dataclass
 class Garment:
     """A garment's rest mesh, its topology tables and its skinning; constant during a rollout."""
 
@@ -37,6 +48,7 @@ class Garment:
     skin_weights: Float[Array, "vertices influences"]  # rows sum to one
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
+    coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
 
 
 @struct.dataclass

@@ -185,6 +185,60 @@ def plain_network(config, params, graph, garment, xp=np):
     return plain_decoder(latents["garment"], encoded, params, garment, config, xp)
 
 
+HOOD_STAGES = ("coarse0 mesh", "coarse0 coarse1", "coarse1", "coarse0 coarse1", "coarse0 mesh")
+
+
+def plain_hood(params, graph, steps_per_stage):
+    """Return the accelerations of the hierarchical network, before the output's normaliser, in NumPy."""
+    weights, statistics = params["params"], params["statistics"]
+    coarse = graph.globals["coarse"]
+    level = np.max([(k + 1) * edges.is_kept for k, edges in enumerate(coarse)], axis=0)
+    rows = {}
+    for name, features in graph.nodes.items():
+        embeddings = (
+            weights["type_embedding"][graph.globals[f"{name}_type"]],
+            weights["level_embedding"][level if name == "garment" else np.zeros_like(level)],
+        )
+        features = np.concatenate([features[:, :3], *embeddings, features[:, 3:]], axis=1)
+        features = plain_normalize(features, statistics["garment"], 3, np)
+        rows[name] = plain_mlp(features, weights["garment_encoder"], np)
+    for name, features in graph.edges.items():
+        kind, num_static = ("world", 0) if name.startswith("world") else ("mesh", 3)
+        encoder = weights[f"coarse_encoders_{name}" if name.startswith("coarse") else f"{kind}_encoder"]
+        rows[name] = plain_mlp(plain_normalize(features, statistics[kind], num_static, np), encoder, np)
+    for stage, names in enumerate(HOOD_STAGES):
+        joined = np.zeros(len(level), bool) | ("mesh" in names)
+        for k, edges in enumerate(coarse):
+            if f"coarse{k}" in names:
+                joined |= edges.is_kept
+        for step in range(steps_per_stage):
+            layer = layer_weights(weights[f"stages_{stage}"], step)
+            rows = plain_hood_step(rows, graph, layer, names.split(), joined)
+    return plain_mlp(rows["garment"], weights["decoder"], np)
+
+
+def plain_hood_step(rows, graph, weights, names, joined):
+    """One step: messages of the stage's edge sets and of the world edges that end where `joined` holds."""
+    v, b, new = rows["garment"], rows.get("body"), dict(rows)
+    sums = {}
+    for name in names:
+        ends = [v[graph.receivers[name]], v[graph.senders[name]]]
+        step = plain_mlp(np.concatenate([*ends, rows[name]], axis=1), weights[f"edge_mlps_{name}"], np)
+        sums[name] = numpy_segment_sum(step, graph.receivers[name], len(v))
+        new[name] = rows[name] + step
+    sums["world"], nothing = np.zeros_like(v), np.zeros_like(v)
+    if b is not None:
+        mask = (graph.globals["world_mask"] & joined)[:, None]
+        for name, ends in (("world", [v, b]), ("world_reverse", [b, v])):
+            step = mask * plain_mlp(np.concatenate([*ends, rows[name]], axis=1), weights["world_mlp"], np)
+            sums[name], new[name] = step, rows[name] + step
+        inputs = [b, *[nothing for _ in names], sums["world_reverse"]]
+        new["body"] = b + plain_mlp(np.concatenate(inputs, axis=1), weights["vertex_mlp"], np)
+    inputs = [v, *[sums[name] for name in sorted(names)], sums["world"]]
+    new["garment"] = v + plain_mlp(np.concatenate(inputs, axis=1), weights["vertex_mlp"], np)
+    return new
+
+
 def plain_encoded_vertices(nodes, edges, graph, weights, xp):
     """Return vertex latents from rows with the features of vertex, body point and world edge."""
     rows = [nodes["garment"]]

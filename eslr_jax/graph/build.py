@@ -4,6 +4,7 @@ Nodes, edges, senders and receivers are dictionaries:
 
 - nodes "garment" [vertices, features] and, beside a body, "body" [vertices, features];
 - edges "mesh" [edges, features] in both directions, sorted by receiver;
+- with `ModelConfig.hierarchical`, edges "coarse0" to "coarse2" [coarse_edges, features] of the coarse levels;
 - beside a body, edges "world" [vertices, features] from body to garment, and with `ModelConfig.update_body`
   "world_reverse" [vertices, features] from garment to body.
 
@@ -22,9 +23,12 @@ import jraph
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import ModelConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.inputs import GraphInputs, required
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
+
+COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 
 Rows = dict[str, Float[Array, "_ features"]]
 
@@ -34,6 +38,7 @@ class Topology(TypedDict, total=False):
 
     reverse_edges: Int[Array, " edges"]  # index of the opposite mesh edge
     incoming_edges: Int[Array, "vertices degree"]  # mesh edges that enter a vertex, padded with their number
+    coarse: tuple[CoarseEdges, ...]  # coarse levels, finest first; hierarchical networks
     edge_length: Float[Array, ""]  # mean rest edge length [m]; features "gradient"
     garment_type: Int[Array, " vertices"]  # HOOD's vertex type; features "hood"
     body_type: Int[Array, " vertices"]  # the same of the body rows
@@ -50,6 +55,9 @@ def build_graph(
         material: Fabric.
         inputs: State of garment and body.
         config: Architecture, which decides on features and world edges; static.
+
+    Raises:
+        ConfigError: The network is hierarchical and the garment has no coarse levels.
     """
     graph = build_frame_graph(garment, material, inputs, config)
     if config.features == "hood":
@@ -77,11 +85,20 @@ def build_frame_graph(
     if is_hood:
         topology["garment_type"] = jnp.where(garment.is_pinned, features.TYPE_PINNED, features.TYPE_GARMENT)
         nodes = {"garment": features.hood_garment_features(garment, material, inputs)}
-        edges = {"mesh": features.hood_mesh_features(garment, material, inputs)}
+        edges = {"mesh": features.hood_edge_features(garment, material, inputs, garment)}
     else:
         spacing = topology["edge_length"] = features.mean_edge_length(garment)
         nodes = {"garment": features.frame_node_features(garment, material, inputs, spacing)}
         edges = {"mesh": features.frame_mesh_features(garment, inputs.position, spacing)}
+    if config.hierarchical:
+        if garment.coarse is None:
+            raise ConfigError(
+                "the network is hierarchical and the garment has no coarse levels; add_coarse_edges adds them"
+            )
+        topology["coarse"] = garment.coarse
+        for name, level in zip(COARSE_SETS, garment.coarse, strict=True):
+            edges[name] = features.hood_edge_features(garment, material, inputs, level)
+            senders[name], receivers[name] = level.senders, level.receivers
     if inputs.contacts is not None:
         mask = (jnp.abs(inputs.contacts.distances) <= config.world_edge_radius) & garment.vertex_mask
         topology["world_mask"] = mask

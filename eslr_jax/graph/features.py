@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.graph.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
 LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
 LAME_LAMBDA_RANGE = (3535.414406069427, 93333.73508005822)  # [Pa] (HOOD)
@@ -145,10 +145,19 @@ def hood_body_features(
     return jnp.concatenate([velocity, normals, column, -jnp.ones((num_rows, 4), velocity.dtype)], axis=1)
 
 
-def hood_mesh_features(garment: Garment, material: Material, inputs: GraphInputs) -> Float[Array, "edges 12"]:
-    """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3."""
-    current = _edge_vectors(garment, inputs.position)
-    rest = _edge_vectors(garment, garment.rest_positions)
+def hood_edge_features(
+    garment: Garment, material: Material, inputs: GraphInputs, edges: Garment | CoarseEdges
+) -> Float[Array, "edges 12"]:
+    """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3.
+
+    Args:
+        garment: Rest mesh.
+        material: Fabric.
+        inputs: State of the garment.
+        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
+    """
+    current = _edge_vectors(edges, inputs.position)
+    rest = _edge_vectors(edges, garment.rest_positions)
     constants = material_inputs(garment, material)
     return jnp.concatenate(
         [
@@ -157,7 +166,7 @@ def hood_mesh_features(garment: Garment, material: Material, inputs: GraphInputs
             rest,
             safe_norm(rest, keepdims=True),
             jnp.broadcast_to(inputs.timestep, (current.shape[0], 1)),
-            (constants[garment.senders] + constants[garment.receivers]) / 2,
+            (constants[edges.senders] + constants[edges.receivers]) / 2,
         ],
         axis=1,
     )
@@ -284,9 +293,11 @@ def refinement_mesh_features(
     )
 
 
-def _edge_vectors(garment: Garment, position: Float[Array, "vertices 3"]) -> Float[Array, "edges 3"]:
-    """Return the vector from receiver to sender of every mesh edge [m]."""
-    return position[garment.senders] - position[garment.receivers]
+def _edge_vectors(
+    edges: Garment | CoarseEdges, position: Float[Array, "vertices 3"]
+) -> Float[Array, "edges 3"]:
+    """Return the vector from receiver to sender of every edge [m]."""
+    return position[edges.senders] - position[edges.receivers]
 
 
 def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, "edges 1"]) -> Float[Array, "edges 1"]:

@@ -48,6 +48,24 @@ def mesh_tables(graph: jraph.GraphsTuple, dtype) -> MeshTables:
     )
 
 
+def coarse_tables(graph: jraph.GraphsTuple, level: int) -> MeshTables:
+    """Return the tables that messages along a coarse level's edges follow; there is nothing to smooth.
+
+    Args:
+        graph: A graph of `graph.build` for a hierarchical network.
+        level: Index of the level; 0 is the finest.
+    """
+    edges, name = graph.globals["coarse"][level], f"coarse{level}"
+    num_vertices = edges.is_kept.shape[0]
+    return MeshTables(
+        senders=graph.senders[name],
+        receivers=graph.receivers[name],
+        reverse_edges=edges.reverse_edges,
+        neighbors=jnp.zeros((num_vertices, 0), jnp.int32),
+        degree=jnp.zeros((num_vertices, 1)),
+    )
+
+
 def _take(x: Array, indices: Int[Array, ...]) -> Array:
     """Gather rows; every index is known to be in range and not negative."""
     return x.at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)

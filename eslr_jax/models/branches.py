@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import flax.linen as nn
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.graph.build import Topology
 from eslr_jax.models.gsa import GsaBlock
 from eslr_jax.models.mlp import MLP
 
@@ -78,12 +79,18 @@ class TwoBranches(nn.Module):
         return self.decoder.finish(hidden)
 
 
-def stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Module:
+def stack(module: type[nn.Module], config: ModelConfig, length: int, **attributes: Any) -> nn.Module:
     """Return `length` copies of a module, each with its own weights, compiled once.
 
     `ModelConfig.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
     results of its matrix products ("products"), or its inputs alone ("layers": a third of the memory, for a
     quarter more time).
+
+    Args:
+        module: Class of the module, with `ModelConfig` as its first attribute.
+        config: Architecture.
+        length: Number of copies.
+        **attributes: Other attributes of the module.
     """
     if config.remat != "none":
         keeps = jax.checkpoint_policies.dots_saveable if config.remat == "products" else None
@@ -95,11 +102,11 @@ def stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Modul
         in_axes=nn.broadcast,
         length=length,
     )
-    return scanned(config)
+    return scanned(config, **attributes)
 
 
 def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "vertices 1"]:
     """Return one for every vertex with a world edge, zero for the others; zeros without a body."""
     rows = graph.nodes["garment"].shape[0]
-    mask = graph.globals.get("world_mask", jnp.zeros(rows, bool))
+    mask = cast(Topology, graph.globals).get("world_mask", jnp.zeros(rows, bool))
     return mask.astype(dtype)[:, None]

@@ -165,9 +165,9 @@ class EncodeProcessDecode(TwoBranches):
             for name, rows in self.with_types(graph).items()
         }
         edges = {
-            name: scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
-            if name == "mesh"
-            else scale(rows, statistics["world"], 0)
+            name: scale(rows, statistics["world"], 0)
+            if name.startswith("world")
+            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
             for name, rows in cast(Rows, graph.edges).items()
         }
         return nodes, edges

@@ -20,12 +20,13 @@ from jaxtyping import Array, Float
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import CheckpointError
 from eslr_jax.graph import features, normalizer
-from eslr_jax.graph.build import Rows, feature_sizes
+from eslr_jax.graph.build import COARSE_SETS, Rows, Topology, feature_sizes
 from eslr_jax.models.attention import orthogonal_projection
 from eslr_jax.models.branches import Places
+from eslr_jax.models.hood import NUM_LEVELS, HierarchicalNetwork
 from eslr_jax.models.network import Encoded, EncodeProcessDecode, Statistics
 from eslr_jax.models.smoothing import EncodedVertices, SmoothingNetwork
-from eslr_jax.types import Garment
+from eslr_jax.types import CoarseEdges, Garment
 
 Params = dict[str, Any]
 
@@ -65,6 +66,8 @@ DEEP = dataclasses.replace(
 SMOOTH = dataclasses.replace(
     _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
+# The published hierarchical network, "postcvpr".
+HOOD = dataclasses.replace(_without_attention(_without_smoothing(PAPER)), hierarchical=True, update_body=True)
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
     "eslr-10": dataclasses.replace(PAPER, message_passing_steps=10, attention_blocks=3),
@@ -72,6 +75,7 @@ MODELS: dict[str, ModelConfig] = {
     "gsa-15": _without_smoothing(PAPER),
     "mgn-15": _without_attention(_without_smoothing(PAPER)),
     "mgn-48": dataclasses.replace(_without_attention(_without_smoothing(PAPER)), message_passing_steps=48),
+    "hood": HOOD,
     "eslr-small": SMALL,
     "lsdmp-small": _without_attention(SMALL),
     "gsa-small": _without_smoothing(SMALL),
@@ -86,6 +90,8 @@ MODELS: dict[str, ModelConfig] = {
 
 def make_network(config: ModelConfig) -> EncodeProcessDecode | SmoothingNetwork:
     """Return the module that a configuration describes."""
+    if config.hierarchical:
+        return HierarchicalNetwork(config)
     return EncodeProcessDecode(config) if config.edge_latents else SmoothingNetwork(config)
 
 
@@ -203,10 +209,14 @@ def measure_statistics(
         nodes = jax.lax.stop_gradient(nodes)
         edges = cast(Rows, graph.edges)
         masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
+        coarse = cast(Topology, graph.globals).get("coarse", ())
+        masks |= {name: level.edge_mask for name, level in zip(COARSE_SETS, coarse, strict=False)}
+        world = {name: rows for name, rows in edges.items() if name.startswith("world")}
+        mesh = {name: rows for name, rows in edges.items() if name not in world}
         groups = (
             ("garment", nodes, features.HOOD_NODE_STATIC),
-            ("mesh", {"mesh": edges["mesh"]}, features.HOOD_MESH_STATIC),
-            ("world", {name: rows for name, rows in edges.items() if name != "mesh"}, 0),
+            ("mesh", mesh, features.HOOD_MESH_STATIC),
+            ("world", world, 0),
         )
         for name, group, num_static in groups:
             if group:
@@ -282,8 +292,9 @@ def _new_statistics(config: ModelConfig) -> Statistics:
     statistics = {}
     if config.features == "hood":
         sizes = feature_sizes(config)
+        embedded = features.NUM_TYPES + (NUM_LEVELS if config.hierarchical else 0)
         statistics["garment"] = normalizer.init_normalizer(
-            sizes["garment"] + features.NUM_TYPES - features.HOOD_NODE_STATIC
+            sizes["garment"] + embedded - features.HOOD_NODE_STATIC
         )
         statistics["mesh"] = normalizer.init_normalizer(sizes["mesh"] - features.HOOD_MESH_STATIC)
         statistics["world"] = normalizer.init_normalizer(sizes["world"])
@@ -295,11 +306,12 @@ def _new_statistics(config: ModelConfig) -> Statistics:
 def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Places]:
     """Return the smallest graph that touches every weight: one edge, two body points."""
     sizes, zeros, pair = feature_sizes(config), jnp.zeros, jnp.arange(2)
+    worlds = ("world", "world_reverse") if config.update_body else ("world",)
     graph = jraph.GraphsTuple(
         nodes={"garment": zeros((2, sizes["garment"])), "body": zeros((2, sizes["body"]))},
-        edges={"mesh": zeros((2, sizes["mesh"])), "world": zeros((2, sizes["world"]))},
-        senders={"mesh": pair[::-1], "world": pair},
-        receivers={"mesh": pair, "world": pair},
+        edges={"mesh": zeros((2, sizes["mesh"])), **{name: zeros((2, sizes["world"])) for name in worlds}},
+        senders={"mesh": pair[::-1], **dict.fromkeys(worlds, pair)},
+        receivers={"mesh": pair, **dict.fromkeys(worlds, pair)},
         globals={
             "reverse_edges": pair[::-1],
             "incoming_edges": pair[:, None],
@@ -310,4 +322,10 @@ def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Places]:
         n_node=None,
         n_edge=None,
     )
+    if config.hierarchical:
+        level = CoarseEdges(pair[::-1], pair, pair[::-1], jnp.ones(2, bool), jnp.ones(2, bool))
+        for name in COARSE_SETS:
+            graph.edges[name] = graph.edges["mesh"]
+            graph.senders[name], graph.receivers[name] = level.senders, level.receivers
+        graph.globals["coarse"] = (level,) * len(COARSE_SETS)
     return graph, Places(zeros((2, config.embedding_size)), jnp.ones(2, bool))
