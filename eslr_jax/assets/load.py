@@ -210,7 +210,8 @@ def prepare_stored(
             name=name,
             **options,
         )
-        return {field.name: np.asarray(getattr(garment, field.name)) for field in dataclasses.fields(Garment)}
+        leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
+        return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
     if not cache:
         return to_device(Garment(**make()))

@@ -14,6 +14,7 @@ from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene.plan import shared_surface
@@ -70,7 +71,10 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     body = load_body()
     options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
+    padded = pad_alike(garments)
+    if config.model.hierarchical:
+        padded = [add_coarse_edges(garment) for garment in padded]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     surface = shared_surface(garments, body)
     if surface is None:
         raise ConfigError("none of the garments is near the body; train on garments that are worn")
