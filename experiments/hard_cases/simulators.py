@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.gap import find_friction_loads
@@ -44,20 +44,25 @@ def network_simulator(name: str, params: Any, model: ModelConfig, iterations: in
 
 def foreign_trajectory(
     positions: Float[np.ndarray, "frames vertices 3"],
-    velocities: Float[np.ndarray, "frames vertices 3"],
     scene: Scene,
+    velocities: Float[np.ndarray, "frames vertices 3"] | None = None,
     iterations: int = 0,
 ) -> Trajectory:
-    """Return the trajectory of a simulator that reports positions alone; energies and residuals are NaN.
+    """Return the trajectory of another simulator; energies and residuals, which it does not tell, are NaN.
 
     Args:
         positions: Vertex positions [m], shape [frames, vertices, 3].
-        velocities: Vertex velocities [m/s], shape [frames, vertices, 3].
         scene: The scene that was simulated.
+        velocities: Vertex velocities [m/s], shape [frames, vertices, 3]; by default differences of positions.
         iterations: Iterations that it spent on every frame.
     """
-    x, v = jnp.asarray(positions, jnp.float32), jnp.asarray(velocities, jnp.float32)
-    unknown: Array = jnp.full(len(x), jnp.nan)
+    x = jnp.asarray(positions, jnp.float32)
+    if velocities is None:
+        moved = jnp.diff(x, axis=0) / scene.timestep
+        v = jnp.concatenate([scene.initial_state.velocity[None], moved])
+    else:
+        v = jnp.asarray(velocities, jnp.float32)
+    unknown = jnp.full(len(x), jnp.nan)
     return Trajectory(
         positions=x,
         velocities=v,
