@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, SceneBody
@@ -53,9 +54,8 @@ def icosphere(subdivisions: int, radius: float) -> Mesh:
     points = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
     positions = np.concatenate([np.roll(points, shift, axis=1) for shift in range(3)])
     faces = ConvexHull(positions).simplices
-    corners = positions[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    is_inside_out = np.einsum("fi,fi->f", normal, corners.mean(axis=1)) < 0
+    outward = positions[faces].mean(axis=1)
+    is_inside_out = np.sum(face_cross_products(positions, faces) * outward, axis=1) < 0
     faces = np.where(is_inside_out[:, None], faces[:, ::-1], faces)
     for _ in range(subdivisions):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.types import Garment
 from hard_cases.build import FRAME, corners_of, hanging_sheet, make_cloth, make_scene, sheet, turn_about_x
 from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
@@ -163,8 +164,7 @@ def _measure_bad_start(runs: Runs) -> list[Measure]:
 
 def _flipped_share(run: Run) -> float:
     """Return the share of faces that look against the mean of their neighbours."""
-    corners = run.positions[-1][run.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_cross_products(run.positions[-1], run.faces)
     around = np.zeros((run.positions.shape[1], 3))
     for k in range(3):
         np.add.at(around, run.faces[:, k], normal)

@@ -60,18 +60,21 @@ def intersecting_pairs(
     if not np.isfinite(positions).all():
         return np.empty((0, 2), np.int64)
     positions, faces = np.asfortranarray(positions), np.asfortranarray(faces)
-    edges = np.asfortranarray(ipctk.edges(faces))
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, edge_of_side, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    edges = np.asfortranarray(edges)
+    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
+    beside = np.split(sides_by_edge % len(faces), np.cumsum(counts)[:-1])  # faces of every edge
     broad = ipctk.LBVH()
     broad.can_vertices_collide = ipctk.make_static_obstacle_filter(len(cloth))
     broad.build(positions, edges, faces, 0.0)
     candidates = broad.detect_edge_face_candidates()
     ids = np.array([(found.edge_id, found.face_id) for found in candidates], np.int64).reshape(-1, 2)
-    beside = _faces_of_edges(edges, faces)
     pairs = [
         (min(face, other), max(face, other))
         for edge, face in ids[_pierces(ipctk, positions[edges[ids[:, 0]]], positions[faces[ids[:, 1]]])]
         for other in beside[edge]
-        if other >= 0 and not set(faces[face]) & set(faces[other])
+        if not set(faces[face]) & set(faces[other])
     ]
     return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
 
@@ -100,20 +103,3 @@ def _meets(ipctk: ModuleType, start: np.ndarray, end: np.ndarray, corners: np.nd
         ipctk.edge_edge_distance(start, end, corners[i], corners[j]) for i, j in ((0, 1), (1, 2), (2, 0))
     ]
     return min(distances) <= tolerance
-
-
-def _faces_of_edges(edges: np.ndarray, faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
-    """Return the faces beside every edge, shape [edges, 2]; -1 where there is none."""
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    base = int(faces.max()) + 1
-    keys = sides[:, 0].astype(np.int64) * base + sides[:, 1]
-    order = np.argsort(keys, kind="stable")
-    ends = np.sort(edges, axis=1)
-    wanted = ends[:, 0].astype(np.int64) * base + ends[:, 1]
-    first = np.searchsorted(keys[order], wanted)
-    beside = np.full((len(edges), 2), -1)
-    beside[:, 0] = order[first] % len(faces)
-    second = np.minimum(first + 1, len(keys) - 1)
-    is_shared = (first + 1 < len(keys)) & (keys[order][second] == wanted)
-    beside[is_shared, 1] = order[second[is_shared]] % len(faces)
-    return beside
