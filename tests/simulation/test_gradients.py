@@ -19,6 +19,7 @@ from eslr_jax.types import tree_cast
 
 TIGHT = SimConfig(iterations=1500)  # ends where float64 ends
 STEP = 3e-3  # of central differences; what is changed, changes by a tenth of it or a few micrometres
+_NOISE = 5e-7  # of a difference quotient: what the solver leaves of the loss, over two steps
 
 
 @pytest.fixture(autouse=True)
@@ -108,13 +109,14 @@ def check_every_parameter(scene, tolerance):
         ]
         expected = (ends[0] - ends[1]) / (2 * STEP)
         found = float(jnp.sum(gradient[name] * direction))
-        assert found == pytest.approx(expected, rel=tolerance, abs=1e-7), name
+        assert found == pytest.approx(expected, rel=tolerance, abs=_NOISE), name
 
 
 def test_one_hanging_frame_has_right_gradients_by_every_parameter():
     check_every_parameter(small_scene(2, has_body=False), 1e-3)
 
 
+@pytest.mark.slow
 def test_one_frame_on_a_body_has_right_gradients_by_every_parameter():
     check_every_parameter(small_scene(2, has_body=True), 1e-3)
 

@@ -1,40 +1,31 @@
-"""Hard cases of cloth alone: falling, hanging, pulled, twisted, badly started, badly meshed."""
+"""Hard cases of cloth alone: falling, hanging, pulled, twisted, badly started."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.errors import MeshError
-from eslr_jax.evaluation.hard_cases.build import (
-    FRAME,
-    Mesh,
-    corners_of,
-    hanging_sheet,
-    join_meshes,
-    make_cloth,
-    make_scene,
-    sheet,
-)
-from eslr_jax.evaluation.hard_cases.case import HardCase, Runs, Scenes
-from eslr_jax.evaluation.hard_cases.measures import (
-    Measure,
+from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.types import Garment
+from hard_cases.build import FRAME, corners_of, hanging_sheet, make_cloth, make_scene, sheet, turn_about_x
+from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
+from hard_cases.measures import (
+    MM,
     center,
-    judge_frames,
+    count_crossings,
+    energy_at_rest,
     largest_rise,
     largest_stretch,
     mechanical_energy,
-    rms_speed,
+    rms,
     settle,
     speeds,
+    weight,
 )
-from eslr_jax.evaluation.hard_cases.simulators import Run
-from eslr_jax.physics.materials import COTTON
 
-_GRAVITY = 9.81  # [m/s^2]
 _SIDE = 21  # vertices along the side of the small square cloth
 _SIZE = 0.5  # [m], its side
 
@@ -42,22 +33,24 @@ _SIZE = 0.5  # [m], its side
 # --- free fall -------------------------------------------------------------------------------------------
 
 
-def _build_free_fall(options: dict[str, Any]) -> Scenes:
+def _build_free_fall(options: Mapping[str, Any]) -> Scenes:
     garment = make_cloth(sheet(_SIDE, _SIDE, (_SIZE, _SIZE)), options)
     tilt = np.radians(30)
     turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
-    return {"fall": make_scene(garment, np.asarray(garment.rest_positions) @ turn.T, 31)}
+    return {"fall": CaseScene(make_scene(garment, np.asarray(garment.rest_positions) @ turn.T, 31))}
 
 
 def _measure_free_fall(runs: Runs) -> list[Measure]:
     run = runs["fall"]
     steps = np.arange(len(run.positions))
-    drop = _GRAVITY * FRAME**2 * steps * (steps + 1) / 2  # backward Euler's own parabola
+    drop = (
+        float(run.scene.constants.gravity) * FRAME**2 * steps * (steps + 1) / 2
+    )  # backward Euler's own parabola
     rest = run.positions + drop[:, None, None] * np.array([0.0, 1.0, 0.0])
     moved = np.linalg.norm(rest - rest[0], axis=-1)
     fallen = center(run)[0, 1] - center(run)[-1, 1]
     return [
-        Measure("displacement beyond free fall, largest [mm]", 1e3 * float(moved.max()), 20.0),
+        Measure("displacement beyond free fall, largest [mm]", MM * float(moved.max()), 20.0),
         Measure("fall of the centre against backward Euler [%]", 100 * abs(fallen / drop[-1] - 1), 1.0),
     ]
 
@@ -74,59 +67,48 @@ FREE_FALL = HardCase(
 # --- hung by two corners ---------------------------------------------------------------------------------
 
 
-def _hung_cloth(options: dict[str, Any]) -> tuple[Any, np.ndarray]:
+def _hung_cloth(options: Mapping[str, Any]) -> tuple[Garment, np.ndarray]:
     """Return a square cloth pinned at its upper corners, and its rest positions."""
     mesh = hanging_sheet(_SIDE, _SIDE, (_SIZE, _SIZE))
     is_pinned = corners_of(mesh[0], (-1, 1), (1, 1), axes=(0, 1))
     return make_cloth(mesh, options, is_pinned=is_pinned), mesh[0]
 
 
-def _build_hang(options: dict[str, Any]) -> Scenes:
+def _build_hang(options: Mapping[str, Any]) -> Scenes:
     garment, rest = _hung_cloth(options)
     frames = 151
     closing = np.clip(np.arange(frames) * FRAME / 0.5, 0, 1)  # in half a second, to 80 % of the width
     pins = np.broadcast_to(rest, (frames, *rest.shape)).copy()
     pins[..., 0] *= (1 - 0.2 * closing)[:, None]
-    return {"hang": make_scene(garment, rest, frames, pin_targets=pins)}
+    return {"hang": CaseScene(make_scene(garment, rest, frames, pin_targets=pins))}
 
 
 def _sag(position: np.ndarray) -> float:
     """Return how far the middle of the upper edge hangs below its ends [m]."""
-    upper = position.reshape(_SIDE, _SIDE, 3)[:, -1]
+    upper = position[: _SIDE**2].reshape(_SIDE, _SIDE, 3)[:, -1]
     return float(upper[0, 1] - upper[_SIDE // 2, 1])
 
 
 def _measure_hang(runs: Runs) -> list[Measure]:
     run = runs["hang"]
-    assert run.stress is not None
-    energy = mechanical_energy(run)
-    rest = settle(run.stress, run.positions[-1])
-    still = _with_positions(run, np.stack([rest, rest]))
-    lowest = mechanical_energy(still)[0]
+    energy, last = mechanical_energy(run), run.trajectory.positions[-1]
+    rest = settle(run.scene, last, run.scene.pin_targets[-1])
+    lowest = energy_at_rest(run.scene, rest)
     moving = np.sqrt(np.mean(speeds(run) ** 2, axis=1))
     after = np.flatnonzero(moving > 0.05)
     first_still = max(int(after[-1]) + 1 if len(after) else 0, 16)  # the pins stand from frame 15 on
     calm = energy[first_still:]
+    rise = largest_rise(calm) if len(calm) else np.inf
     drop = float(energy.max() - lowest)
+    sag = 100 * abs(_sag(np.asarray(last)) / _sag(np.asarray(rest)) - 1)
     return [
-        Measure("sag against the equilibrium [%]", 100 * abs(_sag(run.positions[-1]) / _sag(rest) - 1), 2.0),
-        Measure("speed after 5 s, rms [m/s]", rms_speed(run, len(run.positions) - 4), 0.05),
+        Measure("sag against the equilibrium [%]", sag, 2.0),
+        Measure("speed after 5 s, rms [m/s]", rms(speeds(run)[-3:]), 0.05),
         Measure(
             "energy above the equilibrium, of the drop [%]", 100 * float(energy[-1] - lowest) / drop, 2.0
         ),
-        Measure(
-            "rise of energy once still, of the drop [%]",
-            100 * (largest_rise(calm) if len(calm) else np.inf) / drop,
-            1.0,
-        ),
+        Measure("rise of energy once still, of the drop [%]", 100 * rise / drop, 1.0),
     ]
-
-
-def _with_positions(run: Run, positions: np.ndarray) -> Run:
-    """Return a run that stands still at other positions."""
-    assert run.trajectory is not None
-    x = jnp.asarray(positions, jnp.float32)
-    return Run(run.stress, dataclasses.replace(run.trajectory, positions=x, velocities=jnp.zeros_like(x)))
 
 
 HANG = HardCase(
@@ -141,7 +123,7 @@ HANG = HardCase(
 # --- bad starts ------------------------------------------------------------------------------------------
 
 
-def _build_bad_start(options: dict[str, Any]) -> Scenes:
+def _build_bad_start(options: Mapping[str, Any]) -> Scenes:
     garment, rest = _hung_cloth(options)
     random = np.random.default_rng(0)
     edge = _SIZE / (_SIDE - 1)
@@ -157,7 +139,9 @@ def _build_bad_start(options: dict[str, Any]) -> Scenes:
         flipped[faces[face][0]] = 2 * foot - tip  # the mirror image across the other edge
     starts = {"scrambled": scrambled, "flattened": flattened, "flipped": flipped}
     return {
-        label: make_scene(garment, np.where(pinned[:, None], rest, start), 61, pin_targets=rest[None])
+        label: CaseScene(
+            make_scene(garment, np.where(pinned[:, None], rest, start), 61, pin_targets=rest[None])
+        )
         for label, start in starts.items()
     }
 
@@ -165,11 +149,9 @@ def _build_bad_start(options: dict[str, Any]) -> Scenes:
 def _measure_bad_start(runs: Runs) -> list[Measure]:
     measures = []
     for label, run in runs.items():
-        assert run.stress is not None
         energy = mechanical_energy(run)
-        rest = np.asarray(run.stress.scene.garment.rest_positions)
-        settled = settle(run.stress, rest)
-        lowest = mechanical_energy(_with_positions(run, np.stack([settled, settled])))[0]
+        settled = settle(run.scene, run.scene.garment.rest_positions, run.scene.pin_targets[-1])
+        lowest = energy_at_rest(run.scene, settled)
         # Heights count from the pins, so the settled energy is that of the whole sag.
         above, drop = energy[-1] - lowest, energy[0] - lowest
         measures += [
@@ -182,8 +164,7 @@ def _measure_bad_start(runs: Runs) -> list[Measure]:
 
 def _flipped_share(run: Run) -> float:
     """Return the share of faces that look against the mean of their neighbours."""
-    corners = run.positions[-1][run.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_cross_products(run.positions[-1], run.faces)
     around = np.zeros((run.positions.shape[1], 3))
     for k in range(3):
         np.add.at(around, run.faces[:, k], normal)
@@ -202,7 +183,7 @@ BAD_START = HardCase(
 # --- pulled and let go -----------------------------------------------------------------------------------
 
 
-def _build_pull(options: dict[str, Any]) -> Scenes:
+def _build_pull(options: Mapping[str, Any]) -> Scenes:
     mesh = sheet(_SIDE, _SIDE, (_SIZE, _SIZE))
     is_pinned = corners_of(mesh[0], (-1, -1), (-1, 1), (1, -1), (1, 1), axes=(0, 2))
     held = make_cloth(mesh, options, is_pinned=is_pinned)
@@ -210,8 +191,9 @@ def _build_pull(options: dict[str, Any]) -> Scenes:
     scenes: Scenes = {}
     for percent in (150, 200):
         stretched = mesh[0] * np.array([percent / 100, 1.0, percent / 100])
-        pulled = settle(make_scene(held, stretched, 2), stretched, stretched)
-        scenes[f"{percent} %"] = make_scene(free, pulled, 31)
+        corners = jnp.asarray(stretched, jnp.float32)
+        pulled = settle(make_scene(held, stretched, 2), corners, corners)
+        scenes[f"{percent} %"] = CaseScene(make_scene(free, np.asarray(pulled), 31))
     return scenes
 
 
@@ -220,19 +202,12 @@ def _measure_pull(runs: Runs) -> list[Measure]:
     for label, run in runs.items():
         energy = mechanical_energy(run)
         gain = energy.max() - energy[0]
-        elastic = energy[0] - float(np.sum(center(run)[0] * [0, 1, 0])) * _weight(run)
+        stored = energy[0] - center(run)[0, 1] * weight(run.scene)
         measures += [
             Measure(f"{label}: stretch after 1 s", largest_stretch(run, 30), 1.1),
-            Measure(f"{label}: energy gained, of the stored [%]", 100 * gain / elastic, 0.1),
+            Measure(f"{label}: energy gained, of the stored [%]", 100 * gain / stored, 0.1),
         ]
     return measures
-
-
-def _weight(run: Run) -> float:
-    """Return the cloth's weight [N]."""
-    assert run.stress is not None
-    areas = np.asarray(run.stress.scene.garment.vertex_areas)
-    return float(_GRAVITY * COTTON.density * areas.sum())
 
 
 PULL = HardCase(
@@ -247,37 +222,26 @@ PULL = HardCase(
 # --- twisted ---------------------------------------------------------------------------------------------
 
 
-def _build_twist(options: dict[str, Any]) -> Scenes:
+def _build_twist(options: Mapping[str, Any]) -> Scenes:
     width, length, rows, columns = 0.25, 1.0, 41, 11
     mesh = sheet(rows, columns, (length, width))
     x = mesh[0][:, 0]
-    is_end = np.abs(x) > 0.5 * length - 1e-6
-    garment = make_cloth(mesh, options, is_pinned=is_end)
+    garment = make_cloth(mesh, options, is_pinned=np.abs(x) > 0.5 * length - 1e-6)
     frames = 301
-    angle = np.pi / 3 * FRAME * np.arange(frames)[:, None] * (x > 0)
-    y, z = mesh[0][:, 1], mesh[0][:, 2]
-    pins = np.stack(
-        [
-            np.broadcast_to(x, angle.shape),
-            y * np.cos(angle) - z * np.sin(angle),
-            y * np.sin(angle) + z * np.cos(angle),
-        ],
-        axis=-1,
-    )
-    return {"twist": make_scene(garment, mesh[0], frames, pin_targets=pins, self_contact=True)}
+    pins = turn_about_x(mesh[0], np.pi / 3 * FRAME * np.arange(frames)[:, None] * (x > 0))
+    return {"twist": CaseScene(make_scene(garment, mesh[0], frames, pin_targets=pins, self_contact=True))}
 
 
 def _measure_twist(runs: Runs) -> list[Measure]:
     run = runs["twist"]
     size = np.ptp(run.positions, axis=1).max()
     frames = [len(run.positions) * k // 4 - 1 for k in range(1, 5)]
-    counts = [verdict.cloth_cloth for verdict in judge_frames(run, frames)]
     return [
         Measure("speed of a vertex, largest [m/s]", float(speeds(run)[1:].max()), 1.5),
         Measure("side of the bounding box, largest [m]", float(size), 2.0),
         *(
             Measure(f"intersecting pairs after {(frame + 1) * FRAME:.1f} s", count, None)
-            for frame, count in zip(frames, counts, strict=True)
+            for frame, count in zip(frames, count_crossings(run, frames), strict=True)
         ),
     ]
 
@@ -288,68 +252,4 @@ TWIST = HardCase(
     build=_build_twist,
     measure=_measure_twist,
     picture="twist",
-)
-
-
-# --- bad meshes ------------------------------------------------------------------------------------------
-
-
-def _bad_meshes() -> dict[str, tuple[Mesh, dict[str, Any]]]:
-    """Return meshes that break simulators, each with further options of `prepare_garment`."""
-    good = hanging_sheet(_SIDE, _SIDE, (_SIZE, _SIZE))
-    slivers = hanging_sheet(_SIDE, 11, (1e-3 * (_SIDE - 1), _SIZE))  # 1 mm by 50 mm
-    graded = good[0].copy()  # spacing grows tenfold across the cloth
-    share = np.linspace(0, 1, _SIDE)
-    spacing = 10 ** share[:-1]
-    graded[:, 0] = np.repeat(np.concatenate([[0], np.cumsum(spacing)]) / spacing.sum() - 0.5, _SIDE) * _SIZE
-    doubled = np.concatenate([good[0], good[0][:1]]), np.concatenate([good[1], [[len(good[0]), 1, _SIDE]]])
-    fin = np.concatenate([good[0], good[0][[_SIDE * 5 + 5]] + np.array([0, 0, 0.02])])
-    edge = good[1][np.any(good[1] == _SIDE * 5 + 5, axis=1)][0][:2]
-    unused = np.concatenate([good[0], good[0][:1] + np.array([0, 0, 0.1])])
-    return {
-        "slivers of aspect 50": (slivers, {}),
-        "spacing 1:10": ((graded, good[1]), {}),
-        "two components": (join_meshes(good, (good[0] + np.array([0, 0, 0.1]), good[1])), {}),
-        "two components, allowed": (
-            join_meshes(good, (good[0] + np.array([0, 0, 0.1]), good[1])),
-            {"allow_components": True},
-        ),
-        "duplicate vertices": (doubled, {}),
-        "non-manifold edge": ((fin, np.concatenate([good[1], [[*edge, len(good[0])]]])), {}),
-        "unreferenced vertex": ((unused, good[1]), {}),
-        "12 vertices": (hanging_sheet(3, 4, (0.3, 0.4)), {}),
-        "50k vertices": (hanging_sheet(224, 224, (1.0, 1.0)), {}),
-    }
-
-
-def _build_bad_mesh(options: dict[str, Any]) -> Scenes:
-    scenes: Scenes = {}
-    for label, (mesh, more) in _bad_meshes().items():
-        upper = mesh[0][:, 1] > mesh[0][:, 1].max() - 1e-6
-        try:
-            garment = make_cloth(mesh, options, is_pinned=upper, **more)
-        except MeshError as error:
-            scenes[label] = error
-            continue
-        scenes[label] = make_scene(garment, mesh[0], 4 if len(mesh[0]) > 20_000 else 31)
-    return scenes
-
-
-def _measure_bad_mesh(runs: Runs) -> list[Measure]:
-    measures = []
-    for label, run in runs.items():
-        if run.refusal is not None:
-            measures.append(Measure(f"{label}: refused, {run.refusal}"[:100], 0, 0))
-            continue
-        measures.append(Measure(f"{label}: accepted, stretch", largest_stretch(run), 1.25))
-    return measures
-
-
-BAD_MESH = HardCase(
-    name="bad_mesh",
-    reason="users' meshes: each is simulated within bars, or refused with a named error",
-    build=_build_bad_mesh,
-    measure=_measure_bad_mesh,
-    picture="slivers of aspect 50",
-    may_refuse=True,
 )

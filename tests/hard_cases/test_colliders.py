@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from eslr_jax.evaluation.colliders import Capsule, Plane, RoundedCone, Sphere, triangle_distances
+from hard_cases.colliders import Capsule, Plane, RoundedCone, Sphere, triangle_distances
 
 DOWN = np.array([0.0, -1.0, 0.0])
 COLLIDERS = {

@@ -1,6 +1,6 @@
-"""Analytic colliders: signed distances in closed form, in float64, to judge penetration by.
+"""Solids whose signed distance is known in closed form, in float64; penetration is measured against them.
 
-All of them are convex solids, so their signed distance (positive outside) is a convex function of the point.
+All are convex, so the signed distance (positive outside) is a convex function of the point.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class Collider(Protocol):
     """A solid with a known signed distance."""
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m], positive outside."""
+        """Return signed distances [m] of points [m], positive outside."""
         ...
 
 
@@ -31,7 +31,7 @@ class Sphere:
     radius: float  # [m]
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m], positive outside: |x - c| - r."""
+        """Return signed distances [m]: |x - c| - r."""
         return np.linalg.norm(_float64(points) - self.center, axis=-1) - self.radius
 
 
@@ -44,10 +44,10 @@ class Capsule:
     radius: float  # [m]
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m], positive outside: the distance to the segment minus the radius."""
+        """Return signed distances [m]: the distance to the segment minus the radius."""
         axis = _float64(self.end) - self.start
         offset = _float64(points) - self.start
-        share = np.clip(offset @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
+        share = np.clip(offset @ axis / float(axis @ axis), 0.0, 1.0)
         return np.linalg.norm(offset - share[..., None] * axis, axis=-1) - self.radius
 
 
@@ -59,7 +59,7 @@ class Plane:
     normal: np.ndarray  # outward unit normal, shape [3]
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m], positive outside: n . (x - p)."""
+        """Return signed distances [m]: n . (x - p)."""
         return (_float64(points) - self.point) @ _float64(self.normal)
 
 
@@ -73,10 +73,10 @@ class RoundedCone:
     radius: float  # of the tip [m]
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m], positive outside.
+        """Return signed distances [m].
 
-        With s along the axis and r across it the flank is r cos(a) - s sin(a) away, and the apex is nearest
-        where r sin(a) + s cos(a) < 0.
+        With s along the axis and r across it, the flank is r cos(a) - s sin(a) away. The apex is nearest where
+        r sin(a) + s cos(a) < 0.
         """
         offset = _float64(points) - self.apex
         along = offset @ _float64(self.axis)
@@ -92,12 +92,12 @@ def triangle_distances(
 ) -> Float[np.ndarray, " faces"]:
     """Return the least signed distance over every triangle [m], to about 1e-4 of its size.
 
-    A sample of the triangle leads to a smaller triangle around the best point, and so on; the distance to a
-    convex solid has no other local minimum in which this could end.
+    Every round samples a smaller triangle around the best point so far. That can't end in the wrong place,
+    because the distance to a convex solid has one minimum.
 
     Args:
         collider: A convex solid.
-        corners: Corner positions [m].
+        corners: Corner positions [m], shape [faces, 3, 3].
     """
     corners = _float64(corners)
     weights = _barycentric_grid(_GRID)  # [samples, 3]
@@ -123,5 +123,4 @@ def _barycentric_grid(count: int) -> np.ndarray:
 
 
 def _float64(values: np.ndarray) -> np.ndarray:
-    """Return values as float64."""
     return np.asarray(values, np.float64)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from eslr_jax.evaluation.colliders import Capsule, Collider, Plane, Sphere
-from eslr_jax.evaluation.hard_cases.build import (
+from hard_cases.build import (
     FRAME,
     Mesh,
     capsule,
@@ -18,32 +18,27 @@ from eslr_jax.evaluation.hard_cases.build import (
     plane,
     sheet,
     tube,
+    turn_about_x,
 )
-from eslr_jax.evaluation.hard_cases.case import HardCase, Runs, Scenes
-from eslr_jax.evaluation.hard_cases.measures import Measure, judge_frames, largest_stretch, quantile_depth
-from eslr_jax.evaluation.hard_cases.simulators import StressScene
+from hard_cases.case import CaseScene, Colliders, HardCase, Measure, Runs, Scenes
+from hard_cases.colliders import Capsule, Plane, Sphere
+from hard_cases.measures import count_crossings, depths, largest_stretch, quantile_depth
 
 _FRAMES = 61
 
 
-def _two_sheets(options: dict[str, Any]) -> StressScene:
+def _two_sheets(options: Mapping[str, Any]) -> CaseScene:
     """Two sheets, one over the other, fall on a ball."""
     lower = sheet(25, 25, (0.6, 0.6))
     upper = lower[0] + np.array([0.003, 0.01, 0.004]), lower[1]
     mesh = join_meshes(lower, upper)
     garment = make_cloth(mesh, options, allow_components=True)
-    ball = icosphere(4, 0.15)
-    return make_scene(
-        garment,
-        mesh[0] + np.array([0.0, 0.17, 0.0]),
-        _FRAMES,
-        body=ball,
-        colliders=lambda frame: (Sphere(np.zeros(3), 0.15),),
-        self_contact=True,
-    )
+    start = mesh[0] + np.array([0.0, 0.17, 0.0])
+    scene = make_scene(garment, start, _FRAMES, body=icosphere(4, 0.15), self_contact=True)
+    return CaseScene(scene, lambda frame: (Sphere(np.zeros(3), 0.15),))
 
 
-def _folded(options: dict[str, Any]) -> StressScene:
+def _folded(options: Mapping[str, Any]) -> CaseScene:
     """A sheet folded over itself with a round crease lies down on the ground."""
     length, width, gap = 0.5, 0.25, 0.024
     mesh = sheet(43, 22, (length, width))
@@ -55,14 +50,8 @@ def _folded(options: dict[str, Any]) -> StressScene:
     x = np.minimum(s, straight) + radius * np.sin(turn) - np.maximum(s - straight - np.pi * radius, 0)
     y = radius * (1 - np.cos(turn))
     start = np.stack([x - straight / 2, y + 0.02, mesh[0][:, 2]], axis=1)
-    return make_scene(
-        garment,
-        start,
-        _FRAMES,
-        body=plane(1.2, 25, 0.0),
-        colliders=lambda frame: (Plane(np.zeros(3), np.array([0.0, 1.0, 0.0])),),
-        self_contact=True,
-    )
+    scene = make_scene(garment, start, _FRAMES, body=plane(1.2, 25, 0.0), self_contact=True)
+    return CaseScene(scene, lambda frame: (Plane(np.zeros(3), np.array([0.0, 1.0, 0.0])),))
 
 
 _HIP = 0.09  # [m] from the middle to each leg's axis
@@ -70,38 +59,24 @@ _LEG_RADIUS = 0.07  # [m]
 _LEG_LENGTH = 0.55  # [m]
 
 
-def _legs(frames: int) -> tuple[Mesh, np.ndarray, Any]:
-    """Return two legs that swing against each other about the hip, as a mesh, its track and colliders."""
-    along_x = capsule(_LEG_RADIUS, _LEG_LENGTH, around=24, rings=16)
-    leg = along_x[0][:, [1, 0, 2]] * [1, 1, -1] - np.array([0, _LEG_LENGTH / 2, 0]), along_x[1]
-    time = np.arange(frames) * FRAME
+def _legs(frames: int) -> tuple[Mesh, np.ndarray, Colliders]:
+    """Return two legs that swing against each other about the hip: mesh, track and colliders."""
+    along_x, faces = capsule(_LEG_RADIUS, _LEG_LENGTH, around=24, rings=16)
+    leg = along_x[:, [1, 0, 2]] * [1, 1, -1] - np.array([0, _LEG_LENGTH / 2, 0])
+    time = np.arange(frames)[:, None] * FRAME
     swing = np.radians(20.0) * np.sin(2 * np.pi * 0.75 * np.maximum(time - 0.3, 0.0))
-    tracks, axes = [], []
-    for sign in (-1, 1):
-        cosine, sine = np.cos(sign * swing), np.sin(sign * swing)
-        x, y, z = leg[0].T
-        hip = np.array([sign * _HIP, 0.0, 0.0])
-        tracks.append(
-            hip
-            + np.stack(
-                [
-                    np.broadcast_to(x, (frames, len(x))),
-                    y * cosine[:, None] - z * sine[:, None],
-                    y * sine[:, None] + z * cosine[:, None],
-                ],
-                axis=-1,
-            )
-        )
-        foot = hip + np.stack([0 * cosine, -_LEG_LENGTH * cosine, -_LEG_LENGTH * sine], axis=-1)
-        axes.append((hip, foot))
+    hips = {sign: np.array([sign * _HIP, 0.0, 0.0]) for sign in (-1, 1)}
+    foot = np.array([[0.0, -_LEG_LENGTH, 0.0]])
+    track = [hip + turn_about_x(leg, sign * swing) for sign, hip in hips.items()]
+    feet = {sign: (hip + turn_about_x(foot, sign * swing))[:, 0] for sign, hip in hips.items()}
 
-    def colliders(frame: int) -> tuple[Collider, ...]:
-        return tuple(Capsule(hip, foot[frame], _LEG_RADIUS) for hip, foot in axes)
+    def colliders(frame: int) -> list[Capsule]:
+        return [Capsule(hip, feet[sign][frame], _LEG_RADIUS) for sign, hip in hips.items()]
 
-    return join_meshes(leg, leg), np.concatenate(tracks, axis=1), colliders
+    return join_meshes((leg, faces), (leg, faces)), np.concatenate(track, axis=1), colliders
 
 
-def _skirt_over_trousers(options: dict[str, Any]) -> StressScene:
+def _skirt_over_trousers(options: Mapping[str, Any]) -> CaseScene:
     """A skirt over two trouser legs, all held at the waist, over legs that walk."""
     leg = tube(20, 16, (_LEG_RADIUS + 0.012, _LEG_RADIUS + 0.016), 0.45)
     left, right = ((leg[0] + np.array([sign * _HIP, 0.0, 0.0]), leg[1]) for sign in (-1, 1))
@@ -112,18 +87,11 @@ def _skirt_over_trousers(options: dict[str, Any]) -> StressScene:
     is_waist = mesh[0][:, 1] > -1e-9
     garment = make_cloth(mesh, options, is_pinned=is_waist, allow_components=True)
     body, track, colliders = _legs(_FRAMES)
-    return make_scene(
-        garment,
-        mesh[0],
-        _FRAMES,
-        body=body,
-        body_positions=track,
-        colliders=colliders,
-        self_contact=True,
-    )
+    scene = make_scene(garment, mesh[0], _FRAMES, body=body, body_positions=track, self_contact=True)
+    return CaseScene(scene, colliders)
 
 
-def _build_layers(options: dict[str, Any]) -> Scenes:
+def _build_layers(options: Mapping[str, Any]) -> Scenes:
     return {
         "two sheets": _two_sheets(options),
         "folded": _folded(options),
@@ -135,11 +103,11 @@ def _measure_layers(runs: Runs) -> list[Measure]:
     measures = []
     for label, run in runs.items():
         last = len(run.positions) - 1
-        counts = [verdict.cloth_cloth for verdict in judge_frames(run, [0, last // 3, 2 * last // 3, last])]
+        counts = count_crossings(run, [0, last // 3, 2 * last // 3, last])
         measures += [
             Measure(f"{label}: intersecting pairs after 2 s, beyond frame 0", counts[-1] - counts[0], 0),
             Measure(f"{label}: intersecting pairs on the way, largest", max(counts), None),
-            Measure(f"{label}: depth in the body, 99.9 % [mm]", quantile_depth(run), None),
+            Measure(f"{label}: depth in the body, 99.9 % [mm]", quantile_depth(depths(run)), None),
             Measure(f"{label}: stretch, largest", largest_stretch(run), None),
         ]
     return measures
