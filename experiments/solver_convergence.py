@@ -94,7 +94,7 @@ def make_scene(name: str) -> Scene:
     """Return a scene by name: garment or ball, and its resolution."""
     what, size = name.split("_")
     if what == "ball":
-        from hard_cases.ball import drop_scene
+        from hard_cases import drop_scene
 
         return drop_scene({}, columns={"1k": 33, "4k": 65}[size], seconds=(LAST_FRAME + 1) / 30).scene
     poses = pose_body(load_body(), load_motion(CLIP), num_frames=LAST_FRAME + 2)
