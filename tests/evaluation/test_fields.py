@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
 from eslr_jax.simulate.step import FrameInput, frame_problem, solve
 from example_runs import write_run
 
@@ -13,7 +14,6 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.fields import _prepared, _scene, energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
 from eslr_jax.io.run import read_run
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms

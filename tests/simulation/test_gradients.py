@@ -104,9 +104,7 @@ def check_every_parameter(scene, tolerance):
     zeros = jax.tree.map(jnp.zeros_like, along)
     gradient = jax.jit(jax.grad(loss))(zeros)
     for name, direction in along.items():
-        ends = [
-            float(loss({**zeros, name: sign * STEP * direction})) for sign in (1.0, -1.0)
-        ]
+        ends = [float(loss({**zeros, name: sign * STEP * direction})) for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1]) / (2 * STEP)
         found = float(jnp.sum(gradient[name] * direction))
         assert found == pytest.approx(expected, rel=tolerance, abs=_NOISE), name
@@ -168,7 +166,9 @@ def test_a_refined_prediction_has_right_gradients(output):
     @jax.jit
     def loss(factor):
         material = scene.material.replace(lame_mu=scene.material.lame_mu * factor)
-        return jnp.sum(weights * rollout_scene(params, scene.replace(material=material), config).positions[-1])
+        return jnp.sum(
+            weights * rollout_scene(params, scene.replace(material=material), config).positions[-1]
+        )
 
     expected = (loss(1.0 + STEP) - loss(1.0 - STEP)) / (2 * STEP)
     assert float(jax.jit(jax.grad(loss))(1.0)) == pytest.approx(float(expected), rel=1e-3)
