@@ -48,6 +48,33 @@ def hanging_sheet(rows: int, columns: int, size: tuple[float, float]) -> Mesh:
     return upright, faces[:, ::-1].copy()
 
 
+def tube(around: int, along: int, radii: tuple[float, float], length: float) -> Mesh:
+    """Return an open tube around y, from height zero down, facing out.
+
+    Args:
+        around: Vertices around.
+        along: Vertices along.
+        radii: Radius at the top and at the bottom [m].
+        length: Length [m].
+    """
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    share = np.linspace(0, 1, along)
+    radius = radii[0] + (radii[1] - radii[0]) * share
+    positions = np.stack(
+        [
+            np.cos(angle)[:, None] * radius,
+            np.broadcast_to(-share * length, (around, along)),
+            np.sin(angle)[:, None] * radius,
+        ],
+        axis=-1,
+    )
+    index = np.arange(around * along).reshape(around, along)
+    following = np.roll(index, -1, axis=0)
+    a, b, c, d = (part.ravel() for part in (index[:, :-1], following[:, :-1], following[:, 1:], index[:, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return positions.reshape(-1, 3), faces
+
+
 def icosphere(subdivisions: int, radius: float) -> Mesh:
     """Return a ball's surface around the origin, facing out [m]."""
     golden = (1 + np.sqrt(5)) / 2
@@ -68,53 +95,45 @@ def icosphere(subdivisions: int, radius: float) -> Mesh:
     return positions / np.linalg.norm(positions, axis=1, keepdims=True) * radius, faces
 
 
-def _rings(profile: Float[np.ndarray, "rings 2"], around: int) -> Mesh:
-    """Return the open surface swept by a profile of (radius, height) around y, from top to bottom, facing out."""
-    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    radius, height = profile.T
-    x, z = np.outer(np.cos(angle), radius), np.outer(np.sin(angle), radius)
-    positions = np.stack([x, np.broadcast_to(height, x.shape), z], axis=-1)
-    index = np.arange(x.size).reshape(x.shape)
-    following = np.roll(index, -1, axis=0)
-    a, b, c, d = (part.ravel() for part in (index[:, :-1], following[:, :-1], following[:, 1:], index[:, 1:]))
-    return positions.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-
-
-def tube(around: int, along: int, radii: tuple[float, float], length: float) -> Mesh:
-    """Return an open tube around y, from height zero down, facing out.
-
-    Args:
-        around: Vertices around.
-        along: Vertices along.
-        radii: Radius at the top and at the bottom [m].
-        length: Length [m].
-    """
-    return _rings(np.stack([np.linspace(*radii, along), np.linspace(0, -length, along)], axis=1), around)
-
-
 def revolve(profile: Float[np.ndarray, "rings 2"], around: int) -> Mesh:
-    """Return the closed surface swept by a profile of (radius, height) [m] around y, from top to bottom.
+    """Return the closed surface swept by a profile of (radius, height) [m] around y, from bottom to top.
 
-    The first and the last point lie on the axis.
+    The first and the last point lie on the axis. What comes of the case `pinch` depends on the vertices' order.
     """
-    positions, faces = _rings(profile[1:-1], around)
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    rings = profile[1:-1]
+    positions = np.stack(
+        [
+            rings[:, :1] * np.cos(angle),
+            np.broadcast_to(rings[:, 1:], (len(rings), around)),
+            -rings[:, :1] * np.sin(angle),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
     poles = np.array([[0, profile[0, 1], 0], [0, profile[-1, 1], 0]])
-    top, bottom = np.full(around, len(positions)), np.full(around, len(positions) + 1)
-    first = np.arange(around) * (len(profile) - 2)
-    last = first + len(profile) - 3
-    caps = [(top, np.roll(first, -1), first), (last, np.roll(last, -1), bottom)]
-    faces = np.concatenate([faces, *(np.stack(cap, axis=1) for cap in caps)])
-    return np.concatenate([positions, poles]), faces
+    index = np.arange(len(rings) * around).reshape(len(rings), around)
+    following = np.roll(index, -1, axis=1)
+    a, b = index[:-1].ravel(), following[:-1].ravel()
+    c, d = following[1:].ravel(), index[1:].ravel()
+    bottom, top = len(positions), len(positions) + 1
+    faces = [
+        np.stack([a, b, c], 1),
+        np.stack([a, c, d], 1),
+        np.stack([np.full(around, bottom), following[0], index[0]], 1),
+        np.stack([np.full(around, top), index[-1], following[-1]], 1),
+    ]
+    return np.concatenate([positions, poles]), np.concatenate(faces)
 
 
 def capsule(radius: float, length: float, *, around: int = 32, rings: int = 24) -> Mesh:
     """Return a capsule along x around the origin; `length` is that of its axis [m]."""
-    cap = np.linspace(np.pi / 2, 0, max(around // 4, 3))
-    upper = np.stack([radius * np.cos(cap), radius * np.sin(cap) + length / 2], axis=1)
-    lower = upper[::-1] * [1, -1]
-    heights = np.linspace(length / 2, -length / 2, rings + 2)[1:-1]
-    straight = np.stack([np.full(rings, radius), heights], axis=1)
-    positions, faces = revolve(np.concatenate([upper, straight, lower]), around)
+    cap = np.linspace(-np.pi / 2, 0, max(around // 4, 3))
+    lower = np.stack([radius * np.cos(cap), radius * np.sin(cap) - length / 2], axis=1)
+    upper = lower[::-1] * [1, -1]
+    straight = np.stack(
+        [np.full(rings, radius), np.linspace(-length / 2, length / 2, rings + 2)[1:-1]], axis=1
+    )
+    positions, faces = revolve(np.concatenate([lower, straight, upper]), around)
     return positions[:, [1, 2, 0]], faces
 
 

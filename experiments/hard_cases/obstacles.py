@@ -32,7 +32,7 @@ def _needle() -> tuple[Mesh, RoundedCone]:
     profile = np.concatenate([[[0.0, -height]], flank, tip])
     profile[-1, 0] = 0.0
     cone = RoundedCone(np.array([0.0, apex, 0.0]), np.array([0.0, -1.0, 0.0]), _HALF_ANGLE, _TIP)
-    return revolve(profile[::-1], 24), cone
+    return revolve(profile, 24), cone
 
 
 def _build_needle(options: Mapping[str, Any]) -> Scenes:
