@@ -62,7 +62,7 @@ def directions(scene, seed=0):
 
 
 def changed(scene, change):
-    """Return the scene with everything changed: factors on positive numbers, offsets of a millimetre on places."""
+    """Return the scene with everything changed: factors on positive numbers, offsets of millimetres on places."""
     material, constants = scene.material, scene.constants
     fabric = {
         field.name: getattr(material, field.name) * (1 + 0.1 * change[field.name])

@@ -34,7 +34,7 @@ def cloth():
 
 @pytest.fixture(scope="module")
 def poses():
-    return drifting_ball(5)
+    return drifting_ball(4)
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +55,16 @@ def learned(cloth, poses, params):
 def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
     assert int(solved.status) == Status.OK
     positions = np.asarray(solved.positions)
-    assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.05, "corners fall"
+    assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.03, "corners fall"
     middle = positions[-1].reshape(8, 8, 3)[3:5, 3:5].reshape(-1, 3)
     assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
 
 
 def test_jit_equals_the_plain_call(cloth, poses, params, solved, learned):
+    jitted = jax.jit(rollout, static_argnames="config")
     for weights, config, plain in ((None, SOLVER, solved), (params, NETWORK, learned)):
-        jitted = jax.jit(partial(rollout, config=config))(weights, cloth, poses)
-        np.testing.assert_allclose(jitted.positions, plain.positions, atol=1e-5)
-
-
-def test_config_is_a_static_argument_of_jit(cloth, poses, solved):
-    jitted = jax.jit(rollout, static_argnames="config")(None, cloth, poses, config=SOLVER)
-    np.testing.assert_allclose(jitted.positions, solved.positions, atol=1e-5)
+        found = jitted(weights, cloth, poses, config=config)
+        np.testing.assert_allclose(found.positions, plain.positions, atol=1e-5)
 
 
 def test_vmap_over_fabrics_equals_one_by_one(cloth, poses):
@@ -119,7 +115,7 @@ def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
     scene = prepare_scene(cloth, poses, options=options)
     assert scene.body is None
     trajectory = rollout_scene(None, scene, SOLVER)
-    frames = np.arange(5)
+    frames = np.arange(4)
     # Backward Euler: velocity after n steps is -g n dt, so the fall is g dt^2 n (n + 1) / 2.
     fall = 9.81 * TIMESTEP**2 * frames * (frames + 1) / 2
     height = np.asarray(trajectory.positions)[..., 1].mean(axis=1)
@@ -140,9 +136,9 @@ def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved
 
 
 def test_non_finite_positions_raise_with_the_frame(cloth, poses):
-    broken = poses.replace(positions=poses.positions.at[4].set(jnp.nan))
+    broken = poses.replace(positions=poses.positions.at[3].set(jnp.nan))
     trajectory = rollout(None, cloth, broken, config=SOLVER)
-    with pytest.raises(NonFiniteError, match="frame 4"):
+    with pytest.raises(NonFiniteError, match="frame 3"):
         raise_for_status(trajectory)
 
 
@@ -168,7 +164,7 @@ def test_other_values_compile_nothing_anew(cloth, poses):
     before = rollout_scene._cache_size()
     faster = scene.replace(
         initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
-        constants=scene.constants.replace(gravity=3.0),
+        constants=scene.constants.replace(gravity=jnp.float32(3.0)),
         material=FABRICS[1],
     )
     rollout_scene(None, faster, SOLVER)

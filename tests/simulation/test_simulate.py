@@ -60,6 +60,7 @@ def test_a_pace_sets_the_iterations_of_the_next_chunk(scene):
     np.testing.assert_array_equal(paced.iterations, [0] + [10] * 10 + [15] * 3)
 
 
+@pytest.mark.slow
 def test_tolerance_stops_early_and_is_kept(scene):
     loose = simulate(None, scene, config=SimConfig(iterations=300, tolerance=0.01)).trajectory
     assert int(loose.iterations[1:].max()) < 150
@@ -89,7 +90,7 @@ def crossing_sheets():
     lower, upper = square(), square()
     from eslr_jax.geometry.prepare import prepare_garment
 
-    rest = np.concatenate([lower.rest_positions, np.asarray(upper.rest_positions) + [0, 0.02, 0]])
+    rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
     faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])
     ones = np.ones((128, 1))
     garment = prepare_garment(
@@ -105,6 +106,7 @@ def crossing_sheets():
     )
 
 
+@pytest.mark.slow
 def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     scene = crossing_sheets()
     few = scene.replace(self_contact=PairCapacity(pairs=20, faces=scene.self_contact.faces))
@@ -120,6 +122,16 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     assert enlarge_buffers(scene, expected) is None
 
 
+def test_buffers_grow_to_what_the_fullest_frame_asked_for_and_a_quarter_more(scene, whole):
+    tight = scene.replace(self_contact=PairCapacity(pairs=20, faces=96))
+    demand = jnp.array([[0, 0]] * 5 + [[40, 12]] + [[10, 3]] * 8)
+    full = whole.replace(pair_demand=demand, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
+    assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=50, faces=96)
+    assert enlarge_buffers(tight, full.replace(status=jnp.int32(Status.OK))) is None
+    with pytest.raises(CapacityError, match="40 pairs and 12 faces or more"):
+        raise_for_status(full)
+
+
 def test_a_body_too_fast_to_follow_is_told(scene):
     body = scene.body
     jumped = body.replace(positions=body.positions.at[5:].add(jnp.array([0.0, 0.35, 0.0])))
@@ -131,6 +143,6 @@ def test_a_body_too_fast_to_follow_is_told(scene):
         simulate(None, fast, config=SOLVER)
 
 
-def test_a_longer_name_of_a_value_is_refused():
+def test_a_negative_number_of_iterations_is_refused():
     with pytest.raises(ValueError, match="iterations must not be negative"):
         dataclasses.replace(SOLVER, iterations=-1)
