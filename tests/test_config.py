@@ -17,7 +17,7 @@ from eslr_jax.training.recipe import load_recipe
 
 
 def test_round_trip_through_json():
-    config = SimConfig(model=ModelConfig(latent_size=64), corrector_steps=3)
+    config = SimConfig(model=ModelConfig(latent_size=64), iterations=3)
     assert from_dict(SimConfig, json.loads(to_json(config))) == config
 
 
@@ -63,9 +63,9 @@ def test_overrides_reach_into_tables():
 
 def test_recipe_takes_a_model_by_name(tmp_path):
     path = tmp_path / "recipe.toml"
-    path.write_text('model = "eslr-small"\niterations = 10\n')
+    path.write_text('model = "eslr-small"\nsteps = 10\n')
     config = load_recipe(path, {"model.refinement_steps": 2})
-    assert (config.iterations, config.model.refinement_steps, config.model.latent_size) == (10, 2, 32)
+    assert (config.steps, config.model.refinement_steps, config.model.latent_size) == (10, 2, 32)
     assert from_dict(TrainConfig, json.loads(json.dumps(to_dict(config)))) == config
 
 
@@ -73,9 +73,9 @@ def test_recipe_takes_a_model_by_name(tmp_path):
     ("text", "message"),
     [
         ('model = "eslr-tiny"', "unknown model"),
-        ("iterations = 10", "names no model"),
+        ("steps = 10", "names no model"),
         ("model = [", "not valid TOML"),
-        ('model = "eslr-small"\nitarations = 3', "did you mean iterations"),
+        ('model = "eslr-small"\nstebs = 3', "did you mean steps"),
         ('model = "eslr-small"\nhorizon = 0', "horizon must be at least 1"),
     ],
 )

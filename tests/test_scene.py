@@ -1,29 +1,97 @@
 """What a scene leaves out must be what it does not need."""
 
+import jax
 import numpy as np
 import pytest
-from eslr_jax.simulation.scan import simulate_scene
 
 from eslr_jax.assets import load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.geometry.closest import closest_points
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scene
+from eslr_jax.physics.potential import evaluate
+from eslr_jax.scene.build import build_scene, safe_plan
+from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene, prepare_scenes
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.rollout import rollout_scene
 
 
+def test_frame_zero_is_clear_of_the_body(small_scene):
+    body = small_scene.body
+    found = jax.jit(find_contacts)(
+        small_scene.initial_state.position, body.positions[0], body.positions[0], body.surface
+    )
+    assert float(found.distances.min()) > 0
+
+
+def test_what_is_not_asked_for_is_absent(small_garment, small_poses):
+    scene = prepare_scene(small_garment, small_poses)
+    assert scene.pin_targets is None
+    assert scene.self_contact is None
+    options = SceneOptions(has_body=False, start_at_rest=True, self_contact=True)
+    other = prepare_scene(small_garment, small_poses, options=options)
+    assert other.body is None
+    assert other.self_contact is not None
+    np.testing.assert_array_equal(other.initial_state.velocity, 0.0)
+    np.testing.assert_allclose(
+        scene.initial_state.velocity * scene.timestep,
+        # the limb is rigid: it carries the sleeve as it carries its nearest vertex, but for the turn
+        np.broadcast_to(
+            np.asarray(small_poses.positions[1] - small_poses.positions[0]).mean(axis=0), (60, 3)
+        ),
+        atol=0.01,
+    )
+
+
+def test_what_a_plan_leaves_out_changes_no_force(small_garment, small_poses, small_scene, small_trajectory):
+    """The safe plan searches every face of the body, and models pins although there are none."""
+    whole = build_scene(small_garment, small_poses, small_scene.material, safe_plan(small_poses))
+    assert whole.pin_targets is not None
+    near = prepare_scene(small_garment, small_poses, options=SceneOptions(reach=0.04))
+    assert whole.body.surface.faces.shape[0] > near.body.surface.faces.shape[0]
+    position = small_trajectory.positions[3] + 1e-3
+
+    @jax.jit
+    def forces(scene):
+        states, inputs = jax.tree.map(lambda leaf: leaf[2], trajectory_states(small_trajectory, scene))
+        return evaluate(position, frame_problem(scene, states, inputs)).gradient
+
+    expected = forces(whole)
+    np.testing.assert_allclose(forces(near), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_the_first_frames_of_a_scene_have_its_inputs(small_scene):
+    short = first_frames(small_scene, 3)
+    assert short.num_frames == 3
+    whole = jax.tree.map(lambda leaf: leaf[:2], frame_inputs(small_scene))
+    jax.tree.map(np.testing.assert_array_equal, frame_inputs(short), whole)
+    assert first_frames(small_scene, 99).num_frames == small_scene.num_frames
+
+
+def test_scenes_for_a_stack_have_equal_shapes(small_garment, small_poses):
+    from cloth import make_sleeve
+
+    pinned = make_sleeve(is_pinned=np.arange(60) >= 50)
+    material = prepare_scene(small_garment, small_poses).material
+    scenes = prepare_scenes([small_garment, pinned], [small_poses] * 2, [material] * 2)
+    shapes = [jax.tree.map(np.shape, scene) for scene in scenes]
+    assert shapes[0] == shapes[1]
+    assert all(scene.pin_targets is not None for scene in scenes), "what one of them needs, all model"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dress", "tshirt"])
 def test_cloth_touches_nothing_else_than_what_was_searched(body, name):
     """The hem of a dress swings farther from where it is skinned to than a T-shirt does."""
     poses = pose_body(body, load_motion("cmu_016_32"), num_frames=31)
     scene = prepare_scene(load_garment(name), poses)
-    config = SimConfig(simulator="physics", solver_iterations=40)
-    trajectory = simulate_scene(None, scene, PhysicsParameters(), config)
+    trajectory = jax.jit(rollout_scene, static_argnames="config")(None, scene, SimConfig(iterations=40))
     solid = np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
+    find = jax.jit(find_contacts)
     for frame in (10, 20, 30):
-        cloth, reached = trajectory.positions[frame], scene.body_positions[frame]
-        contacts = find_contacts(cloth, reached, reached, scene.surface)
+        cloth, reached = trajectory.positions[frame], scene.body.positions[frame]
+        contacts = find(cloth, reached, reached, scene.body.surface)
         corners = np.asarray(poses.positions[frame])
         face, weights = closest_points(np.asarray(cloth), corners, solid)
         nearest = np.einsum("vc,vcx->vx", weights, corners[solid[face]])

@@ -109,7 +109,7 @@ def find_tip_contacts(
     """
     count = body.shape[0]
     capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count), _TIP_CELL_CAPACITY)
-    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
+    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
     points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), is_cloth=False)
     return _find_pairs(points, _Cloth(position, predicted, garment), TIP_RADIUS, capacity)
 

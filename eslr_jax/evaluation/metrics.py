@@ -39,7 +39,7 @@ def measure_frames(trajectory: Trajectory, scene: Scene) -> FrameMeasures:
             contacts = find_contacts(moved_to, body, body, scene.body.surface)
             distances = jnp.where(garment.vertex_mask, contacts.distances, jnp.inf)
         moved = jnp.where(garment.vertex_mask[:, None], (moved_to - position) / scene.timestep, 0.0)
-        speed = jnp.sqrt(jnp.sum(moved * moved) / jnp.sum(garment.vertex_mask))
+        speed = jnp.sqrt(jnp.sum(moved * moved) / jnp.sum(garment.vertex_mask, dtype=moved.dtype))
         return FrameMeasures(stretch, distances, speed)
 
     body = None if scene.body is None else scene.body.positions[1:]

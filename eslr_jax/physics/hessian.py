@@ -5,6 +5,8 @@ Every function returns one small dense block per face, hinge or vertex; `newton`
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -120,13 +122,18 @@ def vertex_blocks(
     position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return the Hessian of inertia, collision and friction per vertex [N/m]; all positive semi-definite."""
-    masses, timestep = np.asarray(problem.masses, np.float64), float(problem.timestep)
-    blocks = (masses / timestep**2)[:, None, None] * np.eye(3)
+    blocks = (float64_masses(problem) / float(problem.timestep) ** 2)[:, None, None] * np.eye(3)
     if problem.body is None:
         return blocks
     for contacts in (problem.body.nearest, problem.body.opposing):
         blocks = blocks + _collision_blocks(position, contacts, problem)
     return blocks + _friction_blocks(position, problem)
+
+
+def float64_masses(problem: FrameProblem) -> Float[np.ndarray, " vertices"]:
+    """Return the vertices' masses [kg], of a problem in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.tree.map(jnp.asarray, problem).masses)
 
 
 def _collision_blocks(

@@ -65,11 +65,11 @@ def minimize_newton(
     problem = to_float64(problem)
     evaluate = _evaluator(problem)
     bands = _find_bands(problem)
-    weight = float(problem.constants.gravity) * np.linalg.norm(problem.masses)
+    weight = float(problem.constants.gravity) * np.linalg.norm(hessian.float64_masses(problem))
 
     if start is None:
         with jax.enable_x64(True):
-            start = np.asarray(pushed_out_guess(problem))
+            start = np.asarray(_guess(problem))
     x = np.array(start, np.float64)
     if problem.pin_targets is not None:
         x = np.where(np.asarray(problem.garment.is_pinned)[:, None], problem.pin_targets, x)
@@ -98,6 +98,7 @@ def to_float64(tree: Any) -> Any:
 
 
 _value_and_gradient = jax.jit(jax.value_and_grad(potential))
+_guess = jax.jit(pushed_out_guess)
 
 
 def _evaluator(problem: FrameProblem) -> Callable:

@@ -92,7 +92,7 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     is_free = garment.vertex_mask
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
-    degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1), 1)
+    degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
     share = jnp.where(is_free, stretch_diagonal(garment, problem.material) / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(

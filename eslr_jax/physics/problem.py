@@ -72,7 +72,7 @@ def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> 
         garment: Rest mesh; its mean vertex area gives the spacing.
         thickness: Distance that a smooth sheet would keep [m].
     """
-    mean_area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask)
+    mean_area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
     squared_edge = 2.0 / jnp.sqrt(3.0) * mean_area  # of equilateral triangles, two per vertex
     return thickness + squared_edge / (8.0 * _LIMB_RADIUS)
 

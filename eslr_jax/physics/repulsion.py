@@ -102,7 +102,7 @@ def push_apart(
         is_deep = (depth > 0).astype(position.dtype)
         # Moving corner k by w_k / |w|^2 moves the foot by one.
         scale = share * pairs.weights / jnp.sum(pairs.weights**2, axis=1, keepdims=True)
-        touched = is_deep[:, None] * (pairs.weights > 0)
+        touched = jnp.where(pairs.weights > 0, is_deep[:, None], 0.0)
         asked = _scatter(pairs, is_deep if next_body is None else None, touched, num_vertices)
         moves = []
         for axis in direction:

@@ -18,7 +18,7 @@ from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene.plan import shared_surface
-from eslr_jax.types import BodySurface, Garment
+from eslr_jax.types import Body, BodySurface, Garment
 
 _FPS = 30.0
 
@@ -68,18 +68,31 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         ConfigError: The split is unknown or empty, or no clip has two frames.
         AssetError: A garment does not exist.
     """
-    body = load_body()
     options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    padded = pad_alike(garments)
     if config.model.hierarchical:
-        padded = [add_coarse_edges(garment) for garment in padded]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
+        garments = [add_coarse_edges(garment) for garment in pad_alike(garments)]
+    return build_training_data(
+        garments, load_body(), [load_motion(clip) for clip in split_clips(config.split)]
+    )
+
+
+def build_training_data(garments: list[Garment], body: Body, motions: list[Motion]) -> TrainingData:
+    """Return what training samples from.
+
+    Args:
+        garments: Unpadded garments of like sizes.
+        body: The body that wears them.
+        motions: Its clips.
+
+    Raises:
+        ConfigError: The garments are not near the body.
+    """
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
     surface = shared_surface(garments, body)
     if surface is None:
         raise ConfigError("none of the garments is near the body; train on garments that are worn")
     surface_rest = jnp.asarray(body.rest_positions[surface.vertex_ids])
-    motions = [load_motion(clip) for clip in split_clips(config.split)]
     rotations, translations, frames_left = _join_clips(motions)
     return TrainingData(
         garments=stacked,
@@ -99,7 +112,9 @@ def _join_clips(motions: list[Motion]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     rotations, translations, frames_left = [], [], []
     for motion in motions:
         turned, moved = resample(motion.rotations, motion.translations, motion.fps, _FPS)
-        rotations.append(abduct_arms(turned, motion.joint_names))
+        if motion.arm_abduction:
+            turned = abduct_arms(turned, motion.joint_names, motion.arm_abduction)
+        rotations.append(turned)
         # Each clip starts above the origin: far from it float32 positions lose digits.
         translations.append(moved - moved[:1] * [1.0, 0.0, 1.0])
         frames_left.append(np.arange(len(turned))[::-1])

@@ -20,7 +20,7 @@ from eslr_jax.errors import CapacityError, CheckpointError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
-from eslr_jax.training.data import load_training_data
+from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -32,6 +32,7 @@ def train(
     *,
     resume: bool = False,
     initial_params: Any = None,
+    datasets: tuple[TrainingData, ...] | None = None,
     on_progress: Progress = lambda done, total, metrics: None,
 ) -> TrainState:
     """Train a network, or go on with a run.
@@ -41,6 +42,7 @@ def train(
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial_params: Weights to start from instead of random ones.
+        datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
         on_progress: Called with steps done, steps in all, and the latest means.
 
     Raises:
@@ -50,7 +52,8 @@ def train(
     """
     mesh = make_mesh(config)
     checkpoints = _open_run(config, ensure_output_dir(out), resume)
-    datasets = tuple(load_training_data(config, vertices) for vertices in config.vertices)
+    if datasets is None:
+        datasets = tuple(load_training_data(config, vertices) for vertices in config.vertices)
     state = init_train_state(config, datasets)
     datasets, state = replicate(datasets, mesh), replicate(state, mesh)
     if initial_params is not None:

@@ -109,7 +109,7 @@ def _mean_start_error(
     return jnp.mean(0.5 * log_share(gap, initial_gap) + 0.5 * log_share(apart, distance))
 
 
-def _mean_contraction(energies: Float[Array, " steps+1"]) -> Float[Array, ""]:
+def _mean_contraction(energies: Float[Array, " energies"]) -> Float[Array, ""]:
     """Return the mean share of the gap that a refinement step leaves; the last prediction stands for the optimum.
 
     Early steps move energies of joules, late ones of microjoules: their mean trains the early ones alone.

@@ -7,6 +7,8 @@ import trimesh
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides, find_contacts, nearest_point
 from eslr_jax.geometry.surface import prepare_surface
 
+find = jax.jit(find_contacts)
+
 
 @pytest.fixture(scope="module")
 def sphere():
@@ -23,7 +25,7 @@ def test_nearest_point_is_the_exact_one_on_a_sphere(sphere):
     query = (
         direction / np.linalg.norm(direction, axis=1, keepdims=True) * generator.uniform(0.2, 0.32, (300, 1))
     )
-    found = nearest_point(jnp.asarray(query, jnp.float32), vertices, surface)
+    found = jax.jit(nearest_point)(jnp.asarray(query, jnp.float32), vertices, surface)
     triangles = mesh.triangles
     exact = [
         np.linalg.norm(
@@ -37,7 +39,7 @@ def test_nearest_point_is_the_exact_one_on_a_sphere(sphere):
 def test_signed_distance_normal_and_gate(sphere):
     _, vertices, surface = sphere
     query = jnp.array([[0.0, 0.26, 0.0], [0.0, 0.24, 0.0], [0.0, 0.25 + 2 * CONTACT_RADIUS, 0.0]])
-    contacts = find_contacts(query, vertices, vertices, surface)
+    contacts = find(query, vertices, vertices, surface)
     np.testing.assert_allclose(contacts.distances[:2], [0.01, -0.01], atol=1e-3)
     np.testing.assert_allclose(contacts.normals[0], [0.0, 1.0, 0.0], atol=0.05)
     np.testing.assert_array_equal(contacts.is_near, [True, True, False])
@@ -47,7 +49,7 @@ def test_contact_point_moves_with_the_body(sphere):
     _, vertices, surface = sphere
     offset = jnp.array([[0.1, -0.05, 0.02]])
     query = jnp.array([[0.1, 0.24, 0.0]])
-    contacts = find_contacts(query, vertices, vertices + offset, surface)
+    contacts = find(query, vertices, vertices + offset, surface)
     np.testing.assert_allclose(contacts.next_points - contacts.points, offset, atol=1e-6)
     np.testing.assert_allclose(contacts.next_normals, contacts.normals, atol=1e-6)
 
@@ -67,7 +69,7 @@ def test_cloth_between_two_limbs_sees_both():
     np.testing.assert_allclose(opposing.normals[0], [-1.0, 0.0, 0.0], atol=0.05)
 
 
-def test_beyond_the_rim_of_a_part_nothing_is_touched(sphere):
+def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):
     """The tangent plane at the boundary would push cloth there by as much as it hangs below it."""
     mesh, _, _ = sphere
     is_upper = mesh.triangles_center[:, 1] > 0
@@ -75,6 +77,6 @@ def test_beyond_the_rim_of_a_part_nothing_is_touched(sphere):
     surface = prepare_surface(mesh.vertices, upper, boundary=np.intersect1d(upper, lower))
     vertices = jnp.asarray(mesh.vertices, jnp.float32)[surface.vertex_ids]
     query = jnp.array([[0.24, -0.05, 0.0], [0.24, 0.1, 0.0]])
-    contacts = find_contacts(query, vertices, vertices, surface)
+    contacts = find(query, vertices, vertices, surface)
     np.testing.assert_array_equal(contacts.is_near, [False, True])
     assert contacts.distances[0] > 0

@@ -4,36 +4,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_garment, make_sheet
 
 from eslr_jax.contact import self_contact
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
-from eslr_jax.geometry.prepare import prepare_garment, to_device
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
-from eslr_jax.types import tree_cast
+from eslr_jax.types import PairCapacity, tree_cast
 
 NEAR, RADIUS, COSINE = 0.01, 0.04, 0.8
 STIFFNESS, THICKNESS = 3.5e7, 3e-3
-_find = jax.jit(self_contact.find_self_contacts, static_argnames=("capacity", "cell_capacity"))
-
-
-def find_self_contacts(position, predicted, garment, **options):
-    return _find(position, predicted, garment, **{"capacity": 8000, "cell_capacity": 400, **options})
-
-
-def make_sheet(rows, columns, spacing):
-    index = np.arange(rows * columns).reshape(rows, columns)
-    x, z = np.meshgrid(np.arange(rows) * spacing, np.arange(columns) * spacing, indexing="ij")
-    positions = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    return positions, np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+AMPLE = PairCapacity(pairs=8000, faces=400)
+find_self_contacts = jax.jit(self_contact.find_self_contacts, static_argnames="capacity")
+repulsion = jax.jit(jax.value_and_grad(repulsion_energy))
+push = jax.jit(push_apart)
 
 
 def make_cloth(rows=30, columns=10, spacing=0.012):
-    positions, faces = make_sheet(rows, columns, spacing)
-    ones = np.ones((len(positions), 1))
-    return prepare_garment(positions, faces, skin_weights=ones, skin_indices=np.zeros_like(ones, int))
+    """A sheet whose rows lie along x."""
+    return make_garment(*make_sheet(columns, rows, spacing, jitter=0))
 
 
 def roll_up(garment, gap=0.008, noise=1e-3, seed=0):
@@ -55,7 +46,7 @@ def cloth():
 @pytest.fixture(scope="module")
 def spiral_contacts(cloth):
     position = jnp.asarray(roll_up(cloth), jnp.float32)
-    return find_self_contacts(position, position, cloth)
+    return find_self_contacts(position, position, cloth, AMPLE)
 
 
 def closest_on_triangle(p, a, b, c):
@@ -143,7 +134,7 @@ def test_pairs_equal_brute_force(cloth, gap):
     velocity = np.random.default_rng(1).normal(scale=5e-3, size=position.shape)
     predicted = position + velocity
     contacts = find_self_contacts(
-        jnp.asarray(position, jnp.float32), jnp.asarray(predicted, jnp.float32), cloth
+        jnp.asarray(position, jnp.float32), jnp.asarray(predicted, jnp.float32), cloth, AMPLE
     )
     expected, unsure = brute_force(cloth, position, predicted)
     found = found_pairs(cloth, contacts)
@@ -154,22 +145,20 @@ def test_pairs_equal_brute_force(cloth, gap):
 
 
 def test_flat_cloth_has_no_pairs(cloth):
-    contacts = find_self_contacts(cloth.rest_positions, cloth.rest_positions, cloth)
+    contacts = find_self_contacts(cloth.rest_positions, cloth.rest_positions, cloth, AMPLE)
     assert int(contacts.count) == 0
     assert int(contacts.status) == Status.OK
     assert not np.any(contacts.side)
 
 
-@pytest.mark.parametrize("options", [{"capacity": 50}, {"cell_capacity": 4}])
-def test_too_small_a_capacity_sets_the_bit_and_says_what_is_needed(cloth, options):
+@pytest.mark.parametrize("capacity", [PairCapacity(50, 400), PairCapacity(8000, 4)], ids=["pairs", "faces"])
+def test_too_small_a_capacity_sets_the_bit_and_says_what_is_needed(cloth, capacity):
     position = jnp.asarray(roll_up(cloth), jnp.float32)
-    contacts = find_self_contacts(position, position, cloth, **options)
+    contacts = find_self_contacts(position, position, cloth, capacity)
     assert int(contacts.status) == Status.SELF_CONTACT_OVERFLOW
-    needed = {"capacity": int(contacts.count), "cell_capacity": int(contacts.listed)}
-    for name, value in options.items():
-        assert needed[name] > value
-    enough = find_self_contacts(position, position, cloth, **{name: needed[name] for name in options})
-    assert int(enough.status) == Status.OK
+    needed = PairCapacity(max(int(contacts.count), capacity.pairs), max(int(contacts.listed), capacity.faces))
+    assert needed != capacity
+    assert int(find_self_contacts(position, position, cloth, needed).status) == Status.OK
 
 
 def test_padding_changes_no_pair(cloth):
@@ -177,12 +166,10 @@ def test_padding_changes_no_pair(cloth):
     padded = to_device(pad_garment(cloth))
     extra = padded.vertex_mask.shape[0] - position.shape[0]
     grown = jnp.concatenate([position, jnp.zeros((extra, 3))])
-    plain = find_self_contacts(position, position, cloth)
-    other = find_self_contacts(grown, grown, padded)
+    plain = find_self_contacts(position, position, cloth, AMPLE)
+    other = find_self_contacts(grown, grown, padded, AMPLE)
     assert found_pairs(cloth, plain) == found_pairs(padded, other)
-    energies = [
-        repulsion_energy(x, pairs, STIFFNESS, 0.02) for x, pairs in ((position, plain), (grown, other))
-    ]
+    energies = [repulsion(x, pairs, STIFFNESS, 0.02)[0] for x, pairs in ((position, plain), (grown, other))]
     np.testing.assert_allclose(*energies, rtol=1e-6)
 
 
@@ -209,11 +196,9 @@ def test_energy_of_one_pair_is_the_formula():
     assert float(height[0]) == pytest.approx(1e-3, rel=1e-5)
     np.testing.assert_allclose([float(c[0]) for c in direction], [0, 1, 0], atol=1e-7)
     expected = STIFFNESS * float(garment.vertex_areas[3]) * 2e-3**3
-    assert float(repulsion_energy(position, contacts, STIFFNESS, THICKNESS)) == pytest.approx(
-        expected, rel=1e-4
-    )
+    assert float(repulsion(position, contacts, STIFFNESS, THICKNESS)[0]) == pytest.approx(expected, rel=1e-4)
     behind = contacts.replace(side=-contacts.side)  # kept below: 4 mm too high
-    assert float(repulsion_energy(position, behind, STIFFNESS, THICKNESS)) == pytest.approx(
+    assert float(repulsion(position, behind, STIFFNESS, THICKNESS)[0]) == pytest.approx(
         STIFFNESS * float(garment.vertex_areas[3]) * 4e-3**3, rel=1e-4
     )
 
@@ -229,7 +214,7 @@ def test_gradient_equals_central_differences_and_closed_form():
         gradient = np.asarray(jax.grad(energy)(position))
         step = 1e-6
         offsets = step * jnp.eye(12).reshape(12, 4, 3)
-        energies = jax.vmap(energy)
+        energies = jax.jit(jax.vmap(energy))
         difference = energies(position[None] + offsets) - energies(position[None] - offsets)
         np.testing.assert_allclose(gradient.ravel(), difference / (2 * step), rtol=1e-5, atol=1e-9)
         force = 3 * STIFFNESS * float(garment.vertex_areas[3]) * 2e-3**2
@@ -243,9 +228,9 @@ def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
         u, v = contacts.weights[:, 1], contacts.weights[:, 2]
         contacts = contacts.replace(weights=jnp.stack([1 - u - v, u, v], axis=-1))
         x = jnp.asarray(roll_up(cloth, seed=3), jnp.float64)
-        forces = -np.asarray(jax.grad(repulsion_energy)(x, contacts, STIFFNESS, 0.01))
+        forces = -np.asarray(repulsion(x, contacts, STIFFNESS, 0.01)[1])
         size = np.abs(forces).sum()
-        assert size > 0
+        assert size > 1.0, "a newton, and hundreds of pairs"
         np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-12 * size)
         np.testing.assert_allclose(np.cross(np.asarray(x), forces).sum(axis=0), 0.0, atol=1e-12 * size)
 
@@ -254,24 +239,24 @@ def test_energy_is_finite_on_degenerate_faces_and_coincident_vertices(cloth, spi
     position, contacts = jnp.asarray(roll_up(cloth), jnp.float32), spiral_contacts
     flat = position * jnp.array([[1.0, 0.0, 0.0]])
     for x in (flat, jnp.zeros_like(position)):
-        value, gradient = jax.value_and_grad(repulsion_energy)(x, contacts, STIFFNESS, THICKNESS)
+        value, gradient = repulsion(x, contacts, STIFFNESS, THICKNESS)
         assert np.isfinite(value)
         assert np.isfinite(gradient).all()
-        pairs = find_self_contacts(x, x, cloth)
+        pairs = find_self_contacts(x, x, cloth, AMPLE)
         assert np.isfinite(pairs.weights).all()
 
 
 def test_push_apart_ends_the_overlap():
     _, position, contacts = pair_of(-0.004)
-    apart = push_apart(position, contacts, THICKNESS)
+    apart = push(position, contacts, THICKNESS)
     height, _ = pair_heights(apart, contacts)
     assert float(height[0]) == pytest.approx(THICKNESS, abs=1e-4)
 
 
 def test_push_apart_leaves_separate_layers_alone(cloth):
     position = jnp.asarray(roll_up(cloth, 0.012, noise=0), jnp.float32)
-    contacts = find_self_contacts(position, position, cloth)
-    np.testing.assert_array_equal(push_apart(position, contacts, THICKNESS), position)
+    contacts = find_self_contacts(position, position, cloth, AMPLE)
+    np.testing.assert_array_equal(push(position, contacts, THICKNESS), position)
 
 
 def test_diagonal_bounds_a_third_of_the_curvature():

@@ -5,12 +5,12 @@ import pytest
 
 from eslr_jax.cli.budget import parse_budget, parse_request, parse_share
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation.calibrate import (
+from eslr_jax.evaluation.calibrate import fit_costs
+from eslr_jax.simulation.budget import (
     SOLVER,
     Calibration,
     Method,
     choose,
-    fit_costs,
     keep_budget,
     read_calibration,
     write_calibration,
@@ -24,7 +24,7 @@ FAST = Method("net", 1000, 2.0, 1.0, SLOW.median, SLOW.p99)
 LARGE = Method(SOLVER, 4000, 4.0, 4.0, PLAIN.median, PLAIN.p99)
 
 
-def test_a_budget_buys_the_least_excess():
+def test_a_budget_buys_the_least_gap():
     choice = choose(Calibration("here", (PLAIN, SLOW)), 1000, budget_ms=22.0)
     assert (choice.method, choice.iterations) == (SOLVER, 21)
     assert choice.expected_ms <= 22.0
@@ -95,7 +95,7 @@ def test_what_is_out_of_reach_is_said():
 def test_calibrations_survive_a_round_trip_and_damage_is_named(tmp_path):
     path = tmp_path / "calibration.json"
     calibration = Calibration("here", (PLAIN, SLOW))
-    write_calibration(calibration, path)
+    write_calibration(calibration, path, {"jax": "0.10.2"})
     assert read_calibration(path) == calibration
     path.write_text(path.read_text()[:100])
     with pytest.raises(AssetError, match="eslr calibrate"):

@@ -1,29 +1,39 @@
 """What a scene says that it models."""
 
+import jax.numpy as jnp
 import pytest
 
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.scene_parts import describe_scene, take_turns, time_parts
-from eslr_jax.scene import SceneOptions, prepare_scene
-
-PHYSICS = SimConfig(simulator="physics")
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
 
-def test_what_a_scene_lacks_is_left_out(tshirt, walk):
-    parts = describe_scene(prepare_scene(tshirt, walk), walk, PHYSICS)
-    assert {"stretch", "bending", "inertia and gravity", "collision and friction"} <= set(parts.modelled)
-    assert {"other body faces", "pins", "self-contact", "network"} <= set(parts.left_out)
-    bare = prepare_scene(tshirt, walk, options=SceneOptions(has_body=False))
-    assert "collision and friction" in describe_scene(bare, walk, PHYSICS).left_out
+def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene, small_config):
+    parts = describe_scene(small_scene, small_poses, small_config)
+    assert set(parts.modelled) == {"stretch", "bending", "inertia and gravity", "collision and friction"}
+    assert set(parts.left_out) == {"pins", "self-contact", "fabric by part", "network"}
+    assert parts.modelled["stretch"] == "100 faces"
+    options = SceneOptions(has_body=False, self_contact=True)
+    bare = describe_scene(
+        prepare_scene(small_garment, small_poses, options=options), small_poses, small_config
+    )
+    assert bare.left_out["collision and friction"] == "no body in reach"
+    assert "self-contact" in bare.modelled
 
 
-def test_turns_return_a_time_for_each_part():
-    times = take_turns({"twice": (lambda x: 2 * x, (1.0,)), "thrice": (lambda x: 3 * x, (1.0,))}, turns=2)
-    assert set(times) == {"twice", "thrice"}
-    assert all(value > 0 for value in times.values())
+def multiply(x):
+    for _ in range(20):
+        x = x @ x / 300
+    return x
+
+
+def test_the_slower_of_two_functions_takes_longer_in_turns():
+    matrix = jnp.ones((300, 300))
+    times = take_turns({"sum": (jnp.sum, (matrix,)), "products": (multiply, (matrix,))}, turns=5)
+    assert times["products"] > 3 * times["sum"]
 
 
 @pytest.mark.slow
-def test_parts_of_a_frame_are_timed(tshirt, walk):
-    times = time_parts(None, prepare_scene(tshirt, walk), PHYSICS)
-    assert times["whole frame"] > times["contact search"] > 0
+def test_parts_of_a_frame_are_timed(small_scene, small_config):
+    times = time_parts(None, small_scene, small_config)
+    assert times["whole frame"] > times["contact search"]
+    assert times["whole frame"] > times["preconditioner"]

@@ -1,4 +1,4 @@
-"""A small crumpled sheet over moving contacts: one frame, in either precision."""
+"""A small crumpled sheet between two moving bodies: one frame, in either precision."""
 
 from __future__ import annotations
 
@@ -7,38 +7,17 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from cloth import make_garment, make_sheet
 
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.padding import pad_garment
-from eslr_jax.geometry.prepare import prepare_garment, to_device
-from eslr_jax.physics.problem import FrameProblem, PhysicsParameters
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.geometry.prepare import to_device
+from eslr_jax.physics.problem import BodyContact, FrameProblem
+from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
 
 TIMESTEP = 1 / 30
-
-
-def make_sheet(rows=5, columns=6, spacing=0.05, *, seed=0, jitter=0.2):
-    """A sheet facing +y; its inner vertices are moved at random, so that no two triangles are alike."""
-    x, z = np.meshgrid(np.arange(columns) * spacing, np.arange(rows) * spacing)
-    positions = np.stack([x, np.zeros_like(x), z], axis=-1)
-    random = np.random.default_rng(seed)
-    offset = random.uniform(-jitter, jitter, (rows - 2, columns - 2, 3))
-    positions[1:-1, 1:-1] += offset * spacing * [1, 0.2, 1]
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    return positions.reshape(-1, 3), np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
-
-
-def make_garment(positions, faces, *, is_pinned=None) -> Garment:
-    count = len(positions)
-    return prepare_garment(
-        positions,
-        faces,
-        skin_weights=np.ones((count, 1)),
-        skin_indices=np.zeros((count, 1), int),
-        is_pinned=is_pinned,
-        allow_components=True,
-    )
+BODY_MOTION = np.array([0.003, 0.002, -0.001])  # [m] in the frame
+GAP = 0.008  # [m] between the two bodies, along y
 
 
 def to_numpy(tree, dtype=np.float64):
@@ -67,10 +46,22 @@ def float64_garment(garment: Garment) -> Garment:
 class Case(NamedTuple):
     """One frame of the sheet; NumPy leaves of one precision."""
 
-    garment: Garment
-    material: Material
     problem: FrameProblem
     position: Any  # a candidate at t + 1 [m]
+
+
+def make_contacts(start, normals, heights, is_near) -> Contacts:
+    """Return contacts with body points that lie `heights` below the cloth along their normals."""
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    points = start - normals * heights[:, None]
+    return Contacts(
+        points=points,
+        next_points=points + BODY_MOTION,
+        normals=normals,
+        next_normals=normals,
+        distances=heights,
+        is_near=is_near,
+    )
 
 
 def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
@@ -84,26 +75,12 @@ def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
 
     start = np.asarray(garment.rest_positions) * [1.05, 1.0, 0.97] + noise(0.004, 3)
     start[:, 1] += 0.03 * np.sin(12 * start[:, 0])
-    normals = np.array([0.0, 1.0, 0.0]) + noise(0.2, 3)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = start - normals * (0.002 + np.abs(noise(0.002)))[:, None]
-    contacts = Contacts(
-        points=points,
-        next_points=points + np.array([0.003, 0.002, -0.001]),
-        normals=normals,
-        next_normals=normals,
-        distances=np.einsum("va,va->v", start - points, normals),
-        is_near=random.uniform(size=count) < 0.8,
+    up = np.array([0.0, 1.0, 0.0])
+    below = make_contacts(
+        start, up + noise(0.2, 3), 0.002 + np.abs(noise(0.002)), random.uniform(size=count) < 0.8
     )
-    problem = FrameProblem(
-        position=start,
-        inertial_guess=start + noise(0.002, 3),
-        timestep=np.float64(TIMESTEP),
-        pin_targets=None if is_pinned is None else start + 0.01,
-        contacts=contacts,
-        friction_load=np.abs(noise(1e-3)),
-        collision_thickness=np.float64(2e-3),
-        parameters=PhysicsParameters(),
+    above = make_contacts(
+        start, noise(0.2, 3) - up, GAP - below.distances, below.is_near & (random.uniform(size=count) < 0.6)
     )
     material = Material(
         density=0.2 * random.uniform(0.5, 2, count),
@@ -112,35 +89,52 @@ def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
         bending_stiffness=4e-5 * random.uniform(0.5, 2, len(garment.hinges)),
         thickness=4.7e-4 * random.uniform(0.5, 2, len(faces)),
     )
-    position = start + np.array([0.003, 0.002, -0.001]) + noise(0.001, 3)
-    return to_numpy(Case(garment, material, problem, position), dtype)
+    problem = FrameProblem(
+        garment=garment,
+        material=material,
+        constants=PhysicsConstants(),
+        timestep=np.float64(TIMESTEP),
+        position=start,
+        inertial_guess=start + noise(0.002, 3),
+        body=BodyContact(
+            nearest=below,
+            opposing=above,
+            friction_load=np.abs(noise(1e-3)),
+            thickness=np.float64(5e-3),  # as wide as the gap is narrow, so that both sides press
+        ),
+        pin_targets=None if is_pinned is None else start + 0.01,
+    )
+    return to_numpy(Case(problem, start + BODY_MOTION + noise(0.001, 3)), dtype)
 
 
 def pad_case(case: Case) -> Case:
     """Return the case with every array padded to a bucket; padded rows hold the last vertex's values."""
-    garment = pad_garment(case.garment)
-    rows = garment.vertex_mask.shape[0] - case.garment.vertex_mask.shape[0]
+    problem = case.problem
+    garment = pad_garment(problem.garment)
+    rows = garment.vertex_mask.shape[0] - problem.garment.vertex_mask.shape[0]
 
     def vertices(leaf):
         return np.concatenate([leaf, np.repeat(leaf[-1:], rows, axis=0)])
 
-    problem = case.problem
+    def elements(leaf, like):
+        return np.pad(leaf, (0, len(like) - len(leaf)), mode="edge")
+
+    body, material = problem.body, problem.material
     padded = problem.replace(
+        garment=to_device(garment),
+        material=Material(
+            density=elements(material.density, garment.vertex_areas),
+            lame_mu=elements(material.lame_mu, garment.rest_areas),
+            lame_lambda=elements(material.lame_lambda, garment.rest_areas),
+            bending_stiffness=elements(material.bending_stiffness, garment.hinge_rest_areas),
+            thickness=elements(material.thickness, garment.rest_areas),
+        ),
         position=vertices(problem.position),
         inertial_guess=vertices(problem.inertial_guess),
-        contacts=jax.tree.map(vertices, problem.contacts),
-        friction_load=np.pad(problem.friction_load, (0, rows)),
+        body=body.replace(
+            nearest=jax.tree.map(vertices, body.nearest),
+            opposing=jax.tree.map(vertices, body.opposing),
+            friction_load=np.pad(body.friction_load, (0, rows)),
+        ),
     )
-    material = case.material
-
-    def elements(leaf, count):
-        return np.pad(leaf, (0, count - len(leaf)), mode="edge")
-
-    material = Material(
-        density=elements(material.density, len(garment.vertex_areas)),
-        lame_mu=elements(material.lame_mu, len(garment.rest_areas)),
-        lame_lambda=elements(material.lame_lambda, len(garment.rest_areas)),
-        bending_stiffness=elements(material.bending_stiffness, len(garment.hinge_rest_areas)),
-        thickness=elements(material.thickness, len(garment.rest_areas)),
-    )
-    return Case(to_device(garment), material, padded, vertices(case.position))
+    return Case(padded, vertices(case.position))

@@ -1,27 +1,26 @@
-"""Impossible materials, parameters and timesteps are refused by name."""
+"""Impossible materials, constants and timesteps are refused by name."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from physics_cases import make_garment, make_sheet
+from cloth import make_garment, make_sheet
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.physics.validate import (
+    CONSTANT_RANGES,
     MATERIAL_RANGES,
-    PARAMETER_RANGES,
+    validate_constants,
     validate_material,
-    validate_parameters,
     validate_timestep,
 )
-from eslr_jax.types import Material
+from eslr_jax.types import Material, PhysicsConstants
 
 
 def test_defaults_and_the_ends_of_the_training_ranges_are_accepted():
     validate_material(COTTON)
-    validate_parameters(PhysicsParameters())
+    validate_constants(PhysicsConstants())
     for timestep in (1 / 30, 1 / 3, np.float32(1 / 60)):
         validate_timestep(timestep)
     validate_material(
@@ -72,18 +71,18 @@ def test_an_array_of_the_wrong_size_names_the_size_needed():
             validate_material(COTTON.replace(**{field: np.full(count + 1, value)}), garment)
 
 
-@pytest.mark.parametrize("field", list(PARAMETER_RANGES))
-def test_parameters_out_of_range_are_refused(field):
+@pytest.mark.parametrize("field", list(CONSTANT_RANGES))
+def test_constants_out_of_range_are_refused(field):
     for value in (-1.0, np.nan, 1e13):
         with pytest.raises(ConfigError, match=f"{field} = "):
-            validate_parameters(PhysicsParameters(**{field: value}))
+            validate_constants(PhysicsConstants(**{field: value}))
 
 
-def test_a_parameter_must_be_one_number():
+def test_a_constant_must_be_one_number():
     with pytest.raises(ConfigError, match=r"gravity has shape \(3,\)"):
-        validate_parameters(PhysicsParameters(gravity=np.full(3, 9.81)))
+        validate_constants(PhysicsConstants(gravity=np.full(3, 9.81)))
     with pytest.raises(ConfigError, match="is not a number"):
-        validate_parameters(PhysicsParameters(gravity="down"))
+        validate_constants(PhysicsConstants(gravity="down"))
 
 
 @pytest.mark.parametrize("timestep", [0.0, -1 / 30, np.nan, 60.0])
@@ -92,8 +91,8 @@ def test_an_impossible_timestep_is_refused(timestep):
         validate_timestep(timestep)
 
 
-def test_every_parameter_has_a_range():
-    assert set(vars(PhysicsParameters())) == set(PARAMETER_RANGES)
+def test_every_constant_has_a_range():
+    assert set(vars(PhysicsConstants())) == set(CONSTANT_RANGES)
 
 
 def test_the_validator_is_light_to_import():

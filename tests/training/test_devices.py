@@ -11,7 +11,7 @@ import pytest
 RECIPE = """
 garments = ["tshirt"]
 split = "validation"
-iterations = 3
+steps = 3
 batch_size = 4
 log_every = 1
 [model]

@@ -1,0 +1,36 @@
+"""Checks of shapes and types in the tests: every function of a kernel room holds what its annotations say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import beartype
+from jaxtyping import install_import_hook
+
+KERNELS = [
+    "eslr_jax.numerics",
+    "eslr_jax.body.lbs",
+    "eslr_jax.contact",
+    "eslr_jax.graph",
+    "eslr_jax.models",
+    "eslr_jax.physics",
+    "eslr_jax.scene.build",
+    "eslr_jax.simulation.frame",
+    "eslr_jax.simulation.network",
+    "eslr_jax.simulation.stepper",
+    "eslr_jax.simulation.rollout",
+    "eslr_jax.training.loss",
+]
+
+
+def check(function: Callable) -> Callable:
+    """Return the function with its arguments and its result checked.
+
+    Constructors are let through: JAX fills pytrees with axes, masks and shapes as it maps over them.
+    """
+    return function if function.__name__ == "__init__" else beartype.beartype(function)
+
+
+def check_kernels() -> None:
+    """Check the kernel rooms from here on; call this before they are imported."""
+    install_import_hook(KERNELS, "shapes.check")

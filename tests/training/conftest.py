@@ -1,0 +1,34 @@
+"""What training runs of the quick tier learn from."""
+
+from __future__ import annotations
+
+import jax
+import pytest
+
+
+@pytest.fixture(scope="module", autouse=True)
+def optax_promotes():
+    """Let integers become floats here: optax does it with its step counts."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.fixture(scope="session")
+def small_data(small_garment):
+    """The sleeve, on a limb that swings for twelve frames."""
+    from cloth import make_limb, swing_motion
+
+    from eslr_jax.training.data import build_training_data
+
+    body = make_limb()
+    return build_training_data([small_garment], body, [swing_motion(body, 12)])
+
+
+@pytest.fixture(scope="session")
+def cheap_model():
+    """One layer of eight channels."""
+    import dataclasses
+
+    from eslr_jax.models.registry import MODELS
+
+    return dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size=8)
