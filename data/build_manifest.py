@@ -83,7 +83,7 @@ def models() -> list[dict]:
     entries = []
     for file in sorted((DATA / "models").glob("*.npz"), key=lambda file: file.stem):
         training = json.loads(file.with_suffix(".json").read_text())["training"]
-        description = f"{training['iterations']} steps at {' and '.join(training['vertices'])}"
+        description = f"{training['steps']} steps at {' and '.join(training['vertices'])}"
         entries.append(entry("model", file.stem, file, "model", description))
     return entries
 

@@ -14,7 +14,7 @@ import argparse
 import json
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body import lbs, retarget
+from eslr_jax.body.joints import find_named_parts
 
 DATA = Path(__file__).resolve().parent
 MAGIC = b"EPMOCAP1"
@@ -47,13 +48,10 @@ CMU_SIDE = {
     "{s}Hand": "hand", "{i}Thumb": "thumb", "{s}FingerBase": "hand", "{s}HandFinger1": "fingers",
 }  # fmt: skip
 CMU_BONE_ENDS = {"femur": "tibia", "tibia": "foot", "humerus": "radius", "radius": "wrist"}
-CMU_ACTOR_LEG = (
-    0.864  # [m] thigh and shank that make the standing foot slide least, the same in all walks; the XML
-)
-# humanoid has 0.821, the bodies in the 2020 file are 1.2 times as large, and neither fits the root's steps
-CMU_WORLD = np.array(
-    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-)  # Z up -> Y up; its rest pose is Y up
+# Thigh and shank that make the standing foot slide least, equal in all walks [m]. The XML humanoid has 0.821 and
+# the bodies in the 2020 file are 1.2 times as large; neither fits the root's steps.
+CMU_ACTOR_LEG = 0.864
+CMU_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # Z up -> Y up
 
 # DeepMimic joints in file order with the number of columns: quaternion (w x y z) or angle about +z.
 DEEPMIMIC_JOINTS = (
@@ -107,7 +105,7 @@ class Rig:
     @property
     def leg_length(self) -> float:
         """Thigh and shank [m]."""
-        return retarget.leg_length(self.joint_names, self.joint_rest_positions)
+        return retarget.leg_length(self.joint_rest_positions, find_named_parts(self.joint_names))
 
 
 @dataclass(frozen=True)
@@ -142,6 +140,94 @@ def both_sides(names: dict[str, str], *, is_sided: bool = True) -> dict[str, str
 def from_wxyz(quaternions: NDArray) -> Rotation:
     """Rotations from quaternions with the real part first, [..., 4]."""
     return Rotation.from_quat(np.asarray(quaternions, np.float64), scalar_first=True)
+
+
+# ---------------------------------------------------------------- from rig to rig
+
+_SIDES = ("Left", "Right")
+_LIMB_BONES = {"UpLeg": "Leg", "Leg": "Foot", "Arm": "ForeArm", "ForeArm": "Hand"}
+_HAND_JOINTS = ("{side}Hand", "{initial}Thumb", "{side}FingerBase", "{side}HandFinger1")
+
+
+def limb_bones(joint_names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the bones whose rest direction differs from rig to rig: limbs, and hands that continue them.
+
+    Args:
+        joint_names: Joints of a rig with CMU names (`LeftArm`, `RThumb`, ...).
+
+    Returns:
+        For each such joint the two joints that span its bone; absent joints are left out.
+    """
+    bones = {}
+    for side in _SIDES:
+        for start, end in _LIMB_BONES.items():
+            bones[side + start] = (side + start, side + end)
+        for name in _HAND_JOINTS:
+            bones[name.format(side=side, initial=side[0])] = (side + "ForeArm", side + "Hand")
+    present = set(joint_names)
+    return {name: bone for name, bone in bones.items() if present.issuperset((name, *bone))}
+
+
+def rest_alignments(
+    joint_names: Sequence[str], joint_rest_positions: NDArray, source_directions: Mapping[str, NDArray]
+) -> NDArray:
+    """Return, for each joint, the rotation from the rig's rest bone to the source's rest bone.
+
+    Args:
+        joint_names: Joints of the rig.
+        joint_rest_positions: Their rest positions [m], shape [joints, 3].
+        source_directions: Direction of the source's bone at rest, in the rig's axes, for the joints of
+            `limb_bones` that should be aligned; shape [3] each.
+
+    Returns:
+        Rotations, identity where nothing is aligned, shape [joints, 3, 3].
+    """
+    index = {name: i for i, name in enumerate(joint_names)}
+    alignments = np.tile(np.eye(3), (len(joint_names), 1, 1))
+    for name, (start, end) in limb_bones(joint_names).items():
+        if name in source_directions:
+            bone = joint_rest_positions[index[end]] - joint_rest_positions[index[start]]
+            alignments[index[name]] = retarget.minimal_rotation(bone, source_directions[name])
+    return alignments
+
+
+def follow_joints(
+    source_rotations: NDArray, source_joints: Sequence[int], alignments: NDArray, parents: Sequence[int]
+) -> NDArray:
+    """Return the rig's local rotations that follow a source skeleton's global ones.
+
+    Joint j of the rig turns by G_j = D_s A_j: first from its own rest bone onto the source's (A_j), then as
+    the source joint s turned since its rest pose (D_s). So limbs point where the source's point, whatever the
+    two rest poses.
+
+    Args:
+        source_rotations: Global rotation of each source joint since its rest pose, in the rig's axes, shape
+            [frames, source_joints, 3, 3].
+        source_joints: Source joint followed by each joint of the rig, shape [joints].
+        alignments: See `rest_alignments`, shape [joints, 3, 3].
+        parents: Parent of each joint, -1 for the root.
+
+    Returns:
+        Local axis-angle rotations [rad], shape [frames, joints, 3].
+    """
+    return retarget.local_rotations(source_rotations[:, list(source_joints)] @ alignments, parents)
+
+
+def start_facing_front(rotations: NDArray, translations: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the motion moved so that the root starts above the origin and faces +Z.
+
+    Args:
+        rotations: Local axis-angle rotations [rad], the root first, shape [frames, joints, 3].
+        translations: Root positions [m], shape [frames, 3].
+
+    Returns:
+        Rotations [rad] and translations [m]; heights are unchanged.
+    """
+    front = Rotation.from_rotvec(rotations[0, 0]).apply([0.0, 0.0, 1.0])
+    turn = Rotation.from_euler("y", -np.arctan2(front[0], front[2]))
+    result = np.array(rotations, dtype=np.float64)
+    result[:, 0] = (turn * Rotation.from_rotvec(result[:, 0])).as_rotvec()
+    return result, turn.apply(translations - translations[0] * [1.0, 0.0, 1.0])
 
 
 # ---------------------------------------------------------------- CMU clips in EnvPool's format
@@ -246,18 +332,18 @@ def retarget_cmu(source: Path, rig: Rig) -> dict[str, Clip]:
 
     joint_map = CMU_CENTRE | both_sides(CMU_SIDE)
     followed = [index[joint_map[name]] for name in rig.joint_names]
-    bones = retarget.limb_bones(rig.joint_names)
+    bones = limb_bones(rig.joint_names)
     directions = {}
     for name, (start, _) in bones.items():
         body = joint_map[start]
         directions[name] = positions[index[body[0] + CMU_BONE_ENDS[body[1:]]]] - positions[index[body]]
-    alignments = retarget.rest_alignments(rig.joint_names, rig.joint_rest_positions, directions)
+    alignments = rest_alignments(rig.joint_names, rig.joint_rest_positions, directions)
     clips = {}
     for file in CMU_FILES:
         for name, fields in read_epmocap(source / file).items():
             posed = pose_humanoid(bodies, from_wxyz(fields["quaternion"]), fields["joints"])
             since_rest = CMU_WORLD @ posed @ np.swapaxes(rest, 1, 2)
-            rotations = retarget.retarget(since_rest, followed, alignments, rig.parents)
+            rotations = follow_joints(since_rest, followed, alignments, rig.parents)
             translations = rig.leg_length / CMU_ACTOR_LEG * fields["position"] @ CMU_WORLD.T
             clips[name.lower()] = Clip(rotations, translations, 1 / fields["dt"])
     return clips
@@ -285,8 +371,8 @@ def deepmimic_rotations(frames: NDArray) -> dict[str, NDArray]:
 def retarget_deepmimic(source: Path, rig: Rig) -> dict[str, Clip]:
     """Retarget every `humanoid3d_*.txt`."""
     joint_map = DEEPMIMIC_CENTRE | both_sides(DEEPMIMIC_SIDE) | both_sides(DEEPMIMIC_UNSIDED, is_sided=False)
-    down = dict.fromkeys(retarget.limb_bones(rig.joint_names), np.array([0.0, -1.0, 0.0]))
-    alignments = retarget.rest_alignments(rig.joint_names, rig.joint_rest_positions, down)
+    down = dict.fromkeys(limb_bones(rig.joint_names), np.array([0.0, -1.0, 0.0]))
+    alignments = rest_alignments(rig.joint_names, rig.joint_rest_positions, down)
     scale = rig.leg_length / DEEPMIMIC_LEG
     clips = {}
     for path in sorted(source.glob("humanoid3d_*.txt")):
@@ -295,7 +381,7 @@ def retarget_deepmimic(source: Path, rig: Rig) -> dict[str, Clip]:
         names = list(turned)
         stacked = DEEPMIMIC_AXES @ np.stack([turned[name] for name in names], axis=1) @ DEEPMIMIC_AXES.T
         followed = [names.index(joint_map[name]) for name in rig.joint_names]
-        rotations = retarget.retarget(stacked, followed, alignments, rig.parents)
+        rotations = follow_joints(stacked, followed, alignments, rig.parents)
         translations = scale * frames[:, 1:4] @ DEEPMIMIC_AXES.T
         clips[path.stem.replace("humanoid3d", "deepmimic")] = _at_uniform_times(
             rotations, translations, frames[:, 0]
@@ -340,7 +426,7 @@ def finish(clip: Clip, lowest_point: Callable[[NDArray, NDArray], jax.Array], *,
         keeps_contact: A foot is always on the floor, so a slow drift of the lowest point is an error of the
             source's root height; it is taken out.
     """
-    rotations, translations = retarget.start_facing_front(clip.rotations, clip.translations)
+    rotations, translations = start_facing_front(clip.rotations, clip.translations)
     frames = zip(rotations.astype(np.float32), translations.astype(np.float32), strict=True)
     lowest = np.array([float(lowest_point(*frame)) for frame in frames])
     if keeps_contact:

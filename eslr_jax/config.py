@@ -15,20 +15,18 @@ from eslr_jax.errors import ConfigError
 class ModelConfig:
     """Architecture of a network; the defaults are the paper's 15-layer model (4,753,108 parameters).
 
-    The fields marked "open" are points on which the paper is silent; the default is the reading that fits its
-    parameter counts, or else what MeshGraphNet and HOOD do.
+    The paper is silent on the fields marked "open". Their defaults fit its parameter counts, or else follow
+    MeshGraphNet and HOOD. `models.lsdmp` lists the open points that are no options.
     """
 
     message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
     smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
-    edge_latents: bool = True  # False: vertices are smoothed and send no messages, see models.smoothing
+    hierarchical: bool = False  # True: HOOD's coarse levels, see models.hood
+    edge_latents: bool = True  # False: no messages, only smoothing, see models.smoothing
     attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
     latent_size: int = 128  # HOOD
     hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
-    residual: bool = True  # open: v and e of a layer are added to its inputs (MeshGraphNet)
-    readd_edges: bool = True  # open: every smoothing adds e of eq. 3 again, not the first alone
-    smooth_world_edges: bool = True  # open: N(i) of eq. 3 counts incoming world edges too
-    update_body: bool = False  # open: see models.lsdmp; a body row has one edge and nothing to pass on
+    update_body: bool = False  # open: layers update body rows as HOOD does, see models.lsdmp
     attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
     attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
     attention_kernel: Literal["relu", "softmax"] = "relu"  # open
@@ -36,15 +34,14 @@ class ModelConfig:
     attention_feedforward: bool = False  # an MLP behind the attention of every block
     embedding_size: int = 8  # open: k of the geodesic embedding
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
-    features: Literal["hood", "gradient"] = "hood"  # HOOD's inputs, or those plus the potential's gradient
-    # An acceleration of the state; a correction of the inertial guess; or a correction with a share of the
-    # preconditioned gradient step and of the last correction, gated per vertex ("descent"); or the best
-    # combination of these three, which never climbs the potential ("subspace").
+    features: Literal["hood", "gradient"] = "hood"  # HOOD's, or scaled ones with the potential's gradient
+    # "acceleration" changes the state's velocity; "correction" moves the inertial guess. "descent" adds the
+    # preconditioned gradient step and the last correction, each with a gate per vertex. "subspace" takes the
+    # combination of these three that minimises the potential.
     output: Literal["acceleration", "correction", "descent", "subspace"] = "acceleration"
     output_scale: float = 1.0  # metres per unit of output, for corrections
     refinement_steps: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
-    world_edge_capacity: int | None = None  # rows for world edges; None is one per vertex
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
     remat: Literal["layers", "products", "none"] = "products"  # what a layer keeps for its backward pass
     seed: int = 0  # of the random attention features
@@ -71,19 +68,25 @@ class ModelConfig:
         for name in ("output_scale", "world_edge_radius"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.world_edge_capacity is not None and self.world_edge_capacity < 1:
-            raise ValueError("world_edge_capacity must be at least 1, or null for one row per vertex")
         if self.refinement_steps > 1 and self.features != "gradient":
             raise ValueError(
-                'refinement_steps > 1 needs features = "gradient": others are the same in every pass'
+                'refinement_steps > 1 needs features = "gradient": others are the same in every step'
             )
         if self.refinement_steps > 1 and self.output == "acceleration":
             raise ValueError(
-                'refinement_steps > 1 needs output "correction", "descent" or "subspace": an acceleration has one pass'
+                'refinement_steps > 1 needs output "correction", "descent" or "subspace": accelerations have one'
             )
         if not self.edge_latents and self.features != "gradient":
             raise ValueError(
                 'edge_latents = false needs features = "gradient", which tell a vertex its force'
+            )
+        if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % 5):
+            raise ValueError(
+                "hierarchical = true needs smoothing_steps = 0 and message_passing_steps in fives"
+            )
+        if self.hierarchical and not (self.update_body and self.features == "hood" and self.edge_latents):
+            raise ValueError(
+                'hierarchical = true needs update_body = true, edge_latents = true and features = "hood"'
             )
         if self.output in ("descent", "subspace") and self.features != "gradient":
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')

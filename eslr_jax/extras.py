@@ -1,4 +1,4 @@
-"""Optional packages, imported where they are used."""
+"""Import optional packages where they are used."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ def require(module: str, *, extra: str = "render", purpose: str = "this") -> Mod
     """Import an optional package.
 
     Args:
-        module: Module name, e.g. "mitsuba".
-        extra: The extra of this project that installs it.
-        purpose: What it is for, as the message begins.
+        module: Name of the module, e.g. "mitsuba".
+        extra: Name of this project's extra that installs the package.
+        purpose: What needs the package; begins the message.
 
     Returns:
         The module.
 
     Raises:
-        MissingExtraError: If it can't be imported; the message names the command that helps.
+        MissingExtraError: The package is not installed; the message names the command that installs it.
     """
     try:
         return importlib.import_module(module)

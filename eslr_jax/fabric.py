@@ -1,4 +1,4 @@
-"""What a garment is made of: one fabric, or one for each of its parts."""
+"""The material of a garment: one fabric, or one for each of its parts."""
 
 from __future__ import annotations
 
@@ -9,27 +9,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.topology import find_hinges, vertex_areas
 from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.materials import COTTON, fabric_material, fabric_names
 from eslr_jax.types import Garment, Material
 
 _NUMBERS = tuple(field.name for field in dataclasses.fields(Material))
-FABRIC_FORMS = "NAME, or density=0.2,lame_mu=23600,..., either of them behind PART:"
+FABRIC_FORMS = "NAME or density=0.2,lame_mu=23600,..., for one part as PART:NAME"
 
 
 def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile) -> Material:
-    """Return the material of a garment from what was written about it.
+    """Return the material that descriptions give to a garment.
 
     Args:
-        texts: Each a fabric's name, or numbers (`density` [kg/m^2], `lame_mu`, `lame_lambda` [Pa],
-            `bending_stiffness` [J], `thickness` [m]; what is not given is cotton's), for the whole garment or,
-            behind `PART:`, for one part. None: what the file says, or else cotton.
-        garment: The prepared garment.
-        stored: Its file, with parts.
+        texts: Descriptions, each for the whole garment or, as `PART:DESCRIPTION`, for one part. A description is
+            a fabric's name, or numbers such as `density=0.2,lame_mu=23600`: `density` [kg/m^2], `lame_mu` and
+            `lame_lambda` [Pa], `bending_stiffness` [J], `thickness` [m]; cotton's value where one is missing.
+            Without descriptions, those in the file, or else cotton.
+        garment: Prepared garment.
+        stored: Garment file with the parts.
 
     Returns:
-        Scalars for one fabric; with several, one value a face (stretch), hinge (bending) and vertex (density).
+        Scalars for one fabric. For several, a value per face (stretch), hinge (bending) and vertex (density).
 
     Raises:
         ConfigError: A fabric or a part is unknown, or a number is impossible.
@@ -51,22 +53,22 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
 
 
 def beyond_training(material: Material) -> tuple[str, ...]:
-    """Return the constants that leave the ranges on which networks are trained (HOOD's)."""
+    """Return the names of the constants outside the ranges that networks are trained on (HOOD's)."""
     ranges = {
         "lame_mu": LAME_MU_RANGE,
         "lame_lambda": LAME_LAMBDA_RANGE,
         "bending_stiffness": BENDING_RANGE,
     }
+    values = {name: np.asarray(getattr(material, name)) for name in ranges}
     return tuple(
         name
         for name, (low, high) in ranges.items()
-        if np.any(np.asarray(getattr(material, name)) < 0.99 * low)
-        or np.any(np.asarray(getattr(material, name)) > 1.01 * high)
+        if values[name].min() < 0.99 * low or values[name].max() > 1.01 * high
     )
 
 
 def parse_fabric(text: str) -> Material:
-    """Return a fabric by name or by numbers.
+    """Return the fabric of a name or of numbers; see `garment_material`.
 
     Raises:
         ConfigError: The name is unknown, or a number is impossible.
@@ -82,21 +84,20 @@ def parse_fabric(text: str) -> Material:
     for word in text.split(","):
         key, _, number = word.partition("=")
         if key.strip() not in _NUMBERS:
-            raise ConfigError(f"fabric {text!r}: {key.strip()!r} is none of {', '.join(_NUMBERS)}")
+            raise ConfigError(f"fabric {text!r}: {key.strip()!r} is unknown; use {', '.join(_NUMBERS)}")
         try:
             values[key.strip()] = np.float32(number)
         except ValueError as error:
-            raise ConfigError(f"fabric {text!r}: {number!r} is no number") from error
+            raise ConfigError(f"fabric {text!r}: {number!r} is not a number") from error
         if not (np.isfinite(values[key.strip()]) and values[key.strip()] > 0):
             raise ConfigError(f"fabric {text!r}: {key.strip()} must be positive")
     return COTTON.replace(**values)
 
 
 def _mixed(whole: Material, parts: dict[int, Material], face_parts: np.ndarray, garment: Garment) -> Material:
-    """Spread fabrics over faces, hinges (the mean of both sides) and vertices (weighted by area)."""
-    faces, hinges = np.asarray(garment.faces), np.asarray(garment.hinges)
-    areas = np.asarray(garment.rest_areas, np.float64)
-    owner = np.full(len(faces), -1)  # padded faces stay with the whole
+    """Spread fabrics over faces, hinges (mean of both faces) and vertices (mean weighted by area)."""
+    faces, areas = np.asarray(garment.faces), np.asarray(garment.rest_areas, np.float64)
+    owner = np.full(len(faces), -1)  # padded faces keep the fabric of the whole
     owner[: len(face_parts)] = face_parts
 
     def by_face(name: str) -> np.ndarray:
@@ -105,26 +106,16 @@ def _mixed(whole: Material, parts: dict[int, Material], face_parts: np.ndarray, 
             values[owner == part] = float(getattr(material, name))
         return values
 
-    def by_vertex(name: str) -> np.ndarray:
-        total, mass = np.zeros(len(garment.vertex_areas)), np.zeros(len(garment.vertex_areas))
-        for corner in range(3):
-            np.add.at(total, faces[:, corner], areas)
-            np.add.at(mass, faces[:, corner], areas * by_face(name))
-        return np.where(total > 0, mass / np.where(total > 0, total, 1.0), float(getattr(whole, name)))
-
-    face_of = {}
-    for face, corners in enumerate(faces[: len(face_parts)].tolist()):
-        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            face_of[start, end] = face
-    bending = by_face("bending_stiffness")
-    by_hinge = np.full(len(hinges), float(whole.bending_stiffness))
-    for hinge, (start, end) in enumerate(hinges[:, :2].tolist()):
-        if (start, end) in face_of and (end, start) in face_of:
-            by_hinge[hinge] = 0.5 * (bending[face_of[start, end]] + bending[face_of[end, start]])
+    num_vertices = len(garment.vertex_areas)
+    mass = vertex_areas(areas * by_face("density"), faces, num_vertices)
+    area = vertex_areas(areas, faces, num_vertices)
+    bending = np.full(len(garment.hinges), float(whole.bending_stiffness))
+    hinge_faces = find_hinges(faces[: len(face_parts)])[1]  # in the order of the garment's hinges
+    bending[: len(hinge_faces)] = by_face("bending_stiffness")[hinge_faces].mean(axis=1)
     return Material(
-        density=np.float32(by_vertex("density")),
+        density=np.float32(np.where(area > 0, mass / np.where(area > 0, area, 1.0), float(whole.density))),
         lame_mu=np.float32(by_face("lame_mu")),
         lame_lambda=np.float32(by_face("lame_lambda")),
-        bending_stiffness=np.float32(by_hinge),
+        bending_stiffness=np.float32(bending),
         thickness=np.float32(by_face("thickness")),
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -75,40 +77,80 @@ def gather_corners(
 ) -> tuple[Vector3, ...]:
     """Return the corner positions of every item, by components.
 
-    The backward pass gathers each row's incoming cotangents through a fixed-degree table instead of
-    scattering them: XLA's scatter on a CPU adds one element at a time, and its order is open on a GPU.
+    Its transpose sums each row's incoming values through a fixed-degree table instead of scattering them: XLA's
+    scatter on a CPU adds one element at a time, and its order is open on a GPU.
 
     Args:
-        x: Vertex positions.
-        indices: Vertex of every corner of every item (a face or a hinge).
+        x: Vertex positions, shape [rows, 3].
+        indices: Vertex of every corner of every item (a face or a hinge), shape [items, corners].
         incidence: For each vertex the flat positions in `indices.T` that name it, padded with
-            `indices.size` (one past the end).
+            `indices.size` (one past the end), shape [rows, degree].
 
     Returns:
         For each corner the x, y and z arrays, each of shape [items].
     """
-    columns = tuple(indices[:, corner] for corner in range(indices.shape[1]))
-    gathered = tuple(_gather_component(x[:, axis], columns, incidence) for axis in range(3))
+    num_items, num_corners = indices.shape
+    flat = indices.T.ravel()
+    gathered = [_gather_flat.bind(x[:, axis], flat, incidence) for axis in range(3)]
     return tuple(
-        (gathered[0][corner], gathered[1][corner], gathered[2][corner]) for corner in range(len(columns))
+        tuple(component[k * num_items : (k + 1) * num_items] for component in gathered)
+        for k in range(num_corners)
+    )  # type: ignore[return-value]
+
+
+# Two linear maps, each the other's transpose, as primitives of JAX. A `custom_vjp` would rule out forward mode,
+# and a second derivative would leave it behind.
+_gather_flat = Primitive("gather_flat")
+_sum_flat = Primitive("sum_flat")
+
+
+def _gather_flat_impl(x, flat, incidence):
+    """Return x[flat]."""
+    return x[flat]
+
+
+def _sum_flat_impl(values, flat, incidence):
+    """Return for every row the sum of the values whose flat position its table names."""
+    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    return sum(padded[incidence[:, k]] for k in range(incidence.shape[1]))
+
+
+def _define(primitive: Primitive, transposed: Primitive, impl, length) -> None:
+    """Give a primitive its rules; only its first argument is real.
+
+    Args:
+        primitive: To be defined.
+        transposed: Its transpose.
+        impl: What it computes, in other primitives.
+        length: From the integer arguments to the length of the result.
+    """
+    primitive.def_impl(jax.jit(impl))
+    primitive.def_abstract_eval(
+        lambda x, flat, incidence: jax.core.ShapedArray((length(flat, incidence),), x.dtype)
     )
+    mlir.register_lowering(primitive, mlir.lower_fun(impl, multiple_results=False))
+
+    def differentiate(primals, tangents):
+        x_dot, flat, incidence = tangents[0], *primals[1:]
+        if isinstance(x_dot, ad.Zero):
+            x_dot = ad.instantiate_zeros(x_dot)
+        return primitive.bind(*primals), primitive.bind(x_dot, flat, incidence)
+
+    def transpose(cotangent, x, flat, incidence):
+        if isinstance(cotangent, ad.Zero):
+            return ad.Zero(x.aval), None, None
+        return transposed.bind(cotangent, flat, incidence), None, None
+
+    def batch(arguments, axes):
+        return jax.vmap(impl, in_axes=axes)(*arguments), 0
+
+    ad.primitive_jvps[primitive] = differentiate
+    ad.primitive_transposes[primitive] = transpose
+    batching.primitive_batchers[primitive] = batch
 
 
-@jax.custom_vjp
-def _gather_component(x, columns, incidence):
-    return tuple(x[column] for column in columns)
-
-
-def _gather_component_forward(x, columns, incidence):
-    return _gather_component(x, columns, incidence), incidence
-
-
-def _gather_component_backward(incidence, cotangents):
-    flat = jnp.concatenate([*cotangents, jnp.zeros_like(cotangents[0][:1])])
-    return sum(flat[incidence[:, k]] for k in range(incidence.shape[1])), None, None
-
-
-_gather_component.defvjp(_gather_component_forward, _gather_component_backward)
+_define(_gather_flat, _sum_flat, _gather_flat_impl, lambda flat, incidence: flat.shape[0])
+_define(_sum_flat, _gather_flat, _sum_flat_impl, lambda flat, incidence: incidence.shape[0])
 
 
 def scatter_corners(

@@ -31,6 +31,17 @@ class PhysicsConstants:
 
 
 @struct.dataclass
+class CoarseEdges:
+    """One coarse level of a garment's edges, see `geometry.coarse`."""
+
+    senders: Int[Array, " coarse_edges"]  # directed, both directions
+    receivers: Int[Array, " coarse_edges"]  # sorted ascending
+    reverse_edges: Int[Array, " coarse_edges"]  # index of the opposite directed edge
+    edge_mask: Bool[Array, " coarse_edges"]
+    is_kept: Bool[Array, " vertices"]  # vertices that these edges join
+
+
+@struct.dataclass
 class Garment:
     """A garment's rest mesh, its topology tables and its skinning; constant during a rollout."""
 
@@ -55,6 +66,7 @@ class Garment:
     skin_weights: Float[Array, "vertices influences"]  # rows sum to one
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
+    coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
 
 
 @struct.dataclass
@@ -66,6 +78,16 @@ class Material:
     lame_lambda: Float[Array, ...]  # [Pa]
     bending_stiffness: Float[Array, ...]  # [J]
     thickness: Float[Array, ...]  # [m]
+
+
+@struct.dataclass
+class Normalizer:
+    """Mean and spread of a set of features over every row seen so far; see `graph.normalizer`."""
+
+    count: Float[Array, ""]  # rows seen
+    mean: Float[Array, " features"]
+    squared_deviations: Float[Array, " features"]  # sum over rows of (x - mean)^2
+    num_updates: Int[Array, ""]  # graphs seen
 
 
 @struct.dataclass

@@ -2,7 +2,7 @@
 
 Blender is GPL, https://www.blender.org; measured in version 5.0.1. It runs in a process of its own, from a start
 without velocity through all frames: it can't be set into a state that moves, so only its own rollouts are
-measured. No damping. Self-contact only in scenes that ask for it.
+measured. There is no damping. Self-contact is on in scenes that model it.
 
 What its numbers mean was measured, on sheets that fall, hang, bend and slide:
 
@@ -25,16 +25,14 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
+from hard_cases import Simulator, foreign_trajectory
 from jaxtyping import Float
 from newton_cloth import prepare_cloth, springs, strip_stiffness
 
-from eslr_jax.errors import EslrError
-from eslr_jax.evaluation.hard_cases import Simulator, StressScene
+from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.io.point_cache import write_pc2
-from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulation.scan import Frames, join_frames
+from eslr_jax.physics.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
 SECONDS_PER_FRAME = 1e-3**0.5  # of Blender's cloth, whatever the frame rate
@@ -57,38 +55,30 @@ def blender_python() -> str | None:
     return os.environ.get("BLENDER_PYTHON")
 
 
-def run_blender(
-    scene: Scene,
-    effort: tuple[int, int],
-    parameters: PhysicsParameters | None = None,
-    *,
-    self_contact: bool = False,
-) -> BlenderRun:
+def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
     """Simulate a scene in Blender.
 
     Args:
-        scene: Of `prepare_scene`.
+        scene: The scene.
         effort: Steps per frame, and rounds of collision per step.
-        parameters: Physical constants.
-        self_contact: Keep layers apart.
 
     Raises:
         EslrError: The scene can't be carried over, or Blender failed; the message holds the last line that it
             wrote.
     """
-    parameters = parameters or PhysicsParameters()
-    cloth = prepare_cloth(scene.garment, scene.material)
-    rows, start = cloth.vertices, np.asarray(scene.start.position, np.float32)[cloth.vertices]
+    constants, cloth = scene.constants, prepare_cloth(scene.garment, scene.material)
+    first, rows = scene.initial_state, cloth.vertices
+    start = np.asarray(first.position, np.float32)[rows]
     edges, _ = springs(cloth)
     lengths, start_lengths = (
         np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1) for x in (cloth.rest, start)
     )
     if cloth.is_pinned.any() and not np.allclose(start_lengths, lengths, rtol=_SAME):
         raise EslrError("Blender takes lengths at rest from the mesh with the pins, which is deformed here")
-    if scene.body_positions is None and np.asarray(scene.start.velocity)[rows].any():
+    if scene.body is None and np.asarray(first.velocity)[rows].any():
         raise EslrError("Blender starts cloth without velocity")
     stretch = strip_stiffness(cloth.shear, cloth.area_stiffness)
-    distance = float(contact_thickness(scene.garment, parameters.collision_thickness))
+    distance = float(contact_thickness(scene.garment, constants.collision_thickness))
     arrays = {
         "start": start,
         "faces": cloth.faces,
@@ -97,16 +87,16 @@ def run_blender(
         "quality": effort[0],
         "collision_quality": effort[1],
         "time_scale": float(scene.timestep) / SECONDS_PER_FRAME,
-        "gravity": float(parameters.gravity),
+        "gravity": float(constants.gravity),
         "mass": cloth.masses[cloth.masses > 0].mean(),
         "tension": 3**0.5 / 2 * stretch.mean() * lengths.mean() / 1e3,
         "bending": 0.03 * (cloth.bending / cloth.hinge_areas).mean(),
         "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE),
         "body_distance": _BODY_DISTANCE,
-        "friction": 100.0 * float(parameters.friction_coefficient),
+        "friction": 100.0 * float(constants.friction_coefficient),
     }
-    if self_contact:
-        arrays["layer_distance"] = float(contact_thickness(scene.garment, parameters.repulsion_thickness))
+    if scene.self_contact is not None:
+        arrays["layer_distance"] = float(contact_thickness(scene.garment, constants.repulsion_thickness))
     if cloth.is_pinned.any():
         below = np.repeat(start[None], scene.num_frames, axis=0)
         below[:, cloth.is_pinned] = np.asarray(scene.pin_targets)[:, rows[cloth.is_pinned]]
@@ -115,10 +105,10 @@ def run_blender(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_pc2(folder / "cloth.pc2", below)
-        if scene.body_positions is not None and scene.surface is not None:
-            body = np.asarray(scene.body_positions)
+        if scene.body is not None:
+            body = np.asarray(scene.body.positions)
             write_pc2(folder / "body.pc2", body)
-            arrays |= {"body_start": body[0], "body_faces": np.asarray(scene.surface.faces)}
+            arrays |= {"body_start": body[0], "body_faces": np.asarray(scene.body.surface.faces)}
         np.savez(folder / "scene.npz", **arrays)  # type: ignore[arg-type]
         command = [str(blender_python()), str(Path(__file__).with_name("blender_worker.py")), name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -126,19 +116,9 @@ def run_blender(
             lines = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()
             raise EslrError(f"Blender failed: {lines[-1]}")
         with np.load(folder / "out.npz") as out:
-            positions = np.repeat(np.asarray(scene.start.position)[None], scene.num_frames, axis=0)
+            positions = np.repeat(np.asarray(first.position)[None], scene.num_frames, axis=0)
             positions[:, rows] = out["positions"]
             return BlenderRun(positions, out["wall"], out["processor"], str(out["version"]))
-
-
-def trajectory_of(positions: Float[np.ndarray, "frames vertices 3"], scene: Scene) -> Trajectory:
-    """Return the trajectory of a rollout of which only positions are known; residuals and iterations are zero."""
-    velocities = jnp.diff(positions, axis=0) / scene.timestep
-    none = jnp.zeros(len(velocities))
-    frames = Frames(
-        jnp.asarray(positions[1:]), velocities, none, none.astype(jnp.int32), needed_capacity=None
-    )
-    return join_frames(scene.start, frames, scene.start)
 
 
 def blender_simulator(effort: tuple[int, int]) -> Simulator:
@@ -146,10 +126,14 @@ def blender_simulator(effort: tuple[int, int]) -> Simulator:
 
     Args:
         effort: Steps per frame, and rounds of collision per step.
-    """
 
-    def run(stress: StressScene) -> Trajectory:
-        done = run_blender(stress.scene, effort, stress.parameters, self_contact=stress.self_contact)
-        return trajectory_of(done.positions, stress.scene)
+    Raises:
+        MissingExtraError: BLENDER_PYTHON names no Python.
+    """
+    if blender_python() is None:
+        raise MissingExtraError("BLENDER_PYTHON names no Python with bpy; see peers.py for how to install it")
+
+    def run(scene: Scene) -> Trajectory:
+        return foreign_trajectory(run_blender(scene, effort).positions, scene)
 
     return Simulator(f"Blender, {effort[0]}x{effort[1]}", run)

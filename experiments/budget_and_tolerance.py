@@ -1,10 +1,11 @@
-"""Whether `--budget` and `--tolerance` are kept: what they choose from the calibration, on clips it has not seen.
+"""Measure whether `--budget` and `--tolerance` are kept on clips that the calibration has not seen.
 
     python experiments/budget_and_tolerance.py [--smoke] [--out DIR]
 
-A tolerance is kept by a frame that leaves at most that share of its drop above the optimum; counted over frames
-of free rollouts on the test clips. A budget is kept by the mean time per frame of a rollout, the first ten
-frames, which go by the calibration alone, included.
+A frame keeps a tolerance if its optimality gap is at most that share of its initial gap; frames are those of
+free rollouts on the test clips. A rollout keeps a budget if its mean time per frame does. That includes the
+first ten frames, whose iterations come from the calibration alone.
+
 Writes budget_and_tolerance.json.
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +22,22 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.calibrate import (
-    Choice,
+from eslr_jax.evaluation.calibrate import simulator_of
+from eslr_jax.evaluation.gap import trajectory_gap
+from eslr_jax.evaluation.report import environment
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import prepare_scene, prepare_scenes
+from eslr_jax.simulation.budget import (
+    Calibration,
     choose,
     device_name,
     keep_budget,
     methods_at,
     read_calibration,
-    simulator_of,
 )
-from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.rollout import rollout_in_chunks
-from eslr_jax.scene import prepare_scene, prepare_scenes
-from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parent / "results"
@@ -45,14 +47,65 @@ BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration
 EVERY = 5  # frames between those whose gap is measured
 
 
-def frame_shares(choice: Choice, scene: Scene, every: int) -> tuple[np.ndarray, float]:
-    """Return the gap of frames of a free rollout over their drop, and the mean of iterations spent."""
-    params, config = simulator_of(choice.method, tolerance=choice.tolerance)
-    parameters = PhysicsParameters()
-    trajectory = simulate_scene(params, scene, parameters, config, choice.iterations)
-    ends = trajectory_gap(trajectory, scene, parameters, every=every)
-    shares = np.asarray(ends.share(ends.answer))
-    return shares, float(np.mean(np.asarray(trajectory.iterations)[1:]))
+def vertex_count(scene: Scene) -> int:
+    """Return the number of vertices of a scene's garment, without padding."""
+    return int(np.sum(scene.garment.vertex_mask))
+
+
+def measure_tolerance(
+    calibration: Calibration, scenes: Sequence[Scene], tolerance: float, every: int
+) -> dict[str, Any]:
+    """Return how many frames of free rollouts keep a tolerance.
+
+    Args:
+        calibration: Measurements that the simulator is chosen from.
+        scenes: Scenes of one resolution.
+        tolerance: Relative gap that is asked for.
+        every: Distance of the frames whose gap is measured.
+    """
+    choices, shares, spent = [], [], []
+    for scene in scenes:
+        choice = choose(calibration, vertex_count(scene), tolerance=tolerance)
+        params, config = simulator_of(choice.method, tolerance=choice.tolerance)
+        trajectory = rollout_scene(params, scene, config, choice.iterations)
+        gap = trajectory_gap(trajectory, scene, every=every)
+        choices.append(choice)
+        shares.append(np.asarray(gap.share(gap.reached)))
+        spent.append(float(np.mean(trajectory.iterations[1:])))
+    joined = np.concatenate(shares)
+    return {
+        "tolerance": tolerance,
+        "methods": sorted({choice.method for choice in choices}),
+        "frames": len(joined),
+        "kept": float(np.mean(joined <= tolerance)),
+        "gap_relative_median": float(np.median(joined)),
+        "gap_relative_p99": float(np.quantile(joined, 0.99)),
+        "iterations_mean": float(np.mean(spent)),
+        "iterations_allowed": max(choice.iterations for choice in choices),
+    }
+
+
+def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dict[str, Any]:
+    """Return how long the frames of a rollout take with a budget.
+
+    Args:
+        calibration: Measurements that the simulator is chosen from.
+        scene: Scene to simulate.
+        factor: Budget as a multiple of the fastest frame that the calibration knows of.
+    """
+    count = vertex_count(scene)
+    fastest = min(method.fixed_ms + method.iteration_ms for method in methods_at(calibration, count))
+    budget = factor * fastest
+    choice = choose(calibration, count, budget_ms=budget)
+    params, config = simulator_of(choice.method, choice.iterations)
+    simulation = simulate(params, scene, config=config, pace=keep_budget(choice, budget))
+    return {
+        "method": choice.method,
+        "iterations": choice.iterations,
+        "iterations_mean": float(np.mean(simulation.trajectory.iterations[1:])),
+        "budget_ms": budget,
+        "frame_ms": simulation.timing.frame_ms,
+    }
 
 
 def main() -> None:
@@ -62,10 +115,10 @@ def main() -> None:
     )
     parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
     parser.add_argument(
-        "--calibration", type=Path, help="this device's own, or the shipped one, if not given"
+        "--calibration", type=Path, help="calibration to choose by; by default that of `eslr simulate`"
     )
     parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="one garment, clip, tolerance and budget")
     arguments = parser.parse_args()
     garments, clips, frames, every = GARMENTS, load_splits()["motions"]["test"], 40, EVERY
     tolerances, budgets = TOLERANCES, BUDGETS
@@ -77,52 +130,22 @@ def main() -> None:
     calibration = read_calibration(arguments.calibration)
     kept: dict[str, list[dict[str, Any]]] = {"tolerance": [], "budget": []}
     for size in arguments.sizes:
-        shares: dict[float, list[np.ndarray]] = {tolerance: [] for tolerance in tolerances}
-        chosen: dict[float, list[Choice]] = {tolerance: [] for tolerance in tolerances}
-        spent: dict[float, list[float]] = {tolerance: [] for tolerance in tolerances}
-        for garment in garments:
-            cloth = load_garment(garment, vertices=size)
-            scenes = prepare_scenes([cloth] * len(clips), motions)  # one body surface, so one compilation
-            count = int(np.sum(scenes[0].garment.vertex_mask))
-            for tolerance in tolerances:
-                choice = choose(calibration, count, tolerance=tolerance)
-                chosen[tolerance].append(choice)
-                for scene in scenes:
-                    left, iterations = frame_shares(choice, scene, every)
-                    shares[tolerance].append(left)
-                    spent[tolerance].append(iterations)
-            least = min(m.fixed_ms + m.iteration_ms for m in methods_at(calibration, count))
-            choices = {
-                factor * least: choose(calibration, count, budget_ms=factor * least) for factor in budgets
-            }
-            alone = prepare_scene(cloth, motions[0])  # not padded to the clips' common size
-            for budget, choice in choices.items():
-                params, config = simulator_of(choice.method, choice.iterations)
-                trajectory, timing = rollout_in_chunks(
-                    params, alone, config=config, pace=keep_budget(choice, budget)
-                )
-                took, spent_mean = timing.frame_ms, float(np.mean(np.asarray(trajectory.iterations)[1:]))
-                row = {"size": size, "garment": garment, "method": choice.method}
-                row |= {"iterations": choice.iterations, "iterations_mean": spent_mean}
-                row |= {"budget_ms": budget, "frame_ms": took}
-                kept["budget"].append(row)
-                print(f"{size} {garment}: budget {budget:.1f} ms, took {took:.1f} ms", flush=True)
-            jax.clear_caches()
+        cloths = {garment: load_garment(garment, vertices=size) for garment in garments}
+        scenes = []
+        for cloth in cloths.values():  # one body surface for all clips, so one compilation
+            scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
         for tolerance in tolerances:
-            joined = np.concatenate(shares[tolerance])
-            row = {
-                "size": size,
-                "tolerance": tolerance,
-                "methods": sorted({choice.method for choice in chosen[tolerance]}),
-                "frames": len(joined),
-                "kept": float(np.mean(joined <= tolerance)),
-                "gap_relative_median": float(np.median(joined)),
-                "gap_relative_p99": float(np.quantile(joined, 0.99)),
-                "iterations_mean": float(np.mean(spent[tolerance])),
-                "iterations_allowed": max(choice.iterations for choice in chosen[tolerance]),
-            }
+            row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
             kept["tolerance"].append(row)
-            print(f"{size}: tolerance {tolerance:.1%} kept by {row['kept']:.2%} of {len(joined)} frames")
+            print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
+        for garment, cloth in cloths.items():
+            scene = prepare_scene(cloth, motions[0])  # not padded to a common size
+            for factor in budgets:
+                row = {"size": size, "garment": garment, **measure_budget(calibration, scene, factor)}
+                kept["budget"].append(row)
+                text = f"budget {row['budget_ms']:.1f} ms, took {row['frame_ms']:.1f} ms"
+                print(f"{size} {garment}: {text}", flush=True)
+        jax.clear_caches()
     ratios = [row["frame_ms"] / row["budget_ms"] for row in kept["budget"]]
     result = {
         "clips": clips,

@@ -1,9 +1,9 @@
 """A scene of this package in Newton's cloth solvers: VBD, Style3D and XPBD (extra `peers`).
 
 Newton is Apache-2.0, https://github.com/newton-physics/newton; read in version 1.8.0. The body is one static
-mesh whose points and velocities are set, and whose search tree is refitted, before every substep; cloth meets it
-by vertices, at the distance that our vertices keep. There is no damping, and self-contact only in scenes that ask
-for it: VBD's at our distance, Style3D's as it comes; XPBD has none for vertices and faces.
+mesh whose points and velocities are set, and whose search tree is refitted, before every substep. Cloth meets it
+by vertices, at the distance that our vertices keep. There is no damping. With self-contact, VBD keeps our
+distance between layers, Style3D its own, and XPBD none between vertices and faces.
 
 How fabric is carried over (h thickness, mu and lambda Lame, l edge, A the areas of the faces beside it):
 
@@ -26,18 +26,18 @@ import contextlib
 import dataclasses
 import io
 import math
+from types import ModuleType
 from typing import Any, Literal
 
-import jax
+import jax.numpy as jnp
 import numpy as np
+from hard_cases import Simulator, foreign_trajectory
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError
-from eslr_jax.evaluation.hard_cases import Simulator, StressScene
 from eslr_jax.extras import require
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulation.scan import Frames, join_frames
+from eslr_jax.physics.problem import contact_thickness
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other
@@ -164,71 +164,65 @@ def bending_cotangents(cloth: Cloth) -> Float[np.ndarray, "hinges 4"]:
     )
 
 
-def contact_stiffness(scene: Scene, parameters: PhysicsParameters) -> float:
+def contact_stiffness(scene: Scene) -> float:
     """Return a spring [N/m] as strong as our cubic energy on a vertex pressed through the whole distance.
 
     3 k a r^2 / r, with the mean vertex area a and the distance r.
     """
     areas = np.asarray(scene.garment.vertex_areas)
-    radius = float(contact_thickness(scene.garment, parameters.collision_thickness))
-    return 3.0 * float(parameters.collision_stiffness) * float(areas[areas > 0].mean()) * radius
+    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
+    return 3.0 * float(scene.constants.collision_stiffness) * float(areas[areas > 0].mean()) * radius
+
+
+def require_newton() -> ModuleType:
+    """Return Newton.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    return require("newton", extra="peers", purpose="the comparison with other simulators")
 
 
 class NewtonCloth:
     """A scene in one of Newton's solvers; steps frames from any state."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        setting: Setting,
-        parameters: PhysicsParameters | None = None,
-        *,
-        self_contact: bool = False,
-    ) -> None:
+    def __init__(self, scene: Scene, setting: Setting) -> None:
         """Build the model.
 
         Args:
-            scene: Of `prepare_scene`.
+            scene: The scene.
             setting: Solver and effort.
-            parameters: Physical constants.
-            self_contact: Keep layers apart, where the solver can.
 
         Raises:
             MissingExtraError: Newton is not installed.
         """
-        newton = require("newton", extra="peers", purpose="the comparison with other simulators")
+        newton = require_newton()
         self._warp = require("warp", extra="peers", purpose="the comparison with other simulators")
         self._warp.config.log_level = self._warp.LOG_WARNING  # it would report every kernel it loads
-        parameters = parameters or PhysicsParameters()
+        constants = scene.constants
         self._cloth = cloth = prepare_cloth(scene.garment, scene.material)
         self._timestep = float(scene.timestep)
         self.substeps = setting.substeps or stable_substeps(cloth, self._timestep)
-        self._body = None if scene.body_positions is None else np.asarray(scene.body_positions)
         self._targets = (
             None if scene.pin_targets is None else np.asarray(scene.pin_targets)[:, cloth.vertices]
         )
         with contextlib.redirect_stdout(io.StringIO()):  # Style3D reports its own times
-            builder = _build(newton, scene, setting.solver, cloth, parameters)
+            builder = _build(newton, scene, setting.solver, cloth)
             self._model = model = builder.finalize()
-            model.set_gravity((0.0, -float(parameters.gravity), 0.0))
-            model.soft_contact_ke = contact_stiffness(scene, parameters)
+            model.set_gravity((0.0, -float(constants.gravity), 0.0))
+            model.soft_contact_ke = contact_stiffness(scene)
             model.soft_contact_kd = 0.0
-            model.soft_contact_mu = float(parameters.friction_coefficient)
+            model.soft_contact_mu = float(constants.friction_coefficient)
             model.particle_grid, model.particle_max_radius = None, 0.0  # XPBD would keep all vertices apart
-            layer_distance = None
-            if self_contact:
-                layer_distance = float(contact_thickness(scene.garment, parameters.repulsion_thickness))
-            self._solver = _make_solver(
-                newton, model, setting, float(parameters.friction_speed), layer_distance
-            )
-        self._mesh = None
-        if self._body is not None:
-            self._mesh = model.shape_source[0].mesh
-            for bound, sign in (
-                (model.shape_collision_aabb_lower, -1),
-                (model.shape_collision_aabb_upper, 1),
+            self._solver = _make_solver(newton, model, setting, scene)
+        self._body = None
+        if scene.body is not None:
+            self._body, self._mesh = np.asarray(scene.body.positions), model.shape_source[0].mesh
+            for bound, size in (
+                (model.shape_collision_aabb_lower, -_FAR),
+                (model.shape_collision_aabb_upper, _FAR),
             ):
-                bound.fill_(self._warp.vec3(sign * _FAR, sign * _FAR, sign * _FAR))
+                bound.fill_(self._warp.vec3(size, size, size))
         gap = max(_REACH / self.substeps, _LEAST_GAP)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=gap)
         self._contacts = self._pipeline.contacts()
@@ -250,11 +244,8 @@ class NewtonCloth:
             self._warp.capture_launch(self._graph)
         position, velocity = np.array(state.position), np.array(state.velocity)
         position[rows], velocity[rows] = self._now.particle_q.numpy(), self._now.particle_qd.numpy()
-        return dataclasses.replace(
-            state,
-            position=jax.numpy.asarray(position),
-            velocity=jax.numpy.asarray(velocity),
-            frame=state.frame + 1,
+        return state.replace(
+            position=jnp.asarray(position), velocity=jnp.asarray(velocity), frame=state.frame + 1
         )
 
     def _substep(self) -> None:
@@ -280,10 +271,10 @@ class NewtonCloth:
             self._now.particle_q.assign(position)
 
 
-def _build(newton: Any, scene: Scene, solver: str, cloth: Cloth, parameters: PhysicsParameters) -> Any:
+def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     """Return a model builder that holds cloth at rest and the body in its first frame."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
-    radius = float(contact_thickness(scene.garment, parameters.collision_thickness))
+    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
     count = len(cloth.rest)
     flags = np.where(cloth.masses > 0, int(newton.ParticleFlags.ACTIVE), 0).tolist()
     builder.add_particles(
@@ -302,8 +293,8 @@ def _build(newton: Any, scene: Scene, solver: str, cloth: Cloth, parameters: Phy
     bending = {
         "vbd": cloth.bending / length,  # 1/2 k l theta^2
         "style3d": cloth.bending_stiffness / 12.0,  # 3 k (l theta)^2 / (2 A)
-        "xpbd": cloth.bending
-        / cloth.hinge_areas,  # the force at a tip is k l theta, where ours is M l / (2 A_f)
+        # The force at a tip is k l theta, where ours is M l / (2 A_f).
+        "xpbd": cloth.bending / cloth.hinge_areas,
     }[solver]
     zeros = [0.0] * len(cloth.faces)
     builder.add_triangles(
@@ -330,40 +321,35 @@ def _build(newton: Any, scene: Scene, solver: str, cloth: Cloth, parameters: Phy
             builder.add_spring(int(i), int(j), float(stiffness), 0.0, control=0.0)
     if solver == "vbd":
         builder.color(include_bending=True)
-    if scene.surface is not None:
-        friction = float(parameters.friction_coefficient)
-        stiffness = contact_stiffness(scene, parameters)
-        config = newton.ModelBuilder.ShapeConfig(density=0.0, ke=stiffness, kd=0.0, mu=friction)
-        mesh = newton.Mesh(
-            np.asarray(scene.body_positions[0]),
-            np.asarray(scene.surface.faces).ravel(),
-            compute_inertia=False,
+    if scene.body is not None:
+        friction = float(scene.constants.friction_coefficient)
+        config = newton.ModelBuilder.ShapeConfig(
+            density=0.0, ke=contact_stiffness(scene), kd=0.0, mu=friction
         )
+        faces = np.asarray(scene.body.surface.faces).ravel()
+        mesh = newton.Mesh(np.asarray(scene.body.positions[0]), faces, compute_inertia=False)
         builder.add_shape_mesh(-1, mesh=mesh, cfg=config)
     return builder
 
 
-def _make_solver(
-    newton: Any, model: Any, setting: Setting, friction_speed: float, layer_distance: float | None
-) -> Any:
-    """Return the solver; layers keep that distance [m], None: they pass through each other."""
+def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene) -> Any:
+    """Return the solver; layers of cloth pass through each other where the scene does not model them."""
+    solvers, constants, iterations = newton.solvers, scene.constants, setting.iterations
+    friction_speed = float(constants.friction_speed)
     if setting.solver == "vbd":
         layers = {}
-        if layer_distance is not None:
+        if scene.self_contact is not None:
+            distance = float(contact_thickness(scene.garment, constants.repulsion_thickness))
             layers = {
                 "particle_enable_self_contact": True,
-                "particle_self_contact_margin": layer_distance,
-                "particle_self_contact_gap": layer_distance,  # Newton's advice: half to all of the margin
+                "particle_self_contact_margin": distance,
+                "particle_self_contact_gap": distance,  # Newton's advice: half to all of the margin
             }
-        return newton.solvers.SolverVBD(
-            model, iterations=setting.iterations, friction_epsilon=friction_speed, **layers
-        )
+        return solvers.SolverVBD(model, iterations=iterations, friction_epsilon=friction_speed, **layers)
     if setting.solver == "xpbd":
-        return newton.solvers.SolverXPBD(model, iterations=setting.iterations)
-    solver = newton.solvers.SolverStyle3D(
-        model, config=newton.solvers.SolverStyle3D.Config(iterations=setting.iterations)
-    )
-    if layer_distance is None:
+        return solvers.SolverXPBD(model, iterations=iterations)
+    solver = solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=iterations))
+    if scene.self_contact is None:
         solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
     solver.collision.friction_epsilon = friction_speed
     return solver
@@ -372,32 +358,25 @@ def _make_solver(
 def newton_simulator(setting: Setting) -> Simulator:
     """Return a solver of Newton as a simulator of the hard cases.
 
-    Residuals stay zero: Newton reports none, and ours are not its own.
-
     Args:
         setting: Solver and effort.
-    """
 
-    def run(stress: StressScene) -> Trajectory:
-        scene = stress.scene
+    Raises:
+        MissingExtraError: Newton is not installed.
+    """
+    require_newton()
+
+    def run(scene: Scene) -> Trajectory:
         try:
-            cloth = NewtonCloth(scene, setting, stress.parameters, self_contact=stress.self_contact)
-            states = [scene.start]
+            cloth = NewtonCloth(scene, setting)
+            states = [scene.initial_state]
             for frame in range(scene.num_frames - 1):
                 states.append(cloth(states[-1], frame))
-        except EslrError:
-            raise
-        except Exception as error:  # of a package that names none
+        except Exception as error:  # Newton names none of its own
             raise EslrError(f"{setting.name} refused the scene: {error}") from error
-        numpy = jax.numpy
-        frames = Frames(
-            positions=numpy.stack([state.position for state in states[1:]]),
-            velocities=numpy.stack([state.velocity for state in states[1:]]),
-            residuals=numpy.zeros(len(states) - 1),
-            iterations=numpy.full(len(states) - 1, cloth.substeps * setting.iterations),
-            needed_capacity=None,
-        )
-        return join_frames(scene.start, frames, states[-1])
+        positions = np.stack([state.position for state in states])
+        velocities = np.stack([state.velocity for state in states])
+        return foreign_trajectory(positions, scene, velocities, cloth.substeps * setting.iterations)
 
-    substeps = "as many" if setting.substeps is None else setting.substeps
-    return Simulator(f"{setting.name}, {substeps}x{setting.iterations}", run)
+    effort = f"{setting.substeps}x" if setting.substeps else "as many substeps as needed, "
+    return Simulator(f"{setting.name}, {effort}{setting.iterations}", run)

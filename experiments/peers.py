@@ -33,24 +33,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from blender_cloth import blender_python, run_blender, trajectory_of
-from newton_cloth import NewtonCloth, Setting
+from blender_cloth import blender_python, run_blender
+from hard_cases import drop_scene, foreign_trajectory
+from hard_cases.referee import judge
+from newton_cloth import NewtonCloth, Setting, require_newton
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import MissingExtraError
-from eslr_jax.evaluation.calibrate import device_name, example_scene
-from eslr_jax.evaluation.gap import answer_potentials, trajectory_gap, trajectory_states
-from eslr_jax.evaluation.hard_cases.body import drop_scene
-from eslr_jax.evaluation.hard_cases.simulators import split_frames
-from eslr_jax.evaluation.referee import Referee
+from eslr_jax.evaluation.calibrate import example_scene
+from eslr_jax.evaluation.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.report import environment
-from eslr_jax.extras import require
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulation.scan import frame_inputs, simulate_scene
-from eslr_jax.simulation.step import frame_problem, step
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
+from eslr_jax.simulation.rollout import rollout_scene, scan_frames
+from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import ClothState, Scene, Trajectory
 
 RESULTS = Path(__file__).parent / "results"
@@ -90,21 +89,32 @@ class Method:
         return f"{self.substeps}x{self.iterations}"
 
 
+def split_frames(scene: Scene, substeps: int) -> Scene:
+    """Return a scene with `substeps` shorter frames in place of each one; all else moves straight."""
+
+    def split(track):
+        share = (jnp.arange(substeps, dtype=track.dtype) / substeps)[None, :, None, None]
+        between = (1 - share) * track[:-1, None] + share * track[1:, None]
+        return jnp.concatenate([between.reshape(-1, *track.shape[1:]), track[-1:]])
+
+    body, pins = scene.body, scene.pin_targets
+    return scene.replace(
+        body=None if body is None else body.replace(positions=split(body.positions)),
+        pin_targets=None if pins is None else split(pins),
+        timestep=scene.timestep / substeps,
+        num_frames=(scene.num_frames - 1) * substeps + 1,
+    )
+
+
 def our_method(scene: Scene, substeps: int, iterations: int) -> Method:
     """Return our solver on a scene."""
-    config = SimConfig(simulator="physics", solver_iterations=iterations)
     fine = split_frames(scene, substeps)
-    inputs, constant = frame_inputs(fine), dataclasses.replace(fine, body_positions=None, pin_targets=None)
+    inputs, constant = frame_inputs(fine), without_tracks(fine).replace(num_frames=substeps + 1)
+    stepper = make_stepper(None, SimConfig(iterations=iterations))
 
     @jax.jit
-    def advance(scene: Scene, state: ClothState, inputs) -> ClothState:
-        def one(state, frame):
-            problem = frame_problem(
-                scene.garment, state, frame, scene.surface, scene.timestep, PhysicsParameters()
-            )
-            return step(None, scene.garment, scene.material, problem, state, config)[0], None
-
-        return jax.lax.scan(one, state, inputs)[0]
+    def advance(scene: Scene, state: ClothState, inputs: FrameInput) -> ClothState:
+        return scan_frames(stepper, scene, state, inputs)[0]
 
     def run(state: ClothState, frame: int) -> ClothState:
         rows = slice(frame * substeps, (frame + 1) * substeps)
@@ -116,7 +126,7 @@ def our_method(scene: Scene, substeps: int, iterations: int) -> Method:
 def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
     """Return Newton's solvers on a scene; none, and a line that says what to install, without Newton."""
     try:
-        require("newton", extra="peers", purpose="the comparison with other simulators")
+        require_newton()
     except MissingExtraError as error:
         print(f"peers left out: {error}", file=sys.stderr)
         return []
@@ -146,9 +156,9 @@ def take_turns(
         Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
     """
     for method in methods:  # compiles
-        jax.block_until_ready(method.step(scene.start, 0))
-    states = [scene.start] * len(methods)
-    positions = [[np.asarray(scene.start.position)] for _ in methods]
+        jax.block_until_ready(method.step(scene.initial_state, 0))
+    states = [scene.initial_state] * len(methods)
+    positions = [[np.asarray(scene.initial_state.position)] for _ in methods]
     wall, processor = [[] for _ in methods], [[] for _ in methods]
     for frame in range(num_frames - 1):
         for k, method in enumerate(methods):
@@ -163,7 +173,7 @@ def take_turns(
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the gap [J] of one frame of every method from some states of a rollout, and the frames' drops.
+    """Return every method's gap [J] after one frame from states of a rollout, and the frames' initial gaps [J].
 
     Args:
         methods: On the scene.
@@ -171,18 +181,17 @@ def teach(
         truth: Its near-optimal rollout.
         every: Frames between the states.
     """
-    parameters = PhysicsParameters()
-    ends = trajectory_gap(truth, scene, parameters, every=every)
-    states, inputs = trajectory_states(truth, scene, parameters)
+    ends = trajectory_gap(truth, scene, every=every)
+    states, inputs = trajectory_states(truth, scene)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
     frames = range(1, scene.num_frames - 1, every)
     gap = []
     for method in methods:
-        answers = [
+        reached = [
             method.step(jax.tree.map(lambda leaf, f=frame: leaf[f], states), frame).position
             for frame in frames
         ]
-        reached = answer_potentials(jnp.stack(answers), *taken, scene, parameters)
+        reached = reached_potentials(jnp.stack(reached), *taken, scene)
         gap.append(np.asarray(reached - ends.optimum))
     return gap, np.asarray(ends.initial_gap)
 
@@ -196,23 +205,23 @@ def _shapes(positions, scene: Scene):
         stretch = principal_stretches(position, scene.garment)[0]
         if body is None:
             return stretch, None
-        return stretch, find_contacts(position, body, body, scene.surface).distances
+        return stretch, find_contacts(position, body, body, scene.body.surface).distances
 
-    return jax.lax.map(measure, (positions, scene.body_positions))
+    body = None if scene.body is None else scene.body.positions
+    return jax.lax.map(measure, (positions, body))
 
 
 def count_intersections(position: np.ndarray, scene: Scene) -> dict[str, int | None]:
     """Return the pairs of triangles that intersect in the last frame; None without the referee's package."""
     names = ("intersections_cloth", "intersections_body")
     is_face = np.asarray(scene.garment.rest_areas) > 0
-    faces, body, body_faces = np.asarray(scene.garment.faces)[is_face], None, None
-    if scene.surface is not None:
-        body, body_faces = np.asarray(scene.body_positions)[-1], np.asarray(scene.surface.faces)
+    body = body_faces = None
+    if scene.body is not None:
+        body, body_faces = np.asarray(scene.body.positions[-1]), np.asarray(scene.body.surface.faces)
     try:
-        referee = Referee(faces, len(position), body_faces, 0 if body is None else len(body))
+        verdict = judge(position, np.asarray(scene.garment.faces)[is_face], body, body_faces)
     except MissingExtraError:
         return dict.fromkeys(names)
-    verdict = referee.judge(position, body)
     return dict(zip(names, (verdict.cloth_cloth, verdict.cloth_body), strict=True))
 
 
@@ -223,8 +232,8 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[st
     row["gap_relative_own"] = None
     if not is_finite:
         return row
-    ends = trajectory_gap(trajectory_of(positions, scene), scene, PhysicsParameters(), every=every)
-    row["gap_relative_own"] = float(np.median(ends.share(ends.answer)))
+    ends = trajectory_gap(foreign_trajectory(positions, scene), scene, every=every)
+    row["gap_relative_own"] = float(np.median(ends.share(ends.reached)))
     stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
     is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
     row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))
@@ -242,9 +251,9 @@ def measure_scene(
 ) -> list[dict[str, Any]]:
     """Return a row of plain values per method: ours by efforts, Newton's by settings, Blender's by efforts."""
     methods = [our_method(scene, *effort) for effort in efforts] + newton_methods(scene, settings)
-    truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
+    truth = rollout_scene(None, scene, SimConfig())
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
-    gap, drop = teach(methods, scene, truth, every)
+    gap, initial = teach(methods, scene, truth, every)
     rows = [
         {
             "method": method.name,
@@ -252,7 +261,7 @@ def measure_scene(
             "frame_ms": float(np.median(wall[k])),
             "frame_cpu_ms": float(np.median(processor[k])),
             **describe_rollout(positions[k], scene, every),
-            **summarize_gap(gap[k], drop),
+            **summarize_gap(gap[k], initial),
         }
         for k, method in enumerate(methods)
     ]
@@ -277,12 +286,12 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int)
     ]
 
 
-def summarize_gap(gap: np.ndarray, drop: np.ndarray) -> dict[str, float | None]:
-    """Return medians and largest values; None where an answer was not finite."""
+def summarize_gap(gap: np.ndarray, initial: np.ndarray) -> dict[str, float | None]:
+    """Return medians and largest values; None where a position was not finite."""
     gap = np.maximum(gap, 0.0)
     values = {
-        "gap_relative_median": np.median(gap / drop),
-        "gap_relative_max": np.max(gap / drop),
+        "gap_relative_median": np.median(gap / initial),
+        "gap_relative_max": np.max(gap / initial),
         "gap_j_median": np.median(gap),
     }
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
@@ -301,9 +310,9 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     methods += [newton_methods(scene, settings) for scene in scenes[1:]]
     _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
-        truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
-        gap, drop = teach(of_scene, scene, truth, EVERY)
-        relative.append([np.maximum(values, 0.0) / drop for values in gap])
+        truth = rollout_scene(None, scene, SimConfig())
+        gap, initial = teach(of_scene, scene, truth, EVERY)
+        relative.append([np.maximum(values, 0.0) / initial for values in gap])
     points: dict[str, list[dict[str, Any]]] = {}
     for k, method in enumerate(methods[0]):
         shares = np.concatenate([values[k] for values in relative])

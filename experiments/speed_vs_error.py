@@ -5,38 +5,29 @@
     python experiments/speed_vs_error.py --peers         # with Newton's solvers, which the extra `peers` installs
     python experiments/speed_vs_error.py --smoke --out DIR
 
-Every method starts from the same states, those of the near-optimal rollout on a test clip, so errors are
-teacher-forced. A method's time is a fixed part (contacts, network) and a part per L-BFGS iteration, measured in
-turns. Free rollouts follow for a few settings. What the peers are and how they are measured: `peers.py`.
+Every method starts from the same states: those of a near-optimal rollout on a test clip. A method's time has a
+fixed part (contacts, network) and a part per L-BFGS iteration; both are measured in turns. Free rollouts follow
+for a few numbers of iterations. `peers.py` says what the peers are and how they are measured.
+
 Writes speed_vs_error.json and .png after every size.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from pathlib import Path
 
 import jax
 import numpy as np
-from peers import SETTINGS, SMOKE_SETTINGS, peer_points, peer_versions
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.load import START_MODEL
-from eslr_jax.evaluation.calibrate import (
-    SOLVER,
-    Method,
-    device_name,
-    example_scene,
-    interpolate_gap,
-    measure_methods,
-    simulator_of,
-)
+from eslr_jax.evaluation.calibrate import example_scene, measure_methods, simulator_of
 from eslr_jax.evaluation.report import environment, trajectory_report
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.simulation.budget import SOLVER, Method, device_name, interpolate_gap
+from eslr_jax.simulation.rollout import rollout_scene
 
 RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
@@ -58,12 +49,20 @@ def points(method: Method) -> list[dict]:
 
 
 def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: tuple[int, ...]) -> list[dict]:
-    """Return the report of free rollouts with several iteration counts."""
+    """Return the report of a free rollout for every number of iterations.
+
+    Args:
+        name: SOLVER, or a bundled network with the solver behind it.
+        garment: Name of a bundled garment.
+        size: Its resolution.
+        num_frames: Length of the rollouts.
+        counts: Numbers of iterations.
+    """
     scene = example_scene(garment, size, CLIP, num_frames)
     reports = []
     params, config = simulator_of(name)
     for count in counts:
-        trajectory = simulate_scene(params, scene, PhysicsParameters(), config, count)
+        trajectory = rollout_scene(params, scene, config, count)
         report = trajectory_report(trajectory, scene)
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
         reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})
@@ -71,10 +70,14 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
 
 
 def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
-    """Return, for a range of budgets, the gap of every method within them.
+    """Return the gap of every method for a range of times per frame.
 
-    Ours can take any number of iterations between those that were measured; a peer's settings are single points,
-    of which the best counts.
+    Between two measured numbers of iterations our methods are interpolated. A peer's settings are single points;
+    the best of those within the time counts.
+
+    Args:
+        by_name: Measured points of every method.
+        peers: Names of those that are peers.
     """
     least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
     most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
@@ -139,10 +142,10 @@ def main() -> None:
     parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
     arguments = parser.parse_args()
-    garments, frames, rollout_frames, settings = GARMENTS, 40, 60, SETTINGS
+    garments, frames, rollout_frames = GARMENTS, 40, 60
     solver_counts, network_counts = ROLLOUTS
     if arguments.smoke:
-        garments, frames, rollout_frames, settings = GARMENTS[:1], 8, 8, SMOKE_SETTINGS
+        garments, frames, rollout_frames = GARMENTS[:1], 8, 8
         arguments.sizes, arguments.models = ["1k"], [START_MODEL]
         solver_counts = network_counts = (10,)  # which the calibration has compiled
     path = arguments.out / "speed_vs_error.json"
@@ -156,10 +159,15 @@ def main() -> None:
         methods = measure_methods((SOLVER, *arguments.models), scenes)
         print(f"{size}: methods measured", flush=True)
         measured = {method.name: points(method) for method in methods}
+        about = environment()
         if arguments.peers:
-            peers = peer_points(scenes, settings)
-            result["peers"] = list(peers)
-            measured |= peers
+            import peers
+
+            settings = peers.SMOKE_SETTINGS if arguments.smoke else peers.SETTINGS
+            of_peers = peers.peer_points(scenes, settings)
+            result["peers"] = list(of_peers)
+            measured |= of_peers
+            about["versions"] |= peers.peer_versions()
             print(f"{size}: peers measured", flush=True)
         rollouts = {
             name: [
@@ -175,19 +183,13 @@ def main() -> None:
         result["sizes"][size] = {
             "methods": measured,
             "costs": [
-                {
-                    key: value
-                    for key, value in dataclasses.asdict(method).items()
-                    if key not in ("median", "p99")
-                }
+                {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
                 for method in methods
             ],
             "budgets": who_wins(measured, result["peers"]),
             "rollouts": rollouts,
-            "environment": environment(),
+            "environment": about,
         }
-        if arguments.peers:
-            result["sizes"][size]["environment"]["versions"] |= peer_versions()
         draw(result, arguments.out / "speed_vs_error.png")
         with atomic_write(path) as temporary:
             temporary.write_text(json.dumps(result, indent=1) + "\n")

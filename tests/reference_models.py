@@ -60,14 +60,13 @@ def plain_layer(latents, graph, weights, config, xp):
     has_body = "world" in graph.edges
     moves_body = has_body and config.update_body
     concat = lambda *rows: xp.concatenate(rows, axis=1)  # noqa: E731
-    old = latents if config.residual else dict.fromkeys(latents, 0.0)
     new = dict(latents)
 
     step = plain_mlp(
         concat(v[receivers["mesh"]], v[senders["mesh"]], latents["mesh"]), weights["mesh_mlp"], xp
     )
     mesh_sum = segment_sum(step, receivers["mesh"], num_vertices)
-    new["mesh"] = old["mesh"] + step
+    new["mesh"] = latents["mesh"] + step
     world_sum = xp.zeros_like(mesh_sum)
     if has_body:
         mask = graph.globals["world_mask"][:, None].astype(v.dtype)
@@ -75,43 +74,50 @@ def plain_layer(latents, graph, weights, config, xp):
             concat(v[receivers["world"]], b[senders["world"]], latents["world"]), weights["world_mlp"], xp
         )
         world_sum = segment_sum(step * mask, receivers["world"], num_vertices)
-        new["world"] = old["world"] + step
-    new["garment"] = old["garment"] + plain_mlp(concat(v, mesh_sum, world_sum), weights["vertex_mlp"], xp)
+        new["world"] = latents["world"] + step
+    new["garment"] = v + plain_mlp(concat(v, mesh_sum, world_sum), weights["vertex_mlp"], xp)
     if moves_body:
         at_body, at_garment = receivers["world_reverse"], senders["world_reverse"]
         step = plain_mlp(
             concat(b[at_body], v[at_garment], latents["world_reverse"]), weights["world_mlp"], xp
         )
-        new["world_reverse"] = old["world_reverse"] + step
+        new["world_reverse"] = latents["world_reverse"] + step
         body_sum = segment_sum(step, at_body, b.shape[0])
-        new["body"] = old["body"] + plain_mlp(
-            concat(b, xp.zeros_like(b), body_sum), weights["vertex_mlp"], xp
-        )
+        new["body"] = b + plain_mlp(concat(b, xp.zeros_like(b), body_sum), weights["vertex_mlp"], xp)
     if not config.smoothing_steps:
         return new
 
-    real_edge = (senders["mesh"] != receivers["mesh"])[:, None].astype(v.dtype)  # padding points at itself
-    degree = segment_sum(real_edge, receivers["mesh"], num_vertices)
-    if has_body and config.smooth_world_edges:
+    is_real, degree = real_edges(graph, num_vertices, v.dtype, xp)
+    if has_body:
         degree = degree + segment_sum(mask, receivers["world"], num_vertices)
     p, q = new["garment"], new.get("body")
-    for k in range(config.smoothing_steps):
-        e, w, r = (
-            new[name] if name in new and (k == 0 or config.readd_edges) else 0.0
-            for name in ("mesh", "world", "world_reverse")
-        )
-        total = segment_sum((p[senders["mesh"]] + e) * real_edge, receivers["mesh"], num_vertices)
-        if has_body and config.smooth_world_edges:
-            total = total + segment_sum((q[senders["world"]] + w) * mask, receivers["world"], num_vertices)
+    for _ in range(config.smoothing_steps):
+        arriving = (p[senders["mesh"]] + new["mesh"]) * is_real
+        total = segment_sum(arriving, receivers["mesh"], num_vertices)
+        if has_body:
+            arriving = (q[senders["world"]] + new["world"]) * mask
+            total = total + segment_sum(arriving, receivers["world"], num_vertices)
         if moves_body:
-            q = p[senders["world_reverse"]] + r
+            q = p[senders["world_reverse"]] + new["world_reverse"]
         p = total / xp.maximum(degree, 1)
     p = xp.where(degree > 0, p, new["garment"])
-    old = new if config.residual else dict.fromkeys(new, 0.0)
-    smoothed = {"garment": old["garment"] + plain_mlp(p, weights["smooth_mlp"], xp)}
+    smoothed = {"garment": new["garment"] + plain_mlp(p, weights["smooth_mlp"], xp)}
     if moves_body:
-        smoothed["body"] = old["body"] + plain_mlp(q, weights["smooth_mlp"], xp)
+        smoothed["body"] = new["body"] + plain_mlp(q, weights["smooth_mlp"], xp)
     return {**new, **smoothed}
+
+
+def real_edges(graph, num_vertices, dtype, xp):
+    """Return one for every mesh edge that is not padding, and the number of these that enter each vertex."""
+    is_real = (graph.senders["mesh"] != graph.receivers["mesh"])[:, None].astype(dtype)
+    return is_real, SEGMENT_SUMS[xp](is_real, graph.receivers["mesh"], num_vertices)
+
+
+def exact_attention(queries, keys, values):
+    """Return softmax(q k^T / sqrt(size)) v."""
+    scores = queries @ keys.T / np.sqrt(queries.shape[1])
+    weights = np.exp(scores - scores.max(axis=1, keepdims=True))
+    return weights / weights.sum(axis=1, keepdims=True) @ values
 
 
 def plain_features(queries, keys, projection, kernel, xp):
@@ -156,7 +162,7 @@ def plain_network(config, params, graph, garment, xp=np):
         encoded = plain_encoded_vertices(nodes, edges, graph, weights, xp)
         features = encoded
         for layer in range(config.message_passing_steps):
-            features = plain_smoothing(features, garment, layer_weights(weights["layers"], layer), config, xp)
+            features = plain_smoothing(features, graph, layer_weights(weights["layers"], layer), config, xp)
         return plain_decoder(features, encoded, params, garment, config, xp)
     encoders = {name: weights[f"{name}_encoder"] for name in ("garment", "mesh", "world")}
     encoders["world_reverse"] = encoders["world"]
@@ -179,27 +185,79 @@ def plain_network(config, params, graph, garment, xp=np):
     return plain_decoder(latents["garment"], encoded, params, garment, config, xp)
 
 
+HOOD_STAGES = ("coarse0 mesh", "coarse0 coarse1", "coarse1", "coarse0 coarse1", "coarse0 mesh")
+
+
+def plain_hood(params, graph, steps_per_stage):
+    """Return the accelerations of the hierarchical network, before the output's normaliser, in NumPy."""
+    weights, statistics = params["params"], params["statistics"]
+    coarse = graph.globals["coarse"]
+    level = np.max([(k + 1) * edges.is_kept for k, edges in enumerate(coarse)], axis=0)
+    rows = {}
+    for name, features in graph.nodes.items():
+        embeddings = (
+            weights["type_embedding"][graph.globals[f"{name}_type"]],
+            weights["level_embedding"][level if name == "garment" else np.zeros_like(level)],
+        )
+        features = np.concatenate([features[:, :3], *embeddings, features[:, 3:]], axis=1)
+        features = plain_normalize(features, statistics["garment"], 3, np)
+        rows[name] = plain_mlp(features, weights["garment_encoder"], np)
+    for name, features in graph.edges.items():
+        kind, num_static = ("world", 0) if name.startswith("world") else ("mesh", 3)
+        encoder = weights[f"coarse_encoders_{name}" if name.startswith("coarse") else f"{kind}_encoder"]
+        rows[name] = plain_mlp(plain_normalize(features, statistics[kind], num_static, np), encoder, np)
+    for stage, names in enumerate(HOOD_STAGES):
+        joined = np.zeros(len(level), bool) | ("mesh" in names)
+        for k, edges in enumerate(coarse):
+            if f"coarse{k}" in names:
+                joined |= edges.is_kept
+        for step in range(steps_per_stage):
+            layer = layer_weights(weights[f"stages_{stage}"], step)
+            rows = plain_hood_step(rows, graph, layer, names.split(), joined)
+    return plain_mlp(rows["garment"], weights["decoder"], np)
+
+
+def plain_hood_step(rows, graph, weights, names, joined):
+    """One step: messages of the stage's edge sets and of the world edges that end where `joined` holds."""
+    v, b, new = rows["garment"], rows.get("body"), dict(rows)
+    sums = {}
+    for name in names:
+        ends = [v[graph.receivers[name]], v[graph.senders[name]]]
+        step = plain_mlp(np.concatenate([*ends, rows[name]], axis=1), weights[f"edge_mlps_{name}"], np)
+        sums[name] = numpy_segment_sum(step, graph.receivers[name], len(v))
+        new[name] = rows[name] + step
+    sums["world"], nothing = np.zeros_like(v), np.zeros_like(v)
+    if b is not None:
+        mask = (graph.globals["world_mask"] & joined)[:, None]
+        for name, ends in (("world", [v, b]), ("world_reverse", [b, v])):
+            step = mask * plain_mlp(np.concatenate([*ends, rows[name]], axis=1), weights["world_mlp"], np)
+            sums[name], new[name] = step, rows[name] + step
+        inputs = [b, *[nothing for _ in names], sums["world_reverse"]]
+        new["body"] = b + plain_mlp(np.concatenate(inputs, axis=1), weights["vertex_mlp"], np)
+    inputs = [v, *[sums[name] for name in sorted(names)], sums["world"]]
+    new["garment"] = v + plain_mlp(np.concatenate(inputs, axis=1), weights["vertex_mlp"], np)
+    return new
+
+
 def plain_encoded_vertices(nodes, edges, graph, weights, xp):
-    """Return vertex latents from rows that hold the vertex's, its body point's and its world edge's features."""
+    """Return vertex latents from rows with the features of vertex, body point and world edge."""
     rows = [nodes["garment"]]
     for features in (nodes["body"], edges["world"]) if "world" in edges else ():
-        padded = xp.concatenate([features, xp.zeros_like(features[:1])])
-        slot = graph.globals["world_slot"]
-        has_row = graph.globals["world_mask"][xp.minimum(slot, len(features) - 1)] & (slot < len(features))
-        rows.append(xp.where(has_row[:, None], padded[slot], 0.0))
+        rows.append(xp.where(graph.globals["world_mask"][:, None], features, 0.0))
     joined = xp.concatenate(rows, axis=1)
     missing = weights["encoder"]["kernel_0"].shape[0] - joined.shape[1]
     joined = xp.concatenate([joined, xp.zeros((len(joined), missing), joined.dtype)], axis=1)
     return plain_mlp(joined, weights["encoder"], xp)
 
 
-def plain_smoothing(v, garment, weights, config, xp):
+def plain_smoothing(v, graph, weights, config, xp):
     """One layer: every smoothing beside the latents themselves."""
     rows, smoothed = [v], v
-    mask = garment.neighbor_mask[..., None]
+    is_real, degree = real_edges(graph, v.shape[0], v.dtype, xp)
     for _ in range(config.smoothing_steps):
-        total = xp.sum(xp.where(mask, smoothed[garment.neighbors], 0.0), axis=1)
-        smoothed = total / xp.maximum(xp.sum(mask, axis=1), 1)
+        arriving = smoothed[graph.senders["mesh"]] * is_real
+        total = SEGMENT_SUMS[xp](arriving, graph.receivers["mesh"], v.shape[0])
+        smoothed = total / xp.maximum(degree, 1)
         rows.append(smoothed)
     return v + plain_mlp(xp.concatenate(rows, axis=1), weights["vertex_mlp"], xp)
 
@@ -246,7 +304,7 @@ def tube(num_around: int, num_along: int):
 
 
 def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool = False, seed: int = 0):
-    """Return a tube, a fabric and random inputs; every tenth vertex is out of the body's reach."""
+    """Return a tube, a fabric and random inputs; every tenth vertex is beyond the radius of world edges."""
     from eslr_jax.geometry.prepare import prepare_garment
     from eslr_jax.graph.inputs import GraphInputs
     from eslr_jax.types import Contacts, Material

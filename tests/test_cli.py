@@ -76,21 +76,8 @@ def test_unwritable_output_is_refused(tmp_path):
     refused(eslr("simulate", "--out", tmp_path / "file"), "is a file")
 
 
-def test_stress_refuses_an_unknown_case(tmp_path):
-    refused(eslr("stress", "--case", "freefall", "--out", tmp_path / "out"), "freefall", "free_fall")
-    assert not (tmp_path / "out").exists()
-
 
 @pytest.mark.slow
-def test_stress_prints_rows_and_draws_pictures(tmp_path):
-    result = eslr("stress", "--case", "free_fall", "--json", "--out", tmp_path)
-    assert result.returncode == 0, result.stderr
-    rows = json.loads(result.stdout)
-    assert len(rows) == 3
-    assert all(set(row) == {"case", "passed", "measure", "value", "bar"} for row in rows)
-    assert all(row["passed"] for row in rows)
-    assert {path.name for path in tmp_path.iterdir()} == {"free_fall.png", "hard_cases.json", "sheet.png"}
-
 
 def test_broken_mesh_is_refused(tmp_path):
     def simulate(path):

@@ -73,6 +73,15 @@ def test_fabric_per_part(two_fabrics):
     assert float(stretch_energy(stretched, garment, material)) == pytest.approx(sum(parts), rel=1e-4)
 
 
+def test_padding_does_not_change_the_fabric_of_parts(two_fabrics):
+    stored, garment = two_fabrics
+    padded = garment_material(["left:denim"], prepare_stored(stored, pad=True), stored)
+    plain = garment_material(["left:denim"], garment, stored)
+    for name in ("density", "lame_mu", "bending_stiffness"):
+        values = getattr(plain, name)
+        np.testing.assert_array_equal(getattr(padded, name)[: len(values)], values)
+
+
 def test_fabrics_beyond_the_networks_are_told():
     assert beyond_training(COTTON) == ()
     assert beyond_training(fabric_material("denim")) == ("lame_mu", "lame_lambda")
@@ -90,8 +99,8 @@ def test_fabric_of_the_file_is_the_default(two_fabrics):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("denin", "did you mean denim"),
-    ("weight=3", "'weight' is none of density"),
-    ("density=heavy", "is no number"),
+    ("weight=3", "'weight' is unknown; use density"),
+    ("density=heavy", "is not a number"),
     ("density=-1", "must be positive"),
     ("density=nan", "must be positive"),
     ("collar:silk", "no part 'collar'; parts: right, left"),

@@ -1,175 +1,27 @@
 """Runs in the browser: the scene over the server's own interface, and in headless Chromium."""
 
-import dataclasses
-import json
 import os
 import shutil
 import threading
 import time
-import typing
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from example_runs import write_run
 
 from eslr_jax.assets import load_garment_file
-from eslr_jax.cli.runs import render
-from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.evaluation.fields import FIELDS, _prepared, _scene, energy_shares, gap_shares, run_field
-from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
+from eslr_jax.evaluation.fields import FIELDS
 from eslr_jax.io.garment import write_garment_npz
 from eslr_jax.io.run import read_run
-from eslr_jax.io.trajectory import write_trajectory
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
-from eslr_jax.physics.problem import PhysicsParameters, start_guess
-from eslr_jax.render.colors import color_scale
-from eslr_jax.scene import initial_state
-from eslr_jax.simulation.step import FrameInput, frame_problem, solve
-
-
-def make_run(folder, body, name, scale=1.0):
-    """Write a run of six frames: a tank top at rest, stretched, raised, at rest, shrunk, and lowered."""
-    folder = folder / name
-    folder.mkdir()
-    garment = load_garment_file("tank")
-    rest = garment.rest_positions + np.array([0, 0.82, 0])
-    shrunk = rest * [0.9, 1, 0.9]  # into the body
-    moved = [rest + np.array([0, 0.02, 0]), rest, shrunk, shrunk - np.array([0, 1e-3, 0])]
-    frames = np.stack([rest, rest * [1.1 * scale, 1, 1], *moved])
-    body_positions = np.repeat(
-        np.asarray(body.rest_positions)[None] + np.array([[0, 0.82, 0]], np.float32), len(frames), 0
-    )
-    write_trajectory(
-        folder / "trajectory.npz",
-        positions=frames,
-        velocities=np.gradient(frames, 1 / 30, axis=0),
-        faces=garment.faces,
-        timestep=1 / 30,
-        body_positions=body_positions,
-        body_faces=np.asarray(body.faces),
-        body_rest_positions=np.asarray(body.rest_positions),
-        contact_faces=np.asarray(body.faces)[np.asarray(body.is_obstacle)],
-    )
-    (folder / "report.json").write_text(json.dumps({"self_contact": True}))
-    write_garment_npz(folder / "garment.npz", garment)
-    return folder
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, body):
     folder = tmp_path_factory.mktemp("runs")
-    return [read_run(make_run(folder, body, name, scale)) for name, scale in (("loose", 1.0), ("tight", 1.2))]
-
-
-def test_stretch_of_uniform_stretch(runs):
-    field = run_field(runs[0], "stretch")
-    np.testing.assert_allclose(field.values[0], 1.0, atol=1e-4)
-    assert field.values[1].min() > 1.0
-    assert 1.05 < np.median(field.values[1]) <= field.values[1].max() < 1.1 + 1e-3
-    np.testing.assert_allclose(field.values[2], field.values[0], atol=1e-4)
-
-
-@pytest.fixture(scope="module")
-def last_problem(runs):
-    """The last frame of a run as its simulation stated it, with garment and fabric."""
-    garment, material = _prepared(runs[0])
-    scene = _scene(runs[0], garment, material, has_contact=True)
-    parameters = PhysicsParameters()
-    state, inputs = jax.tree.map(
-        lambda leaf: leaf[-1], trajectory_states(runs[0].trajectory, scene, parameters)
-    )
-    config = SimConfig(simulator="physics", self_contact=True)
-    problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters, config)
-    return problem, garment, material
-
-
-@pytest.mark.parametrize("term", PotentialTerms._fields)
-def test_energy_shares_add_up_to_the_energy(runs, last_problem, term):
-    problem, garment, material = last_problem
-    answer = jnp.asarray(runs[0].trajectory.positions[-1])
-    whole = float(getattr(potential_terms(answer, problem, garment, material), term))
-    shares = run_field(runs[0], f"{term}-energy").values[-1] * np.asarray(garment.vertex_areas)
-    assert shares.sum() == pytest.approx(whole, rel=1e-3, abs=1e-6)
-    assert whole != 0 or term == "repulsion"  # no two layers meet
-
-
-def test_excess_shares_add_up_to_what_the_answer_is_above_the_optimum(runs, last_problem):
-    problem, garment, material = last_problem
-    answer = start_guess(problem, garment)
-    minimum = solve(problem, garment, material, answer, iterations=500, memory=8, tolerance=1e-3)
-    gap = float(potential(answer, problem, garment, material) - minimum.value)
-    shares = np.asarray(gap_shares(answer, problem, garment, material))
-    assert gap > 1e-3
-    assert shares.sum() == pytest.approx(gap, rel=0.01)  # contacts have kinks
-    assert -shares[shares < 0].sum() < 0.5 * gap
-    at_optimum = gap_shares(minimum.position, problem, garment, material)
-    assert abs(float(at_optimum.sum())) < 0.01 * gap
-
-
-def test_repulsion_counts_where_layers_meet():
-    """Two sheets 1 mm apart: the pairs' energy goes to both layers."""
-    lower = sheet(6, 6, (0.1, 0.1))
-    upper = lower[0] + np.array([0.003, 1e-3, 0.002]), lower[1]
-    garment = make_cloth(join_meshes(lower, upper), {}, allow_components=True)
-    still = jnp.asarray(garment.rest_positions)
-    state = initial_state(still, jnp.zeros_like(still))
-    problem = frame_problem(
-        garment,
-        state,
-        FrameInput(None, None, None),
-        None,
-        jnp.float32(1 / 30),
-        PhysicsParameters(),
-        SimConfig(simulator="physics", self_contact=True),
-    )
-    whole = float(potential_terms(still, problem, garment, COTTON).repulsion)
-    shares = np.asarray(energy_shares("repulsion", still, problem, garment, COTTON))
-    assert whole > 0
-    assert shares.sum() == pytest.approx(whole, rel=1e-4)
-    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole
-
-
-@pytest.mark.parametrize(("name", "change", "message"), [
-    ("gap", {"contact_faces": None, "body_rest_positions": None}, "rest pose, which contacts need"),
-    ("friction-energy", {"body_positions": None, "body_faces": None}, "has no body, and so no friction-energy"),
-    ("distance", {"body_positions": None, "body_faces": None}, "has no body"),
-])  # fmt: skip
-def test_what_a_run_lacks_for_a_field_is_said(runs, name, change, message):
-    run = dataclasses.replace(runs[0], trajectory=dataclasses.replace(runs[0].trajectory, **change))
-    with pytest.raises(AssetError, match=message) as caught:
-        run_field(run, name)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_run_without_self_contact_has_no_repulsion(runs):
-    with pytest.raises(AssetError, match="without --self-contact"):
-        run_field(dataclasses.replace(runs[0], report={}), "repulsion-energy")
-
-
-def test_render_knows_every_field():
-    colors = typing.get_type_hints(render)["color"]
-    assert set(typing.get_args(colors)) == {"fabric", *FIELDS}
-
-
-def test_distance_grows_by_what_the_cloth_is_moved(runs):
-    field = run_field(runs[0], "distance")
-    assert np.all(field.values[0] > 0)
-    np.testing.assert_allclose(field.values[0], field.values[3])
-    with pytest.raises(AssetError, match="no field 'warmth'"):
-        run_field(runs[0], "warmth")
-
-
-def test_color_scale_ends_and_order():
-    colors = color_scale(np.array([-9.0, 0.0, 0.5, 1.0, 9.0, np.nan]), 0.0, 1.0)
-    np.testing.assert_array_equal(colors[0], colors[1])
-    np.testing.assert_array_equal(colors[3], colors[4])
-    np.testing.assert_array_equal(colors[5], colors[1])
-    lightness = color_scale(np.linspace(0, 1, 30), 0.0, 1.0) @ [0.3, 0.6, 0.1]
-    assert np.all(np.diff(lightness) > 0)
+    return [
+        read_run(write_run(folder, body, name, scale)) for name, scale in (("loose", 1.0), ("tight", 1.2))
+    ]
 
 
 @pytest.mark.parametrize(("spoil", "message"), [
@@ -180,7 +32,7 @@ def test_color_scale_ends_and_order():
     (lambda folder: (folder / "report.json").write_text("{"), "report.json"),
 ])  # fmt: skip
 def test_broken_runs_are_named(tmp_path, body, spoil, message):
-    folder = make_run(tmp_path, body, "run")
+    folder = write_run(tmp_path, body, "run")
     spoil(folder)
     with pytest.raises(AssetError, match=message) as caught:
         read_run(folder)
@@ -198,7 +50,7 @@ def view(runs):
 
 
 def scene_of(view):
-    """Return the scene's meshes by name."""
+    """Return what the scene shows of the runs, by name."""
     handles = view.server.scene._handle_from_node_name
     return {name: handle for name, handle in handles.items() if name.startswith("/runs/")}
 
@@ -227,16 +79,6 @@ def test_controls_change_the_scene(view, runs):
     assert scene_of(view)["/runs/0/garment"].wireframe
     assert not scene_of(view)["/runs/0/body"].visible
     view.controls["wireframe"].value = False
-    for name in FIELDS:
-        view.controls["color"].value = name
-        show(view)
-        assert "dark" in view.controls["legend"].content
-    view.fields.clear()
-    view.runs[0].report["self_contact"] = False
-    view.controls["color"].value = "repulsion-energy"
-    show(view)
-    view.runs[0].report["self_contact"] = True
-    assert "without --self-contact" in view.controls["legend"].content
     view.controls["frame"].value = 0
     view.controls["playing"].value = True
     end = threading.Event()
@@ -246,6 +88,64 @@ def test_controls_change_the_scene(view, runs):
     end.set()
     player.join(timeout=10)
     assert not player.is_alive()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_field_is_plotted_over_time_and_leads_to_its_worst_frame(view):
+    from eslr_jax.viewer import go_to_worst, show
+
+    plot = view.controls["plot"]
+    assert not plot.visible
+    view.controls["color"].value = "stretch"
+    show(view)
+    assert "dark" in view.controls["legend"].content
+    deadline = time.monotonic() + 60
+    while not plot.visible and time.monotonic() < deadline:
+        time.sleep(0.05)  # its callback has a thread of its own
+    assert plot.visible
+    time_of_frame, *curves = plot.data
+    np.testing.assert_allclose(np.diff(time_of_frame), 1 / 30)
+    assert [int(np.argmax(curve)) for curve in curves] == [1, 1]  # both are stretched then
+    assert curves[1][1] > curves[0][1] > 1.05
+    go_to_worst(view)
+    assert view.controls["frame"].value == 1
+    view.runs[0].report["self_contact"] = False
+    view.controls["color"].value = "repulsion-energy"
+    show(view)
+    view.runs[0].report["self_contact"] = True
+    assert "without --self-contact" in view.controls["legend"].content
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_every_field_has_a_legend(view):
+    from eslr_jax.viewer import show
+
+    for name in FIELDS:
+        view.controls["color"].value = name
+        show(view)
+        assert "dark" in view.controls["legend"].content
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_names_are_above_the_heads_and_the_page_follows(view):
+    from eslr_jax.viewer import show
+
+    top = view.runs[0].trajectory.body_positions[0][:, 1].max()
+    assert scene_of(view)["/runs/0/name"].position[1] == pytest.approx(top + 0.2, abs=1e-5)
+    moved = view.runs[0].trajectory
+    moved.positions[2] += [0.0, 0.0, 2.0]
+    moved.body_positions[2] += [0.0, 0.0, 2.0]
+    try:
+        for follows, place in ((True, 0.0), (False, 2.0)):
+            view.controls["follow"].value = follows
+            view.controls["frame"].value = 2
+            show(view)
+            body = scene_of(view)["/runs/0/body"].vertices
+            assert body[:, 2].mean() - moved.body_positions[0][:, 2].mean() == pytest.approx(place, abs=1e-4)
+    finally:
+        moved.positions[2] -= [0.0, 0.0, 2.0]
+        moved.body_positions[2] -= [0.0, 0.0, 2.0]
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or os.environ.get("CHROMIUM")

@@ -1,4 +1,4 @@
-"""What is in the box: a name, or the path of a file, to a body, garment, motion or model."""
+"""Bundled bodies, garments, motions and networks, loaded by name, and those of a user by path."""
 
 from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits, split_clips
 from eslr_jax.assets.load import (

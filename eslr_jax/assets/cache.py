@@ -1,8 +1,8 @@
-"""Results that take seconds to make, kept on disk by what they were made of.
+"""Keep results that take seconds to compute on disk.
 
-An entry's name is a hash of its inputs and of the code that made it, so it is never out of date. It appears
-whole or not at all, so two processes may make the same one at once; the last one stays. A cache that can't be
-written or read costs time and nothing else.
+The name of an entry is a hash of its inputs and of the code that computes it, so no entry is ever out of date.
+An entry appears whole or not at all: two processes may write the same one, and the last one stays. A cache that
+can't be read or written costs time and nothing else.
 """
 
 from __future__ import annotations
@@ -16,27 +16,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import platformdirs
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.npz import read_arrays, write_arrays
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
-_CODE = ("geometry", "fit", "io/mesh.py", "io/garment.py", "types.py")  # whose changes make entries worthless
+# A change in these makes every entry stale.
+_CODE = ("geometry", "fit", "io/mesh.py", "io/gltf_document.py", "io/garment.py", "types.py")
 
 
 def user_cache() -> Path:
-    """Return the folder of everything that is kept between runs on this machine; it need not exist."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax"
+    """Return the folder for all caches of this user, which may not exist yet; Linux honours XDG_CACHE_HOME."""
+    return platformdirs.user_cache_path("eslr-jax", appauthor=False)
 
 
 def cache_folder() -> Path:
-    """Return the folder of the garments' cache; it need not exist."""
+    """Return the folder for cached garments, which may not exist yet."""
     return user_cache() / "garments"
 
 
 @cache
 def _code_hash() -> bytes:
-    """Return a hash of the code behind the entries."""
+    """Return a hash of the source files in `_CODE`."""
     package = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for name in _CODE:
@@ -47,7 +49,7 @@ def _code_hash() -> bytes:
 
 
 def content_key(*parts: Any) -> str:
-    """Return a hash of arrays, bytes, paths' contents are the caller's, and of the representation of the rest."""
+    """Return a hash of arrays, of bytes, and of the `repr` of everything else; a path counts as its name."""
     digest = hashlib.sha256(_code_hash())
     for part in parts:
         if isinstance(part, bytes):
@@ -61,7 +63,12 @@ def content_key(*parts: Any) -> str:
 
 
 def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the arrays of an entry, made and kept if there is none."""
+    """Return the arrays of an entry; compute and store them if the entry is missing.
+
+    Args:
+        key: Name of the entry, from `content_key`.
+        make: Computes the arrays.
+    """
     path = cache_folder() / f"{key}.npz"
     if path.exists():
         with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again
@@ -77,7 +84,7 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
 
 
 def _remove_oldest(folder: Path) -> None:
-    """Remove the entries beyond `MAX_ENTRIES` that were not used for longest."""
+    """Remove the least recently used entries beyond `MAX_ENTRIES`."""
     entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
     for path in entries[:-MAX_ENTRIES]:
         path.unlink(missing_ok=True)

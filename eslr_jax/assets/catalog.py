@@ -15,7 +15,7 @@ from eslr_jax.errors import AssetError, ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class Asset:
-    """One bundled thing."""
+    """A bundled body, garment, motion or model."""
 
     kind: str  # body, garment, motion or model
     name: str
@@ -43,7 +43,7 @@ def data_folder() -> Path:
 
 @cache
 def list_assets() -> tuple[Asset, ...]:
-    """Return every bundled asset."""
+    """Return all bundled assets, in the order of the manifest."""
     entries = json.loads((data_folder() / "manifest.json").read_text())["assets"]
     return tuple(Asset(**entry) for entry in entries)
 
@@ -57,7 +57,7 @@ def find_asset(kind: str, name: str) -> Path:
     """Return the file of a named asset.
 
     Raises:
-        AssetError: There is no such name; the message lists what exists.
+        AssetError: There is no such name. The message lists the names.
     """
     for asset in list_assets():
         if asset.kind == kind and asset.name == name:
@@ -75,7 +75,6 @@ def is_intact(asset: Asset) -> bool:
     return hashlib.sha256((data_folder() / asset.file).read_bytes()).hexdigest() == asset.sha256
 
 
-@cache
 def split_clips(split: str) -> tuple[str, ...]:
     """Return the names of a split's clips.
 
@@ -89,6 +88,7 @@ def split_clips(split: str) -> tuple[str, ...]:
     return tuple(motions[split])
 
 
+@cache
 def load_splits() -> dict[str, Any]:
     """Return the split of clips and garments into train, validation, test and unseen."""
     return json.loads((data_folder() / "splits.json").read_text())

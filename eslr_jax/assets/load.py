@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -13,20 +14,22 @@ import numpy as np
 
 from eslr_jax.assets.cache import cached_arrays, content_key
 from eslr_jax.assets.catalog import asset_names, find_asset
-from eslr_jax.body.motion import Motion
+from eslr_jax.body.motion import Motion, shape_body
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_body, make_motion, skeleton_motion
+from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.validate import validate_body
+from eslr_jax.io.asf import read_amc
 from eslr_jax.io.body import read_body
 from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.fbx import fbx_clip_names, read_fbx_body, read_fbx_motion
 from eslr_jax.io.garment import (
     GarmentFile,
+    GarmentSource,
     garment_arrays,
     garment_from_arrays,
     is_garment_file,
@@ -42,7 +45,7 @@ from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
 DEFAULT_MOTION = "cmu_016_32"
-START_MODEL = "smooth-small"  # the network that was trained as a start for the solver
+START_MODEL = "smooth-small"  # the network that was trained to give the solver an initial guess
 Resolution = Literal["1k", "4k", "10k"]
 
 
@@ -51,34 +54,50 @@ def _is_path(name: str) -> bool:
     return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).exists()
 
 
-def load_body(name: str | Path = "anny") -> Body:
-    """Load a rigged body.
+def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Sequence[float] = ()) -> Body:
+    """Load a rigged body; warn if the unit of its file is a guess.
 
     Args:
         name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
-            character (.gltf, .glb, .vrm, .fbx), or an npz file in the bundled format. `FILE#MESH,MESH` picks
+            character (.gltf, .glb, .vrm), or an npz file in the bundled format. `FILE#MESH,MESH` picks
             the meshes of a character that make up the body.
+        units: Unit of the file: m, dm, cm, mm, in, ft, or metres per unit; by default recognised.
+        betas: Shape coefficients [standard deviations] of a body with shapes, such as a SMPL model.
 
     Raises:
-        AssetError: There is no such body, the file is damaged, or it is no rigged body in metres.
+        AssetError: There is no such body, the file is damaged, or its unit is unknown.
+        ConfigError: The body has fewer shapes than betas.
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body in the bundled format is not closed, or inside out.
     """
-    text = str(name)
+    body = _read_body(str(name), units)
+    return shape_body(body, betas) if len(betas) else body
+
+
+def _read_body(text: str, units: str | None) -> Body:
+    """Return a body by name or file, in its average shape."""
     if not _is_path(text):
         return _closed(read_body(find_asset("body", text)), text)
     file, meshes = _split_name(text)
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
-        return make_body(read_gltf_body(file, meshes))
-    if suffix == ".fbx":
-        return make_body(read_fbx_body(file, meshes))
+        return make_body(read_gltf_body(file, meshes), units=units)
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
-        return make_body(read_smpl_body(file))
+        return make_body(read_smpl_body(file), units=units)
     if suffix == ".npz":
         return _closed(read_body(file), Path(file).name)
-    raise AssetError(
-        f"body file {file} has the unknown suffix {suffix!r}; give .npz, .pkl, .glb, .gltf or .fbx"
+    raise _unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
+
+
+def _unknown_suffix(content: str, file: str | Path, known: Iterable[str]) -> AssetError:
+    """Return the error for a file of an unknown kind."""
+    suffix = Path(file).suffix.lower()
+    if suffix == ".fbx":
+        return AssetError(
+            f"{content} file {file}: FBX is not read; export it as glTF (in Blender: File > Export > glTF 2.0)"
+        )
+    return AssetError(
+        f"{content} file {file} has the unknown suffix {suffix!r}; give one of {', '.join(known)}"
     )
 
 
@@ -110,14 +129,14 @@ def load_garment(
     """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation.
 
     Args:
-        name: Name of a bundled garment; or path of a file that `eslr fit` wrote; or of a mesh (obj, ply, stl,
-            glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`), which is fitted first.
+        name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
+            or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
         vertices: Resolution of a bundled garment.
         body: Body that a mesh is fitted to; the bundled one by default.
-        fit: How a mesh is fitted, where that is not left to recognition.
+        fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
-        cache: Keep what was computed for the next time.
-        options: Passed on to `prepare_garment`.
+        cache: Keep the result for the next time.
+        options: Arguments of `prepare_garment`.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
@@ -134,14 +153,26 @@ def load_garment_file(
     body: Body | None = None,
     fit: FitOptions | None = None,
     cache: bool = True,
+    on_source: Callable[[GarmentSource], None] | None = None,
 ) -> GarmentFile:
-    """Load a garment as arrays on the host, fitted to the body if it is a mesh; see `load_garment`."""
+    """Load a garment as arrays on the host, fitted to the body if it is a mesh.
+
+    Args:
+        name: Garment; see `load_garment`, also for the other arguments.
+        vertices: Resolution of a bundled garment.
+        body: Body that a mesh is fitted to.
+        fit: Options of the fit.
+        cache: Keep the result for the next time.
+        on_source: Function that is told of a mesh before it is fitted.
+    """
     if not _is_path(str(name)):
         return read_garment_npz(find_asset("garment", f"{name}_{vertices}"))
     path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
     if path.is_file() and is_garment_file(path):
         return read_garment_npz(path)
     source = read_garment_source(name)
+    if on_source is not None:
+        on_source(source)
     rig, options = load_body() if body is None else body, fit or FitOptions()
     if not cache:
         return fit_garment(source, rig, options)
@@ -156,11 +187,11 @@ def prepare_stored(
     """Prepare a garment file for simulation.
 
     Args:
-        stored: Of `load_garment_file`.
+        stored: Garment of `load_garment_file`.
         pad: Pad to a bucket of sizes.
-        cache: Keep what was computed for the next time.
-        name: What messages call the garment.
-        options: Passed on to `prepare_garment`.
+        cache: Keep the result for the next time.
+        name: Name of the garment in messages.
+        options: Arguments of `prepare_garment`.
 
     Raises:
         MeshError: The mesh can't be simulated.
@@ -179,7 +210,8 @@ def prepare_stored(
             name=name,
             **options,
         )
-        return {field.name: np.asarray(getattr(garment, field.name)) for field in dataclasses.fields(Garment)}
+        leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
+        return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
     if not cache:
         return to_device(Garment(**make()))
@@ -190,19 +222,17 @@ def prepare_stored(
 
 
 def _body_arrays(body: Body) -> list[np.ndarray]:
-    """Return what of a body a fit depends on."""
-    return [
-        np.asarray(array)
-        for array in (
-            body.rest_positions,
-            body.faces,
-            body.skin_weights,
-            body.skin_indices,
-            body.is_obstacle,
-            body.joint_rest_positions,
-            np.array(body.parents),
-        )
-    ]
+    """Return the arrays of a body that a fit depends on."""
+    names = (
+        "rest_positions",
+        "faces",
+        "skin_weights",
+        "skin_indices",
+        "is_obstacle",
+        "joint_rest_positions",
+        "parents",
+    )
+    return [np.asarray(getattr(body, name)) for name in names]
 
 
 @lru_cache(maxsize=4)
@@ -220,13 +250,15 @@ def load_motion(
 ) -> Motion:
     """Load a motion, for the bundled body or carried over to another one.
 
+    A T-pose before the motion of a file is skipped with a warning.
+
     Args:
         name: Name of a bundled clip, or turn, jump or swing, which are computed; or path of a motion: .bvh,
-            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm, .fbx), or an archive in
+            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm), or an archive in
             the bundled format. `FILE#CLIP` picks one of several clips.
         body: The body that is to move; the bundled one by default.
-        joint_map: Changes to the map of joints, the body's to the motion's; "" keeps a joint still.
-        up: Axis that points up in a BVH file; by default the one along which its figure stands.
+        joint_map: Changes to the map from the body's joints to the motion's; "" keeps a joint still.
+        up: Axis that points up in a BVH file; by default the one along which the figure stands.
 
     Raises:
         AssetError: There is no such motion, or the file is damaged.
@@ -241,9 +273,11 @@ def load_motion(
         motion = _bundled_motion(text)
         if body is None or (_is_made_for(motion, body, is_bundled=not _is_path(text)) and not joint_map):
             return motion
-        # An archive tells no skeleton: it is the bundled body's.
+        # An archive holds no skeleton, so that of the bundled body is used.
         return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
-    source = read_skeleton_motion(file, clip)
+    source, skipped = skip_start_pose(read_skeleton_motion(file, clip))
+    if skipped:
+        warnings.warn(skipped, stacklevel=2)
     is_bvh = Path(file).suffix.lower() == ".bvh"
     return make_motion(
         source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
@@ -251,16 +285,16 @@ def load_motion(
 
 
 def own_motion(body: str) -> str:
-    """Return the motion that a body comes with: the animation in its file, or else a bundled walk."""
+    """Return the animation in a body's file, or a bundled walk if it has none."""
     file, _ = _split_name(body)
     suffix = Path(file).suffix.lower()
-    if (suffix in GLTF_SUFFIXES and gltf_clip_names(file)) or (suffix == ".fbx" and fbx_clip_names(file)):
+    if suffix in GLTF_SUFFIXES and gltf_clip_names(file):
         return file
     return DEFAULT_MOTION
 
 
 def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
-    """Tell whether a clip moves this body as it is; a user's own archive is taken at its joints' names."""
+    """Tell whether a clip can move this body without retargeting; a user's archive by its joint names."""
     if motion.joint_names != body.joint_names:
         return False
     rest = np.asarray(body.joint_rest_positions)
@@ -276,7 +310,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     """Read a motion with the skeleton of its file.
 
     Args:
-        file: .bvh, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb, .vrm or .fbx.
+        file: .bvh, .amc with its .asf, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
         clip: Which of several animations.
 
     Raises:
@@ -287,12 +321,9 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     suffix = Path(file).suffix.lower()
     if suffix in GLTF_SUFFIXES:
         return read_gltf_motion(file, clip)
-    if suffix == ".fbx":
-        return read_fbx_motion(file, clip)
-    readers = {".bvh": read_bvh, ".npz": read_amass, ".pkl": read_smpl_pickle}
+    readers = {".bvh": read_bvh, ".amc": read_amc, ".npz": read_amass, ".pkl": read_smpl_pickle}
     if suffix not in readers:
-        known = ", ".join([*readers, *GLTF_SUFFIXES, ".fbx"])
-        raise AssetError(f"motion file {file} has the unknown suffix {suffix!r}; give one of {known}")
+        raise _unknown_suffix("motion", file, (*readers, *GLTF_SUFFIXES))
     return readers[suffix](file)
 
 
@@ -318,14 +349,14 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     """Load a trained network.
 
     Args:
-        name: Name of a bundled model, or path of an exported npz file; `NAME:STEPS` takes more or fewer passes
-            per frame than it was trained with, for less error or less time.
+        name: Name of a bundled model, or path of an exported npz file. `NAME:STEPS` changes the number of
+            refinement steps per frame, for less error or less time.
 
     Returns:
         Its weights and its architecture.
 
     Raises:
-        AssetError: There is no such model, it can't take so many passes, or the file is damaged.
+        AssetError: There is no such model, it can't take so many refinement steps, or the file is damaged.
         CheckpointError: The file is for another architecture or a newer version.
     """
     parts = re.fullmatch(r"(.+):(\d+)", str(name))

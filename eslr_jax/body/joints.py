@@ -1,7 +1,7 @@
-"""Which joint is which: names of common rigs to parts of a body, and joint maps between two rigs.
+"""Which joint is which: parts of a body by the joint names of common rigs, and joint maps between two rigs.
 
 A part is a side and a chain, such as left `upper_leg`; spine, neck and fingers are chains of several joints.
-Recognised: CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, and the
+Known are the names of CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, and the
 LeftCollar/LeftShoulder/LeftElbow family.
 """
 
@@ -56,13 +56,14 @@ for _finger in _FINGERS:
     for _word in (_finger, f"hand{_finger}", f"f{_finger}"):
         _SIDED_WORDS[_word] = _finger
 _SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
+HAND = ("hand", "fingers", *_FINGERS)  # parts that continue the forearm's bone
 _FALLBACKS = {"fingers": ("middle", "index"), "hip_joint": (), "toe": ()} | {
     finger: ("fingers",) for finger in _FINGERS[1:]
 }
 
 
 def name_part(name: str) -> Part | None:
-    """Return the part that a joint's name stands for, by itself; None if it is unknown."""
+    """Return the part that a joint's name alone stands for, or None if it is unknown."""
     name = re.split(r"[:|]", name)[-1]
     if name.startswith("__"):  # a helper of MakeHuman, in the place of the joint that follows
         return None
@@ -92,10 +93,9 @@ def name_part(name: str) -> Part | None:
 
 
 def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
-    """Return the joints of every part that names tell, in the order of the names.
+    """Return the joints of every part that is known by name, in the order of the names.
 
-    Words that mean different joints in different families (shoulder, foot, hand) are told apart by what else
-    the rig has.
+    Shoulder, foot and hand mean different joints in different families; the other names of the rig decide.
     """
     found: dict[Part, list[int]] = {}
     for joint, name in enumerate(joint_names):
@@ -121,7 +121,7 @@ def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
 
 
 def find_parts(skeleton: Skeleton) -> dict[Part, list[int]]:
-    """Return the joints of every part of a rig, from the body outwards; the hips are always found."""
+    """Return the joints of every part of a rig, from the hips outwards; the hips are always among them."""
     found = find_named_parts(skeleton.joint_names)
     hips = _find_hips(skeleton, found)
     found.pop(("", "root"), None)
@@ -131,7 +131,7 @@ def find_parts(skeleton: Skeleton) -> dict[Part, list[int]]:
 
 
 def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
-    """Return the joint above legs and spine: what a character hangs on."""
+    """Return the joint that legs and spine hang on."""
     below = [
         parts[part][0]
         for part in (("left", "upper_leg"), ("right", "upper_leg"), ("", "spine"), ("", "neck"), ("", "head"))
@@ -145,7 +145,7 @@ def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
 
 
 def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    """Return a joint and what it hangs on, up to the root."""
+    """Return a joint and all joints above it, up to the root."""
     chain = [joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(skeleton.parents[chain[-1]])
@@ -153,7 +153,7 @@ def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
 
 
 def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarray | None:
-    """Return left, up and front of the resting torso as columns, or None if the rig does not tell them."""
+    """Return left, up and front of the resting torso as columns, shape [3, 3]; None if they are not known."""
     rest = skeleton.rest_positions
     for chain in ("upper_leg", "upper_arm", "clavicle"):
         if ("left", chain) in parts and ("right", chain) in parts:
@@ -174,10 +174,10 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
 
 
 def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
-    """Return for each joint of a rig the source's joint whose turning it follows.
+    """Return the joint of the source that each joint of a rig follows.
 
-    A name that both have maps to itself if both read it alike; else parts meet parts, and chains of different
-    length share evenly. Joints without a counterpart are left out: they keep still on their parent.
+    Joints of the same part follow each other, and chains of different length share evenly. A joint of no known
+    part follows the joint of its name. Joints without a counterpart are left out: they rest on their parent.
     """
     if target.joint_names == source.joint_names:
         return {name: name for name in target.joint_names}
@@ -199,7 +199,7 @@ def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
 
 
 def read_joint_map(path: str | Path) -> dict[str, str]:
-    """Read a joint map: a JSON object of the body's joints to the motion's; "" keeps a joint still.
+    """Read a joint map: a JSON object from joints of the body to joints of the motion, "" for a still one.
 
     Raises:
         AssetError: The file is missing or holds something else.
@@ -237,7 +237,7 @@ def complete_map(
 
 
 def _check_name(name: str, known: Sequence[str], owner: str) -> None:
-    """Raise unless a name of a joint map exists."""
+    """Raise MotionError unless a name of a joint map exists; `owner` is what messages call the rig."""
     if name not in known:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(known[:6])}, ..."

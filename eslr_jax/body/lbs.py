@@ -1,8 +1,7 @@
 """Linear blend skinning: joint rotations to posed points, with gradients that exist at zero rotation.
 
-Rotations are local axis-angle vectors in world-aligned rest axes: with all of them zero the body is in its
-rest pose, whatever the bone directions. Matrix products are asked for in full float32; the default of some
-GPUs keeps ten bits, which moves a hand by millimetres.
+Rotations are local axis-angle vectors in world-aligned rest axes: if all are zero, the body is in its rest pose.
+Matrix products use full float32: the default of some GPUs keeps ten bits, which moves a hand by millimetres.
 
 Source: Loper et al. 2015 (doi:10.1145/2816795.2818013), section 3.
 """
@@ -14,9 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-SERIES_BELOW = (
-    1e-2  # [rad^2]; there the truncated series below are exact to float32, the closed forms are not
-)
+SERIES_BELOW = 1e-2  # [rad^2], where the truncated series are exact to float32 and the closed forms are not
 
 
 def rotation_matrix(rotation: Float[Array, " 3"]) -> Float[Array, "3 3"]:
@@ -102,7 +99,7 @@ def skin(
     is_joint = indices[:, :, None] == joints[None, None, :]
     dense = jnp.sum(
         jnp.where(is_joint, weights[:, :, None], 0.0), axis=1
-    )  # a product beats gathers, on every device
+    )  # a product beats gathers everywhere
     blended = _product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
@@ -110,11 +107,11 @@ def skin(
 def bend(
     directions: Float[Array, "vertices 3 entries"], turned: Float[Array, "joints 3 3"]
 ) -> Float[Array, "vertices 3"]:
-    """Return the displacement of rest points by pose blend shapes [m].
+    """Return the displacement of rest points by pose blend shapes [m], shape [vertices, 3].
 
     Args:
-        directions: Displacement per entry of R - I [m], shape [vertices, 3, 9 joints].
-        turned: R - I of every joint but the root, local, shape [joints, 3, 3].
+        directions: Displacement per entry of R - I [m], shape [vertices, 3, 9 * joints].
+        turned: Local rotation matrices minus the identity of all joints but the root, shape [joints, 3, 3].
 
     Source: Loper et al. 2015, equation 9.
     """
@@ -123,7 +120,7 @@ def bend(
 
 
 def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Joints that have a parent, and those parents: one pair of arrays per depth, from the root outwards."""
+    """Return the joints of each depth below the root, and their parents."""
     depths: list[int] = []
     for parent in parents:
         depths.append(0 if parent < 0 else depths[parent] + 1)
@@ -133,10 +130,10 @@ def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def _product(left: Array, right: Array) -> Array:
-    """Matrix product in the full precision of its arguments."""
+    """Return a matrix product in the full precision of its arguments."""
     return jnp.matmul(left, right, precision=jax.lax.Precision.HIGHEST)
 
 
 def _apply(matrices: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Product of each matrix with its vector; elementwise, so never in reduced precision."""
+    """Return the product of each matrix with its vector; elementwise, so never in reduced precision."""
     return jnp.sum(matrices * vectors[:, None, :], axis=2)

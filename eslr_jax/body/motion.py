@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import lru_cache, partial
 
 import jax
@@ -11,8 +12,8 @@ import numpy as np
 
 from eslr_jax.body import lbs
 from eslr_jax.body.joints import find_parts, torso_axes
-from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, leg_length, resample
-from eslr_jax.errors import MotionError
+from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, resample
+from eslr_jax.errors import ConfigError, MotionError
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.io.skeleton import Skeleton
 from eslr_jax.types import Body, BodyMotion, BodySurface
@@ -22,16 +23,14 @@ _ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """Joint rotations over time, for the rig that `joint_names` names."""
+    """Joint rotations over time, for one rig."""
 
     name: str
     rotations: np.ndarray  # local axis-angle relative to the rest pose [rad], shape [frames, joints, 3]
     translations: np.ndarray  # position of the root joint [m], shape [frames, 3]
     fps: float
     joint_names: tuple[str, ...]
-    arm_abduction: float = (
-        ARM_ABDUCTION  # degrees that posing adds to both arms, if nothing else is asked for
-    )
+    arm_abduction: float = ARM_ABDUCTION  # [degrees] that posing adds to both arms by default
 
     def __post_init__(self) -> None:
         """Check the arrays.
@@ -63,9 +62,9 @@ def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: f
 
     Args:
         body: The rig.
-        num_frames: Frames to hold it for.
+        num_frames: Number of frames.
         fps: Frames per second.
-        arm_angle: Degrees by which both arms are lifted from the rest pose (negative lowers them).
+        arm_angle: Angle by which both arms are lifted from the rest pose [degrees]; negative lowers them.
     """
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
@@ -81,19 +80,17 @@ def pose_body(
     *,
     fps: float = 30.0,
     arm_abduction: float | None = None,
-    shape: np.ndarray | None = None,
     num_frames: int | None = None,
 ) -> BodyMotion:
     """Pose a body along a motion.
 
     Args:
         body: A rigged body.
-        motion: A motion for the same rig; other rigs need retargeting first.
-        fps: Frame rate of the simulation; the motion is resampled to it.
-        arm_abduction: Degrees added to both arms, to keep them from pressing into the torso; by default what
-            the motion asks for: nothing if it was made on this body.
-        shape: Body shape in standard deviations, shape [shapes]; None is the average.
-        num_frames: Keep this many frames; None keeps all.
+        motion: A motion for the same rig; see `eslr_jax.body.rig.make_motion` for others.
+        fps: Frames per second of the simulation; the motion is resampled to it.
+        arm_abduction: Angle by which both arms are lifted [degrees], to keep them from pressing into the torso;
+            by default the motion's own, which is 0 if it was made on this body.
+        num_frames: Number of frames to keep; None keeps all.
 
     Raises:
         MotionError: The motion is for another skeleton or has fewer frames than asked for.
@@ -102,7 +99,7 @@ def pose_body(
         strangers = [name for name in motion.joint_names if name not in body.joint_names]
         raise MotionError(
             f"motion {motion.name} is for another skeleton ({len(motion.joint_names)} joints, "
-            f"unknown: {', '.join(strangers[:4]) or 'order differs'}); retarget it to this body first"
+            f"unknown: {', '.join(strangers[:4]) or 'order differs'}); load it with this body"
         )
     rotations, translations = resample(motion.rotations, motion.translations, motion.fps, fps)
     if num_frames is not None:
@@ -116,21 +113,26 @@ def pose_body(
         arm_abduction = motion.arm_abduction
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
-    rest, joints = shape_body(body, shape)
-    if shape is not None:
-        # Longer legs take longer steps and carry the root higher, so that the soles stay on the floor.
-        before, after = (
-            leg_length(body.joint_names, np.asarray(j)) or 1.0 for j in (body.joint_rest_positions, joints)
-        )
-        translations = translations * (after / before)
-    transforms = joint_transforms(rotations, translations, joints, body.parents)
+    transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
+    return body_motion(body, _skin_body(body, rotations, transforms), transforms, fps=fps)
+
+
+def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *, fps: float) -> BodyMotion:
+    """Return a body in motion; every `BodyMotion` is made here.
+
+    Args:
+        body: The body at rest.
+        positions: Its vertices [m], shape [frames, body_vertices, 3].
+        joint_transforms: Map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
+        fps: Frames per second.
+    """
     return BodyMotion(
-        positions=_skin_body(body, rest, rotations, transforms),
-        joint_transforms=transforms,
+        positions=positions,
+        joint_transforms=joint_transforms,
         faces=body.faces,
         is_obstacle=body.is_obstacle,
         timestep=jnp.float32(1.0 / fps),
-        rest_positions=rest,
+        rest_positions=body.rest_positions,
         surface=obstacle_surface(body),
     )
 
@@ -150,18 +152,25 @@ def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
     )
 
 
-def shape_body(body: Body, shape: np.ndarray | None) -> tuple[jax.Array, jax.Array]:
-    """Return rest vertices and joints of a body shape [m]."""
-    if shape is None:
-        return body.rest_positions, body.joint_rest_positions
-    coefficients = jnp.asarray(shape, jnp.float32)
-    if coefficients.shape != (body.shape_directions.shape[-1],):
-        raise MotionError(
-            f"shape has {coefficients.size} coefficients; this body takes {body.shape_directions.shape[-1]}"
+def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
+    """Return a body of another shape, at rest.
+
+    Args:
+        body: A body with shapes, such as a SMPL model.
+        betas: Shape coefficients [standard deviations], shape [shapes]; those left out are zero.
+
+    Raises:
+        ConfigError: The body has fewer shapes, or a coefficient is not finite.
+    """
+    given, known = np.asarray(betas, np.float64).ravel(), body.shape_directions.shape[-1]
+    if len(given) > known or not np.isfinite(given).all():
+        raise ConfigError(
+            f"{len(given)} betas for a body of {known} shapes; give at most {known} finite numbers"
         )
-    return (
-        body.rest_positions + body.shape_directions @ coefficients,
-        body.joint_rest_positions + body.joint_shape_directions @ coefficients,
+    coefficients = jnp.asarray(np.pad(given, (0, known - len(given))), jnp.float32)
+    return body.replace(
+        rest_positions=body.rest_positions + body.shape_directions @ coefficients,
+        joint_rest_positions=body.joint_rest_positions + body.joint_shape_directions @ coefficients,
     )
 
 
@@ -175,13 +184,13 @@ def _joint_transforms(rotations, translations, joints, parents):
 def joint_transforms(
     rotations: np.ndarray, translations: np.ndarray, joints: jax.Array, parents: tuple[int, ...]
 ) -> jax.Array:
-    """Return the rest-to-posed maps of every joint in every frame, shape [frames, joints, 3, 4].
+    """Return the map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
 
     Args:
         rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
         translations: Root positions [m], shape [frames, 3].
         joints: Joint rest positions [m], shape [joints, 3].
-        parents: Parent of every joint; -1 is the root.
+        parents: Parent of every joint; -1 for the root.
     """
     return _joint_transforms(
         jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, parents
@@ -189,7 +198,7 @@ def joint_transforms(
 
 
 def _front(body: Body) -> np.ndarray:
-    """Where the resting chest faces; +Z if the rig doesn't tell."""
+    """Return the direction that the resting chest faces, shape [3]; +Z if the rig doesn't tell."""
     skeleton = Skeleton(body.joint_names, body.parents, np.asarray(body.joint_rest_positions, np.float64))
     axes = torso_axes(skeleton, find_parts(skeleton))
     if axes is None or axes[2, 2] > np.cos(_ORDINARY_YAW):
@@ -197,8 +206,9 @@ def _front(body: Body) -> np.ndarray:
     return axes[:, 2]
 
 
-def _skin_body(body: Body, rest: jax.Array, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
+def _skin_body(body: Body, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
     """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
+    rest = body.rest_positions
     if body.pose_directions is None:
         return skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
     bends = jnp.asarray(rotations[:, 1:], jnp.float32)
@@ -207,7 +217,7 @@ def _skin_body(body: Body, rest: jax.Array, rotations: np.ndarray, transforms: j
 
 @jax.jit
 def _skin_bent(rest, directions, weights, indices, rotations, transforms):
-    """Skin frame by frame what the joints' rotations have bent first.
+    """Return posed vertices of every frame, with pose blend shapes added at rest.
 
     Source: Loper et al. 2015, equations 8 and 9.
     """
@@ -221,8 +231,14 @@ def _skin_bent(rest, directions, weights, indices, rotations, transforms):
 
 @jax.jit
 def skin_frames(positions, weights, indices, transforms):
-    """Return skinned positions of every frame [m], shape [frames, vertices, 3].
+    """Return skinned points of every frame [m], shape [frames, vertices, 3].
 
-    Skin frame by frame: a vmap would hold frames x vertices x influences matrices at once.
+    One frame after the other: a vmap would need many times the memory.
+
+    Args:
+        positions: Rest points [m], shape [vertices, 3].
+        weights: Skin weights, shape [vertices, influences].
+        indices: Joint of each weight, shape [vertices, influences].
+        transforms: Map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
     """
     return jax.lax.map(lambda frame: lbs.skin(positions, weights, indices, frame), transforms)

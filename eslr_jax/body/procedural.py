@@ -1,4 +1,4 @@
-"""Motions that are computed, for any rig whose joints are known: turn, jump, swing (host)."""
+"""Computed motions for any rig with known joints: turn, jump and swing (host)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from eslr_jax.errors import MotionError
 from eslr_jax.types import Body
 
 FPS = 30.0
-SECONDS = 4.0  # length of a motion, the second of standing still at its start included
-STILL_SECONDS = 1.0  # the garment settles before anything moves
+SECONDS = 4.0  # length of a motion, with the time at rest
+STILL_SECONDS = 1.0  # at rest before anything moves, so that the garment settles
 _TURN_RATE = 2.0 * np.pi / 2.0  # [rad/s] at most: once around in two seconds
 _JUMP_HEIGHT = 0.3  # [m]
 _JUMP_SECONDS = 1.5  # crouch, flight and landing
@@ -28,7 +28,12 @@ _Rotations = dict[Part, NDArray]  # [frames, 3], local axis-angle in left, up, f
 
 
 def turn(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Turn on the spot, faster and faster, then slower."""
+    """Return rotations and root offsets [m] of a turn on the spot, first faster, then slower.
+
+    Args:
+        time: Time since the movement began [s], shape [frames].
+        leg: Height of the hips above the floor [m]; unused.
+    """
     del leg
     share = np.clip(time / (SECONDS - STILL_SECONDS), 0.0, 1.0)
     angle = _TURN_RATE * (SECONDS - STILL_SECONDS) * 0.5 * (share - np.sin(2 * np.pi * share) / (2 * np.pi))
@@ -36,7 +41,12 @@ def turn(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
 
 
 def jump(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Crouch, jump, land in a crouch, and stand up, again and again; knees bend as the hips sink."""
+    """Return rotations and root offsets [m] of repeated jumps; the knees bend as the hips sink.
+
+    Args:
+        time: Time since the movement began [s], shape [frames].
+        leg: Height of the hips above the floor [m].
+    """
     phase = np.where(time > 0, np.mod(time, _JUMP_SECONDS), 0.0)
     flight = 2.0 * np.sqrt(2.0 * _JUMP_HEIGHT / _GRAVITY)
     crouch = 0.5 * (_JUMP_SECONDS - flight)
@@ -60,7 +70,12 @@ def jump(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
 
 
 def swing(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Twist the trunk from side to side and swing the arms in opposite directions."""
+    """Return rotations and root offsets [m] of a trunk that twists and arms that swing against each other.
+
+    Args:
+        time: Time since the movement began [s], shape [frames].
+        leg: Height of the hips above the floor [m]; unused.
+    """
     del leg
     ramp = np.clip(time / _SWING_SECONDS, 0.0, 1.0)
     angle = _SWING * ramp * np.sin(2 * np.pi * time / _SWING_SECONDS)
@@ -78,11 +93,11 @@ PROCEDURAL: dict[str, Callable[[NDArray, float], tuple[_Rotations, NDArray]]] = 
 
 
 def make_procedural(name: str, body: Body) -> Motion:
-    """Return a computed motion for a body: a second of standing in the rest pose, then the movement.
+    """Return a computed motion for a body: a second in the rest pose, then the movement.
 
     Args:
         name: One of `PROCEDURAL`.
-        body: The rig; parts that it lacks don't move.
+        body: A rigged body; parts that it lacks don't move.
 
     Raises:
         MotionError: The rig has none of the joints that move.
@@ -91,19 +106,17 @@ def make_procedural(name: str, body: Body) -> Motion:
     parts = find_parts(skeleton)
     axes = torso_axes(skeleton, parts)
     axes = np.eye(3) if axes is None else np.round(axes)
-    if abs(np.linalg.det(axes)) < 0.5:  # neither along our axes nor upright
+    if abs(np.linalg.det(axes)) < 0.5:  # the torso lies between our axes
         axes = np.eye(3)
     time = np.arange(int(SECONDS * FPS) + 1) / FPS - STILL_SECONDS
     rest = np.asarray(body.rest_positions)
     leg = skeleton.rest_positions[0, 1] - float(rest[:, 1].min())
     moved, offsets = PROCEDURAL[name](np.maximum(time, 0.0), max(leg, 1e-3))
     rotations = np.zeros((len(time), len(skeleton), 3))
-    is_found = False
-    for part, vectors in moved.items():
-        for joint in parts.get(part, [])[:1]:
-            rotations[:, joint] = vectors @ axes.T
-            is_found = True
-    if not is_found:
+    joints = {part: parts[part][0] for part in moved if part in parts}
+    for part, joint in joints.items():
+        rotations[:, joint] = moved[part] @ axes.T
+    if not joints:
         known = ", ".join(skeleton.joint_names[:6])
         raise MotionError(
             f"motion {name} moves joints that this body lacks ({known}, ...); give another motion"

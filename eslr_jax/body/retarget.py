@@ -1,7 +1,7 @@
-"""Carry motions from one skeleton to another, and resample, ground and adjust them (host, NumPy).
+"""Rotations of a rig's joints over time: local to global, resampled, and with lifted arms (host, NumPy).
 
 A motion is `rotations` [frames, joints, 3], local axis-angle vectors [rad] in world-aligned rest axes, and
-`translations` [frames, 3], the position of the root joint [m]; Y up, and the rest pose faces +Z.
+`translations` [frames, 3], the position of the root joint [m]. Y is up, and the rest pose faces +Z.
 """
 
 from __future__ import annotations
@@ -15,34 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.joints import Part, find_named_parts
 from eslr_jax.errors import MotionError
+from eslr_jax.io.skeleton import chain_rotations, rotation_matrices
 
 ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bundled walks clear of the torso
-_SIDES = ("Left", "Right")
-_LIMB_BONES = {"UpLeg": "Leg", "Leg": "Foot", "Arm": "ForeArm", "ForeArm": "Hand"}
-_HAND_JOINTS = ("{side}Hand", "{initial}Thumb", "{side}FingerBase", "{side}HandFinger1")
-
-
-def limb_bones(joint_names: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Bones whose rest direction differs from rig to rig: the limbs, and hands that continue the forearm.
-
-    Args:
-        joint_names: Joints of a rig with CMU names (`LeftArm`, `RThumb`, ...).
-
-    Returns:
-        For each such joint the two joints that span its bone; absent joints are left out.
-    """
-    bones = {}
-    for side in _SIDES:
-        for start, end in _LIMB_BONES.items():
-            bones[side + start] = (side + start, side + end)
-        for name in _HAND_JOINTS:
-            bones[name.format(side=side, initial=side[0])] = (side + "ForeArm", side + "Hand")
-    present = set(joint_names)
-    return {name: bone for name, bone in bones.items() if present.issuperset((name, *bone))}
 
 
 def minimal_rotation(start: NDArray, end: NDArray) -> NDArray:
-    """Return the smallest rotation that turns direction `start` onto `end`; [3], [3] -> [3, 3]."""
+    """Return the smallest rotation that turns direction `start` onto `end`, shape [3, 3].
+
+    Args:
+        start: A direction of any length, shape [3].
+        end: Another, shape [3].
+    """
     start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis, cosine = np.cross(start, end), float(start @ end)
     sine = np.linalg.norm(axis)
@@ -54,53 +38,13 @@ def minimal_rotation(start: NDArray, end: NDArray) -> NDArray:
     return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / sine).as_matrix()
 
 
-def rest_alignments(
-    joint_names: Sequence[str], joint_rest_positions: NDArray, source_directions: Mapping[str, NDArray]
-) -> NDArray:
-    """Return, for each joint, the rotation from the rig's rest bone to the source's rest bone.
-
-    Args:
-        joint_names: Joints of the rig.
-        joint_rest_positions: Their rest positions [m], shape [joints, 3].
-        source_directions: Direction of the source's bone at rest, in the rig's axes, for the joints of
-            `limb_bones` that should be aligned; shape [3] each.
-
-    Returns:
-        Rotations, identity where nothing is aligned, shape [joints, 3, 3].
-    """
-    index = {name: i for i, name in enumerate(joint_names)}
-    alignments = np.tile(np.eye(3), (len(joint_names), 1, 1))
-    for name, (start, end) in limb_bones(joint_names).items():
-        if name in source_directions:
-            bone = joint_rest_positions[index[end]] - joint_rest_positions[index[start]]
-            alignments[index[name]] = minimal_rotation(bone, source_directions[name])
-    return alignments
-
-
-def retarget(
-    source_rotations: NDArray, source_joints: Sequence[int], alignments: NDArray, parents: Sequence[int]
-) -> NDArray:
-    """Return the rig's local rotations that follow a source skeleton's global ones.
-
-    Joint j of the rig turns by G_j = D_s A_j: first from its own rest bone onto the source's (A_j), then as
-    the source joint s turned since its rest pose (D_s). So limbs point where the source's point, whatever the
-    two rest poses.
-
-    Args:
-        source_rotations: Global rotation of each source joint since its rest pose, in the rig's axes, shape
-            [frames, source_joints, 3, 3].
-        source_joints: Source joint followed by each joint of the rig, shape [joints].
-        alignments: See `rest_alignments`, shape [joints, 3, 3].
-        parents: Parent of each joint, -1 for the root.
-
-    Returns:
-        Local axis-angle rotations [rad], shape [frames, joints, 3].
-    """
-    return local_rotations(source_rotations[:, list(source_joints)] @ alignments, parents)
-
-
 def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArray:
-    """Global rotation matrices [frames, joints, 3, 3] to local axis-angle [rad], [frames, joints, 3]."""
+    """Return local axis-angle rotations [rad], shape [frames, joints, 3].
+
+    Args:
+        global_rotations: Rotation matrices since the rest pose, shape [frames, joints, 3, 3].
+        parents: Parent of each joint, -1 for the root.
+    """
     local = np.array(global_rotations, dtype=np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -109,29 +53,24 @@ def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArra
 
 
 def global_rotations(rotations: NDArray, parents: Sequence[int]) -> NDArray:
-    """Local axis-angle [rad], [frames, joints, 3], to global rotation matrices [frames, joints, 3, 3]."""
-    matrices = _matrices(rotations)
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            matrices[:, joint] = matrices[:, parent] @ matrices[:, joint]
-    return matrices
-
-
-def leg_length(joint_names: Sequence[str], joint_rest_positions: NDArray) -> float | None:
-    """Length of a thigh and shank: the ratio of two skeletons' legs scales a motion's steps.
+    """Return rotation matrices since the rest pose, shape [frames, joints, 3, 3].
 
     Args:
-        joint_names: Joints of a rig, by any names that `find_named_parts` knows.
-        joint_rest_positions: Their rest positions, shape [joints, 3].
-
-    Returns:
-        The length in the unit of the positions, or None if the rig has no such leg.
+        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
+        parents: Parent of each joint, -1 for the root.
     """
-    return leg_of(joint_rest_positions, find_named_parts(joint_names))
+    return chain_rotations(rotation_matrices(rotations), tuple(parents))
 
 
-def leg_of(joint_rest_positions: NDArray, parts: Mapping[Part, Sequence[int]]) -> float | None:
-    """Length of a thigh and shank, by the joints of each part; see `leg_length`."""
+def leg_length(joint_rest_positions: NDArray, parts: Mapping[Part, Sequence[int]]) -> float | None:
+    """Return the length of a thigh and shank in the unit of the positions, or None without such a leg.
+
+    The ratio of two skeletons' legs scales a motion's steps.
+
+    Args:
+        joint_rest_positions: Rest positions of a rig's joints, shape [joints, 3].
+        parts: Joints of each part of the rig; see `find_named_parts`.
+    """
     for side in ("left", "right"):
         chain = [parts.get((side, name), [None])[0] for name in ("upper_leg", "lower_leg", "foot")]
         if None not in chain:
@@ -148,7 +87,7 @@ def abduct_arms(
     *,
     front: Sequence[float] | NDArray = (0.0, 0.0, 1.0),
 ) -> NDArray:
-    """Return the motion with both arms lifted sideways about the chest's front axis.
+    """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad].
 
     Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
     open for a garment.
@@ -156,11 +95,8 @@ def abduct_arms(
     Args:
         rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
         joint_names: Joints of the rig; both upper arms must be among them.
-        degrees: Abduction added to each arm [degrees]; zero returns the motion as it is.
-        front: Where the resting chest faces, shape [3].
-
-    Returns:
-        Rotations [rad], shape [frames, joints, 3].
+        degrees: Angle added to each arm [degrees].
+        front: Direction that the resting chest faces, shape [3].
 
     Raises:
         MotionError: If the rig has no such arms.
@@ -176,6 +112,11 @@ def abduct_arms(
         lift = Rotation.from_rotvec(sign * np.deg2rad(degrees) * np.asarray(front, np.float64))
         result[:, arm] = (lift * Rotation.from_rotvec(result[:, arm])).as_rotvec()
     return result
+
+
+def count_resampled(num_frames: int, fps_in: float, fps_out: float) -> int:
+    """Return how many frames a motion has at another rate: its last one lies inside the motion."""
+    return int(np.floor((num_frames - 1) / fps_in * fps_out + 1e-6)) + 1
 
 
 def resample(
@@ -202,7 +143,7 @@ def resample(
     if not (fps_in > 0 and fps_out > 0):
         raise MotionError(f"frame rates must be positive, not {fps_in} and {fps_out}")
     times = np.arange(len(rotations)) / fps_in
-    count = int(np.floor(times[-1] * fps_out + 1e-6)) + 1
+    count = count_resampled(len(rotations), fps_in, fps_out)
     return interpolate(rotations, translations, times, np.arange(count) / fps_out)
 
 
@@ -225,31 +166,18 @@ def interpolate(
         return np.asarray(rotations, np.float64)[repeat], np.asarray(translations, np.float64)[repeat]
     before = np.clip(np.searchsorted(times, new_times, side="right") - 1, 0, len(times) - 2)
     fraction = np.clip((new_times - times[before]) / (times[before + 1] - times[before]), 0.0, 1.0)
-    start = Rotation.from_rotvec(np.reshape(rotations[before], (-1, 3)))
-    end = Rotation.from_rotvec(np.reshape(rotations[before + 1], (-1, 3)))
-    step = (start.inv() * end).as_rotvec() * np.repeat(fraction, rotations.shape[1])[:, None]
-    turned = (start * Rotation.from_rotvec(step)).as_rotvec().reshape(len(new_times), *rotations.shape[1:])
+    turned = blend_rotations(rotations[before], rotations[before + 1], fraction)
     return turned, CubicSpline(times, translations)(new_times)
 
 
-def start_facing_front(rotations: NDArray, translations: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the motion moved so that the root starts above the origin and faces +Z.
+def blend_rotations(start: NDArray, end: NDArray, fraction: NDArray) -> NDArray:
+    """Return rotations between two, along the shorter way, shape [frames, joints, 3] [rad].
 
     Args:
-        rotations: Local axis-angle rotations [rad], the root first, shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-
-    Returns:
-        Rotations [rad] and translations [m]; heights are unchanged.
+        start: Axis-angle rotations [rad], shape [frames, joints, 3].
+        end: Others, shape [frames, joints, 3].
+        fraction: Share of the way from `start` to `end`, shape [frames].
     """
-    front = Rotation.from_rotvec(rotations[0, 0]).apply([0.0, 0.0, 1.0])
-    turn = Rotation.from_euler("y", -np.arctan2(front[0], front[2]))
-    result = np.array(rotations, dtype=np.float64)
-    result[:, 0] = (turn * Rotation.from_rotvec(result[:, 0])).as_rotvec()
-    return result, turn.apply(translations - translations[0] * [1.0, 0.0, 1.0])
-
-
-def _matrices(rotations: NDArray) -> NDArray:
-    """Axis-angle [..., 3] to matrices [..., 3, 3]."""
-    rotations = np.asarray(rotations, np.float64)
-    return Rotation.from_rotvec(rotations.reshape(-1, 3)).as_matrix().reshape(*rotations.shape, 3)
+    first, last = (Rotation.from_rotvec(np.reshape(values, (-1, 3))) for values in (start, end))
+    step = (first.inv() * last).as_rotvec() * np.repeat(fraction, start.shape[1])[:, None]
+    return (first * Rotation.from_rotvec(step)).as_rotvec().reshape(start.shape)

@@ -1,4 +1,4 @@
-"""From what a file holds to what is simulated: a rigged mesh to a body, a moving skeleton to its motion."""
+"""From what a file holds to what is simulated: a rigged mesh to a body, a moving skeleton to a motion (host)."""
 
 from __future__ import annotations
 
@@ -7,31 +7,20 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.joints import Part, complete_map, find_named_parts, find_parts, torso_axes
+from eslr_jax.body.alignment import align_rests, match_parts, rig_scale
+from eslr_jax.body.joints import HAND, complete_map, find_named_parts, find_parts
 from eslr_jax.body.motion import Motion
-from eslr_jax.body.retarget import (
-    ARM_ABDUCTION,
-    global_rotations,
-    leg_of,
-    local_rotations,
-    minimal_rotation,
-)
+from eslr_jax.body.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
+from eslr_jax.body.units import metres_per_unit
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.mesh import shared_vertices
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.types import Body
 
-HEIGHT_RANGE = (0.3, 3.0)  # [m] of a body; outside, the unit of its file is not the metre
-UNITS = {0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
 MODEL_JOINTS = 18  # joints that a body shares with the SMPL family's 22 to be one of it
-SAME_REST = 1e-3  # [m] by which the rest joints of one rig differ from file to file
-ORDINARY_TILT = np.deg2rad(35.0)  # rest poses that lean less than this are taken to stand alike
-MAX_LEG_TURN = np.deg2rad(75.0)  # between the legs of two rest poses that both stand
 GROUND_QUANTILE = 0.05  # of the lowest sole of each frame: robust to a toe that dips for a moment
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from Z up
-_LIMBS = {"upper_leg": "lower_leg", "lower_leg": "foot", "upper_arm": "forearm", "forearm": "hand"}
-_HAND = ("hand", "fingers", "thumb", "index", "middle", "ring", "pinky")  # continue the forearm's bone
 
 
 def body_skeleton(body: Body) -> Skeleton:
@@ -40,20 +29,21 @@ def body_skeleton(body: Body) -> Skeleton:
     return Skeleton(body.joint_names, body.parents, rest)
 
 
-# ---------------------------------------------------------------- bodies
+def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
+    """Return a rigged mesh as a body in metres.
 
-
-def make_body(mesh: RiggedMesh) -> Body:
-    """Make a rigged mesh a body: one vertex a place, the hips first, hands no obstacle.
+    Vertices at one place are joined, the hips become joint 0, and hands are no obstacle.
 
     Args:
         mesh: A body as its file has it.
+        units: Unit of its lengths, or metres per unit; by default recognised, see `metres_per_unit`.
 
     Raises:
-        AssetError: The mesh is empty, not finite, not in metres, or its weights and faces don't fit.
+        AssetError: The mesh is empty or not finite, its weights and faces don't fit, or its unit is unknown.
     """
     _check_mesh(mesh)
-    vertices, places = _shared_vertices(mesh.positions)
+    scale = metres_per_unit(f"body {mesh.name}", float(np.ptp(mesh.positions, axis=0).max()), units)
+    vertices, places = shared_vertices(mesh.positions)
     faces = places[mesh.faces]
     corners = np.sort(faces, axis=1)
     faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
@@ -65,20 +55,23 @@ def make_body(mesh: RiggedMesh) -> Body:
     def floats(values: NDArray):
         return jnp.asarray(values, jnp.float32)
 
+    def lengths(values: NDArray):
+        return floats(scale * values)
+
     shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
     has_shapes = shapes is not None and joint_shapes is not None
     return Body(
-        rest_positions=floats(mesh.positions[vertices]),
-        shape_directions=floats(shapes[vertices] if has_shapes else np.zeros((len(vertices), 3, 0))),
-        joint_rest_positions=floats(skeleton.rest_positions),
-        joint_shape_directions=floats(joint_shapes[order] if has_shapes else np.zeros((len(order), 3, 0))),
+        rest_positions=lengths(mesh.positions[vertices]),
+        shape_directions=lengths(shapes[vertices] if has_shapes else np.zeros((len(vertices), 3, 0))),
+        joint_rest_positions=lengths(skeleton.rest_positions),
+        joint_shape_directions=lengths(joint_shapes[order] if has_shapes else np.zeros((len(order), 3, 0))),
         skin_weights=floats(weights / weights.sum(1, keepdims=True)),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
         is_obstacle=jnp.asarray(_is_obstacle(faces, weights, indices, skeleton)),
         parents=skeleton.parents,
         joint_names=skeleton.joint_names,
-        pose_directions=None if mesh.pose_directions is None else floats(mesh.pose_directions[vertices]),
+        pose_directions=None if mesh.pose_directions is None else lengths(mesh.pose_directions[vertices]),
     )
 
 
@@ -113,32 +106,13 @@ def _check_mesh(mesh: RiggedMesh) -> None:
         raise AssetError(
             f"body {mesh.name}: vertex {np.argmax(is_bad)} has no or negative skin weights; bind it to a joint"
         )
-    height = float(np.ptp(mesh.positions, axis=0).max())
-    if not HEIGHT_RANGE[0] <= height <= HEIGHT_RANGE[1]:
-        fits = [
-            name for factor, name in UNITS.items() if HEIGHT_RANGE[0] <= height * factor <= HEIGHT_RANGE[1]
-        ]
-        hint = f"it looks like {fits[0]}: " if fits else ""
-        raise AssetError(f"body {mesh.name} is {height:.4g} m large; {hint}scale it to metres")
-
-
-def _shared_vertices(positions: NDArray) -> tuple[NDArray, NDArray]:
-    """Join vertices at bit-identical positions, which exporters split where texture coordinates differ.
-
-    Returns:
-        The vertices kept, in their order, and the place of every vertex among them.
-    """
-    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return np.sort(first), rank[inverse.ravel()]
 
 
 def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: Skeleton) -> NDArray:
-    """Tell the faces that cloth may touch: all but those that follow the hands, which cut themselves."""
+    """Return which faces cloth may touch: all but those of the hands, which intersect themselves."""
     is_hand = np.zeros(len(skeleton), bool)
     for (_, chain), joints in find_parts(skeleton).items():
-        is_hand[joints] |= chain in _HAND
+        is_hand[joints] |= chain in HAND
     for joint, parent in enumerate(skeleton.parents):
         is_hand[joint] |= parent >= 0 and is_hand[parent]
     leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
@@ -146,10 +120,10 @@ def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: S
 
 
 def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
-    """Hang a skeleton on its hips, since a motion's translation is that of joint 0.
+    """Make the hips of a skeleton joint 0, since a motion's translation is that of joint 0.
 
     Returns:
-        The skeleton with the hips as joint 0, and the old index of each of its joints.
+        The skeleton, and the old index of each of its joints.
     """
     hips = find_parts(skeleton)["", "hips"][0]
     neighbors: dict[int, list[int]] = {}
@@ -165,13 +139,10 @@ def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
                 seen.add(other)
                 order.append(other)
                 parents.append(place)
-    if hips == 0:  # as the file has it
+    if hips == 0:
         return skeleton, np.arange(len(skeleton))
     names = tuple(skeleton.joint_names[joint] for joint in order)
     return Skeleton(names, tuple(parents), skeleton.rest_positions[order]), np.array(order)
-
-
-# ---------------------------------------------------------------- motions
 
 
 def make_motion(
@@ -179,15 +150,15 @@ def make_motion(
 ) -> Motion:
     """Carry a moving skeleton over to a body.
 
-    On its own rig a motion is taken as it is. On another one, limbs point where the source's point, the rest
-    of the body turns as the source's has turned since its rest pose; steps are scaled by the length of the
-    legs, the floor is put at y = 0 and the start above the origin.
+    On its own rig a motion is kept, whatever the unit. On another rig, limbs point where the source's limbs
+    point, and the rest of the body turns as the source has turned since its rest pose. Steps are scaled by the
+    length of the legs, the floor is put at y = 0, and the motion starts above the origin.
 
     Args:
         source: The motion of a file.
         body: The body to move.
-        joint_map: Changes to the map of joints, the body's to the source's; "" keeps a joint still.
-        up: Axis that points up in the source: "y", "z", or "auto" to see it from how the source stands.
+        joint_map: Changes to the joint map, from joints of the body to joints of the source; "" keeps one still.
+        up: Axis that points up in the source: "y", "z", or "auto" to judge by how the source stands.
 
     Raises:
         MotionError: No joint is known to both, or the source does not stand at rest.
@@ -199,17 +170,18 @@ def make_motion(
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
     is_model = _is_body_model(target, source)
-    if is_model:  # told by name; joints that the parameters lack rest
+    if is_model:  # joints follow by name, and rest where the parameters have none
         changed = joint_map or {}
         followed = [
             other if name in changed or mapping.get(name) == name else -1
             for name, other in zip(target.joint_names, followed, strict=True)
         ]
-    is_own = is_model or _is_same_rig(target, source, followed)
-    ours, theirs = _matched_parts(target, source.skeleton, followed)
+    scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
+    is_own = scale is not None
+    ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if not is_own:
-        alignments = _align_rests(target, source, ours, theirs)
+        alignments = align_rests(target, source.skeleton, ours, theirs, source.name)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:
@@ -217,15 +189,18 @@ def make_motion(
         else:
             turned[:, joint] = turned[:, parent] if parent >= 0 else np.eye(3)
     translations = source.positions[:, theirs["", "hips"][0]]
-    if not is_own:
-        lengths = [
-            leg_of(rig.rest_positions, parts) for rig, parts in ((target, ours), (source.skeleton, theirs))
+    if scale is None:
+        legs = [
+            leg_length(rig.rest_positions, parts)
+            for rig, parts in ((target, ours), (source.skeleton, theirs))
         ]
-        if lengths[0] and lengths[1]:
-            translations = lengths[0] / lengths[1] * translations
+        if legs[0] and legs[1]:
+            translations = legs[0] / legs[1] * translations
         translations = _put_on_floor(turned, translations, target, body)
     elif source.root_axes is not None:
         translations = translations + source.root_axes @ target.rest_positions[0]
+    else:
+        translations = scale * translations
     has_arms = all((side, "upper_arm") in find_named_parts(target.joint_names) for side in ("left", "right"))
     return Motion(
         source.name,
@@ -238,14 +213,15 @@ def make_motion(
 
 
 def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
-    """Return a body's motion as its moving skeleton: the inverse of `make_motion` on the same rig.
+    """Return the moving skeleton of a body's motion: the inverse of `make_motion` on the same rig.
 
     Raises:
         MotionError: The motion is for another rig.
     """
     if motion.joint_names != body.joint_names:
         raise MotionError(
-            f"motion {motion.name} is not for this body; its joints are {motion.joint_names[:4]}"
+            f"motion {motion.name} is for another skeleton ({', '.join(motion.joint_names[:4])}, ...); load it "
+            "with this body"
         )
     skeleton = body_skeleton(body)
     turned = global_rotations(motion.rotations, skeleton.parents)
@@ -254,7 +230,7 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
 
 
 def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:
-    """Return a motion in other axes: every vector v becomes `axes` v."""
+    """Return a motion in other axes, to which `axes`, shape [3, 3], turns every vector."""
     skeleton = motion.skeleton
     return SkeletonMotion(
         motion.name,
@@ -283,99 +259,20 @@ def _stands_along_z(motion: SkeletonMotion) -> bool:
 
 
 def _is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
-    """Tell whether a motion is the parameters of a body model, and the body is of that family."""
+    """Tell whether a motion holds parameters of the body model that the body is of."""
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
     return source.root_axes is not None and len(shared) >= MODEL_JOINTS
 
 
-def _matched_parts(
-    target: Skeleton, source: Skeleton, followed: list[int]
-) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
-    """Return the joints of each part that both rigs have, by the names of either and by the map."""
-    ours: dict[Part, list[int]] = {}
-    theirs: dict[Part, list[int]] = {}
-    known, others = find_parts(target), find_parts(source)
-    part_of = {joint: part for part, joints in known.items() for joint in joints}
-    part_of_other = {joint: part for part, joints in others.items() for joint in joints}
-    for joint, other in enumerate(followed):
-        part = part_of.get(joint) or part_of_other.get(other)
-        if other >= 0 and part is not None:
-            ours.setdefault(part, []).append(joint)
-            theirs.setdefault(part, []).append(other)
-    if followed[0] < 0:
-        theirs["", "hips"] = others["", "hips"]
-    else:
-        theirs["", "hips"] = [followed[0]]
-    ours["", "hips"] = [0]
-    return ours, theirs
-
-
-def _is_same_rig(target: Skeleton, source: SkeletonMotion, followed: list[int]) -> bool:
-    """Tell whether a motion was made for this very rig."""
-    names = source.skeleton.joint_names
-    if any(
-        other < 0 or names[other] != name for name, other in zip(target.joint_names, followed, strict=True)
-    ):
-        return False
-    theirs = source.skeleton.rest_positions[followed]
-    difference = (theirs - theirs[0]) - (target.rest_positions - target.rest_positions[0])
-    return bool(np.abs(difference).max() < SAME_REST)
-
-
-def _align_rests(
-    target: Skeleton,
-    source: SkeletonMotion,
-    ours: Mapping[Part, list[int]],
-    theirs: Mapping[Part, list[int]],
-) -> NDArray:
-    """Return for each joint the rotation from the body's rest pose to the source's, [joints, 3, 3]."""
-    upright = _torso_turn(target, ours, source.skeleton, theirs)
-    result = np.tile(upright, (len(target), 1, 1))
-    for side in ("left", "right"):
-        for chain, beyond in _LIMBS.items():
-            parts = (side, chain), (side, beyond)
-            if not all(part in ours and part in theirs for part in parts):
-                continue
-            bone = _bone(target, ours, *parts)
-            other = _bone(source.skeleton, theirs, *parts)
-            if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
-                continue
-            turn = minimal_rotation(upright @ bone, other)
-            if beyond in ("lower_leg", "foot") and np.arccos((np.trace(turn) - 1) / 2) > MAX_LEG_TURN:
-                raise MotionError(
-                    f"motion {source.name}: its rest pose does not stand ({side} {chain} points elsewhere); "
-                    "export it with a T-pose at rest"
-                )
-            chains = (chain, *_HAND) if chain == "forearm" else (chain,)
-            for name in chains:
-                result[ours.get((side, name), [])] = turn @ upright
-    return result
-
-
-def _bone(skeleton: Skeleton, parts: Mapping[Part, list[int]], start: Part, end: Part) -> NDArray:
-    """Return the vector from one part's first joint to another's, at rest."""
-    return skeleton.rest_positions[parts[end][0]] - skeleton.rest_positions[parts[start][0]]
-
-
-def _torso_turn(
-    target: Skeleton, ours: Mapping[Part, list[int]], source: Skeleton, theirs: Mapping[Part, list[int]]
-) -> NDArray:
-    """Return the rotation from the body's rest torso to the source's: quarter turns only, if those do.
-
-    Two rest poses that stand alike still lean by some degrees; that is anatomy, and no turn.
-    """
-    one, other = torso_axes(target, ours), torso_axes(source, theirs)
-    if one is None or other is None:
-        return np.eye(3)
-    turn = other @ one.T
-    quarters = Rotation.create_group("O").as_matrix()
-    angles = np.arccos(np.clip((np.einsum("nab,ab->n", quarters, turn) - 1) / 2, -1, 1))
-    is_near = angles.min() < ORDINARY_TILT
-    return np.round(quarters[angles.argmin()]) if is_near else turn
-
-
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:
-    """Return the translations with the start above the origin and the soles on the floor."""
+    """Return root positions [m] that start above the origin, with the soles on the floor, shape [frames, 3].
+
+    Args:
+        turned: Rotation matrices of the body's joints since the rest pose, shape [frames, joints, 3, 3].
+        translations: Root positions [m], shape [frames, 3].
+        target: Joints of the body at rest.
+        body: The body.
+    """
     translations = translations - translations[0] * [1.0, 0.0, 1.0]
     parts = find_parts(target)
     feet = [

@@ -1,4 +1,4 @@
-"""A body without a rig: a mesh sequence, on which patches of its surface stand for joints (host)."""
+"""A body without a rig: a mesh in motion, on which patches of the surface stand for joints (host)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from eslr_jax.body.motion import obstacle_surface
-from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.body.motion import body_motion
+from eslr_jax.body.retarget import count_resampled
+from eslr_jax.body.units import metres_per_unit
+from eslr_jax.errors import MotionError
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import unique_edges
 from eslr_jax.io.mesh_sequence import MeshSequence
@@ -19,32 +21,30 @@ from eslr_jax.types import Body, BodyMotion
 NUM_PATCHES = 48  # pieces that move almost rigidly; about two a limb segment
 _BLEND_STEPS = 12  # Laplacian smoothings of the patches' weights
 _INFLUENCES = 4
-_SIZES = (0.3, 3.0)  # [m] largest extent of a body; outside, the unit is not the metre
 
 
 def pose_sequence(
-    sequence: MeshSequence, *, fps: float = 30.0, num_frames: int | None = None
+    sequence: MeshSequence, *, fps: float = 30.0, num_frames: int | None = None, units: str | None = None
 ) -> tuple[Body, BodyMotion]:
-    """Make a moving mesh a body in motion.
+    """Return a moving mesh as a body, and as that body in motion.
 
-    The vertices move exactly as in the sequence, resampled in time by straight lines. Patches of the surface
-    follow the best rigid motion of their vertices; a garment that fits the first frame is carried along by
-    them to its pins and its start.
+    The vertices move as in the sequence, resampled in time by straight lines. Patches of the surface stand for
+    joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame.
 
     Args:
         sequence: The mesh in motion; its first frame is the rest pose.
-        fps: Frame rate of the simulation.
-        num_frames: Keep this many frames; None keeps all.
+        fps: Frames per second of the simulation.
+        num_frames: Number of frames to keep; None keeps all.
+        units: Unit of the mesh, or metres per unit; by default recognised, see `metres_per_unit`.
 
     Raises:
-        AssetError: The mesh is not of a body's size in metres.
+        AssetError: The unit is unknown.
         MotionError: There are fewer frames than asked for.
     """
-    rest, faces = sequence.positions[0], np.asarray(sequence.faces, np.int64)
-    extent = float(np.ptp(rest, axis=0).max())
-    if not _SIZES[0] <= extent <= _SIZES[1]:
-        raise AssetError(f"{sequence.name} is {extent:.4g} m large in its first frame; scale it to metres")
-    positions = _resample(sequence.positions, sequence.fps, fps)
+    faces = np.asarray(sequence.faces, np.int64)
+    extent = float(np.ptp(sequence.positions[0], axis=0).max())
+    scaled = metres_per_unit(sequence.name, extent, units) * sequence.positions
+    rest, positions = scaled[0], _resample(scaled, sequence.fps, fps)
     if num_frames is not None:
         if num_frames > len(positions):
             raise MotionError(
@@ -67,21 +67,13 @@ def pose_sequence(
         parents=(-1,) * patches,
         joint_names=tuple(f"patch{patch}" for patch in range(patches)),
     )
-    motion = BodyMotion(
-        positions=jnp.asarray(positions, jnp.float32),
-        joint_transforms=jnp.asarray(transforms, jnp.float32),
-        faces=body.faces,
-        is_obstacle=body.is_obstacle,
-        timestep=jnp.float32(1.0 / fps),
-        rest_positions=body.rest_positions,
-        surface=obstacle_surface(body),
-    )
-    return body, motion
+    moved = (jnp.asarray(values, jnp.float32) for values in (positions, transforms))
+    return body, body_motion(body, *moved, fps=fps)
 
 
 def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
     """Return positions at another frame rate, by straight lines between frames."""
-    count = int(np.floor((len(positions) - 1) / fps_in * fps_out + 1e-6)) + 1
+    count = count_resampled(len(positions), fps_in, fps_out)
     at = np.arange(count) * (fps_in / fps_out)
     before = np.clip(at.astype(int), 0, max(len(positions) - 2, 0))
     share = np.clip(at - before, 0.0, 1.0)[:, None, None]
@@ -92,9 +84,13 @@ def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
 def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Divide a surface into patches with soft borders.
 
+    Args:
+        rest: Vertices at rest [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+
     Returns:
-        The largest weights of every vertex, which sum to one, and their patches, [vertices, influences]; and
-        all weights, [vertices, patches].
+        The largest weights of every vertex, which sum to one, shape [vertices, influences]; their patches, of
+        the same shape; and all weights, shape [vertices, patches].
     """
     edges = unique_edges(faces)
     lengths = np.maximum(np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1), 1e-9)
@@ -118,7 +114,12 @@ def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
 
 
 def _fit_patches(positions: NDArray, rest: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
-    """Return each patch's best rigid motion, [frames, patches, 3, 4], and its rest centre, [patches, 3].
+    """Return each patch's best rigid motion, shape [frames, patches, 3, 4], and rest centre, [patches, 3].
+
+    Args:
+        positions: Vertices in motion [m], shape [frames, vertices, 3].
+        rest: Vertices at rest [m], shape [vertices, 3].
+        weights: Weight of every patch at every vertex, shape [vertices, patches].
 
     Source: Kabsch 1976 (doi:10.1107/S0567739476001873).
     """

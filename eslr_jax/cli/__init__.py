@@ -11,9 +11,11 @@ import warnings
 
 from eslr_jax.cli import assets, bodies, budget, evaluate, garments, runs, simulate, train
 from eslr_jax.cli.console import app, stderr
-from eslr_jax.errors import EslrError
+from eslr_jax.errors import ConfigError, EslrError
 
 COMMANDS = (simulate, garments, bodies, runs, assets, train, evaluate, budget)  # each has registered its own
+
+_REPEATABLE = ("--set",)
 
 __all__ = ["app", "main"]
 
@@ -21,7 +23,10 @@ __all__ = ["app", "main"]
 def main() -> None:
     """Run the command line."""
     warnings.filterwarnings("ignore", category=DeprecationWarning)
+    warnings.filterwarnings("always", category=UserWarning, module="eslr_jax")
+    warnings.showwarning = _show_warning
     try:
+        _refuse_repetition(sys.argv[1:])
         app.cli(prog="eslr")
     except EslrError as error:
         stderr.print(f"eslr: {error}", markup=False, highlight=False, soft_wrap=True)
@@ -29,3 +34,20 @@ def main() -> None:
     except KeyboardInterrupt:
         stderr.print("eslr: interrupted", markup=False)
         sys.exit(130)
+
+
+def _show_warning(message, category, *_) -> None:
+    """Show a warning as one line on stderr."""
+    stderr.print(str(message), markup=False, highlight=False, soft_wrap=True)
+
+
+def _refuse_repetition(arguments: list[str]) -> None:
+    """Refuse an option that is given twice: the second value would silently replace the first.
+
+    Raises:
+        ConfigError: Names the option.
+    """
+    options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
+    for option in options:
+        if options.count(option) > 1 and option not in _REPEATABLE:
+            raise ConfigError(f"{option} is given twice; give it once")

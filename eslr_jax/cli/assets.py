@@ -1,4 +1,4 @@
-"""`eslr assets` and `eslr info`: what is in the box, what a network or a scene consists of."""
+"""`eslr assets` and `eslr info`: the bundled files, and what a network or a scene consists of."""
 
 from __future__ import annotations
 
@@ -19,17 +19,25 @@ from eslr_jax.errors import AssetError
 def assets(
     kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
     verify: bool = False,
+    export: Path | None = None,
+    body: str = "anny",
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """List what is in the box.
+    """List the bundled bodies, garments, motions, networks and fabrics.
 
     Args:
-        kind: Only this kind.
+        kind: List only this kind.
         verify: Compare every file with its checksum.
+        export: Write the rest body to this OBJ file instead, to model a garment on: in metres, Y up, facing Z,
+            the feet at the origin.
+        body: Body to export: name of a bundled one, or a body file.
         json_: Print as JSON.
     """
     from eslr_jax.assets.catalog import is_intact, list_assets
 
+    if export is not None:
+        _export_body(export, body)
+        return
     if kind == "fabric":
         _list_fabrics(json_)
         return
@@ -45,6 +53,26 @@ def assets(
     for asset in chosen:
         table.add_row(asset.kind, asset.name, asset.description, asset.licence)
     Console().print(table, markup=False)
+
+
+def _export_body(path: Path, name: str) -> None:
+    """Write a body's rest pose as an OBJ file, standing on the origin."""
+    import numpy as np
+
+    from eslr_jax.assets import load_body
+    from eslr_jax.io.atomic import atomic_write
+    from eslr_jax.io.mesh_sequence import obj_text
+
+    if path.suffix.lower() != ".obj":
+        raise AssetError(
+            f"--export {path}: a body is exported as an obj file; name it such as {path.stem}.obj"
+        )
+    rig = load_body(name)
+    positions = np.asarray(rig.rest_positions, np.float64)
+    positions[:, 1] -= positions[:, 1].min()
+    with atomic_write(path) as temporary:
+        temporary.write_text(obj_text("body", positions, np.asarray(rig.faces)))
+    print(f"{path}: {positions[:, 1].max():.2f} m tall, metres, Y up, facing Z, feet at the origin")
 
 
 def _list_fabrics(as_json: bool) -> None:
@@ -76,7 +104,7 @@ def info(
     self_contact: bool = False,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Show an architecture and its number of parameters; or with --scene, what a scene models at what cost.
+    """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs.
 
     Args:
         model: Name of an architecture, or of a bundled network, or an exported file.
@@ -119,21 +147,22 @@ def _show_scene(
     self_contact: bool,
     as_json: bool,
 ) -> None:
-    """Print what a scene models, what it leaves out, and what its parts cost."""
+    """Print the parts that a scene models, those it leaves out, and their costs."""
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
     from eslr_jax.assets.load import default_model
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
-    from eslr_jax.scene import prepare_scene
+    from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
-    config = SimConfig(simulator=simulator, model=architecture, self_contact=self_contact)
+    config = SimConfig(model=architecture)
+    options = SceneOptions(self_contact=self_contact)
     with stderr.status("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))
-        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses)
+        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses, options=options)
         parts = describe_scene(scene, poses, config)
         costs = time_parts(params, scene, config)
     if as_json:

@@ -21,13 +21,13 @@ def joints(
     out: Path | None = None,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Show which joint of a motion moves which joint of a body.
+    """Show which joint of a motion each joint of a body follows.
 
     Args:
-        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), glTF or FBX.
+        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), or glTF.
         body: Name of a bundled body, or a body file.
-        joint_map: JSON file of changes: the body's joint to the motion's, "" to keep it still.
-        out: Write the map here, to change it and give it to `eslr simulate --joint-map`.
+        joint_map: JSON file of changes: a joint of the body to one of the motion, "" to keep it still.
+        out: File to write the map to; change it and give it to `eslr simulate --joint-map`.
         json_: Print as JSON.
     """
     from eslr_jax.assets import load_body

@@ -1,4 +1,4 @@
-"""`eslr fit`: a garment file made ready for a body."""
+"""`eslr fit`: make a garment file ready for a body."""
 
 from __future__ import annotations
 
@@ -26,31 +26,45 @@ def fit(
 ) -> None:
     """Fit a garment of your own to a body once, for `eslr simulate --garment OUT`.
 
-    What is not given is recognised: unit, axes, place, and the pose of the arms. Beside OUT stands a picture,
-    before on the left and after on the right.
+    Unit, axes, place and the pose of the arms are recognised if they are not given. A picture beside OUT shows
+    the garment before and after.
 
     Args:
         garment: A mesh (obj, ply, stl, glb, npz), or FILE.pkl#NAME of HOOD's garments.
         out: The garment file to write, such as shirt.npz.
         body: Name of a bundled body, or a body file.
-        options: What is not left to recognition.
-        fabric: What it is made of, as for `eslr simulate`; kept in the file.
+        options: What is given instead of recognised.
+        fabric: Fabric as for `eslr simulate`; it is kept in the file.
         picture: Render the picture (extra `render`).
         json_: Print the report as JSON.
     """
     from eslr_jax.assets import load_body, load_garment_file, prepare_stored
     from eslr_jax.fabric import garment_material
-    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.fit.report import describe_cost, describe_fit
     from eslr_jax.io.garment import write_garment_npz
 
     if out.suffix != ".npz":
         raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
     use_compile_cache()
+
+    def say(text: str | None) -> None:
+        if text:
+            stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+
     with stderr.status("fitting"):
         rig = load_body(body)
-        stored = load_garment_file(garment, body=rig, fit=options)
+        is_remeshed = options.edge_length is not None
+        stored = load_garment_file(
+            garment,
+            body=rig,
+            fit=options,
+            on_source=lambda source: say(None if is_remeshed else describe_cost(len(source.mesh.positions))),
+        )
         if "fit" not in stored.metadata:
-            raise AssetError(f"{garment} is fitted already; give it to eslr simulate, or fit its mesh again")
+            raise AssetError(
+                f"{garment} needs no fit: it is bundled or already fitted; give it to eslr simulate, or give "
+                "eslr fit a mesh"
+            )
         stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
         garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
     write_garment_npz(out, stored)
@@ -59,13 +73,15 @@ def fit(
     report = stored.metadata["fit"]
     if json_:
         print(json.dumps(report, indent=2))
+        for text in report["warnings"]:
+            say(f"warning: {text}")
     else:
         print(describe_fit(report))
         print(out)
 
 
 def _write_before_and_after(path: Path, stored, rig) -> None:
-    """Render the garment as it came and as it was fitted; without the extra `render` say so and go on."""
+    """Render the garment before and after the fit, or say that the extra `render` is missing."""
     import numpy as np
 
     from eslr_jax.render import render_frame, side_by_side, write_png

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from eslr_jax.cli.console import app, progress, stderr
-from eslr_jax.errors import AssetError
+from eslr_jax.cli.console import app, progress
+from eslr_jax.cli.moment import parse_seconds
+from eslr_jax.errors import AssetError, ConfigError
+
+if TYPE_CHECKING:
+    from eslr_jax.io.trajectory import TrajectoryFile
 
 
 @app.command
@@ -18,7 +22,7 @@ def view(
     port: int = 8080,
     host: str = "127.0.0.1",
 ) -> None:
-    """Show runs side by side in the browser: timeline, colours, wireframe, export of a picture; Ctrl-C ends it.
+    """Show runs side by side in the browser, with a timeline, colours and plots; Ctrl-C ends it.
 
     Args:
         runs: Folders that `eslr simulate` wrote.
@@ -51,65 +55,108 @@ def render(
         "distance",
     ] = "fabric",
     camera: str = "front",
+    follow: bool = True,
+    zoom: float = 1.0,
+    at: str | None = None,
     width: int | None = None,
     frames: int | None = None,
-    samples: int = 16,
+    samples: int = 9,
 ) -> None:
-    """Render a run without a display: a film (mp4) or a contact sheet (png).
+    """Render a run without a display: a film (mp4), a contact sheet (png), or one picture (png and --at).
 
     Args:
         run: Folder that `eslr simulate` wrote.
         out: File to write; .mp4 (extra `video`) or .png.
         color: Colour the garment by this: dark blue is little, yellow much.
-        camera: front, side, back, or degrees from the front towards the side.
-        width: Width of one picture [pixels]; three quarters of its height.
+        camera: front, side, back, or degrees from the front towards the body's left.
+        follow: Turn the camera with the body; otherwise front is the world's +Z.
+        zoom: How many times larger than with the whole body in the picture; above 1 it looks at the garment.
+        at: Render one picture of this moment: a frame, such as 375, or a time, such as 12.5s.
+        width: Width of one picture [pixels]; its height follows.
         frames: Only the first so many frames of a film, or so many pictures of a sheet.
         samples: Camera rays per pixel.
     """
     from eslr_jax.evaluation.fields import run_field
     from eslr_jax.io.run import read_run
-    from eslr_jax.render import color_scale, contact_sheet, render_frames, write_png, write_video
+    from eslr_jax.render import (
+        add_color_bar,
+        color_scale,
+        contact_sheet,
+        moment_text,
+        render_frames,
+        write_label,
+        write_png,
+        write_video,
+    )
 
-    if out.suffix.lower() not in (".mp4", ".png"):
+    is_film = out.suffix.lower() == ".mp4"
+    if not is_film and out.suffix.lower() != ".png":
         raise AssetError(f"--out {out}: give a film, .mp4, or a picture, .png")
+    if frames is not None and frames < 1:
+        raise ConfigError(f"--frames {frames}: give 1 or more")
+    if at is not None and (is_film or frames is not None):
+        raise ConfigError("--at is one picture: give a .png, and no --frames")
     content = read_run(run)
     trajectory = content.trajectory
-    colors = None
+    chosen = None if at is None else _frame_at(at, trajectory)
+    colors, bar = None, None
     if color != "fabric":
         field = run_field(content, color)
         colors = color_scale(field.values, field.low, field.high)
-        stderr.print(
-            f"{color}: dark {field.low:.3g} to yellow {field.high:.3g} {field.unit}", highlight=False
-        )
+        bar = (field.low, field.high, f"{color} [{field.unit}]" if field.unit else color)
     angle: str | float = float(camera) if camera.lstrip("-").replace(".", "", 1).isdigit() else camera
-    meshes = trajectory.body_positions, trajectory.body_faces, trajectory.positions, trajectory.faces
-    if out.suffix.lower() == ".png":
-        size = (width or 280, round((width or 280) * 10 / 7))
-        count = frames or 8
+    body = trajectory.body
+    body_mesh = (None, None) if body is None else (body.positions, body.faces)
+    meshes = *body_mesh, trajectory.positions, trajectory.faces
+    look: dict[str, Any] = {
+        "rest_positions": body.rest_positions if body is not None and follow else None,
+        "camera": angle,
+        "zoom": zoom,
+        "vertex_colors": colors,
+        "samples": samples,
+    }
+
+    def finish(picture: Any) -> Any:
+        return picture if bar is None else add_color_bar(picture, *bar)
+
+    if not is_film and chosen is None:
+        count, size = frames or 8, (width or 252, round((width or 252) * 10 / 7))
         with progress("rendering", count) as advance:
             sheet = contact_sheet(
-                *meshes, num_frames=count, camera=angle, size=size, vertex_colors=colors, samples=samples,
+                *meshes,
+                num_frames=count,
+                size=size,
+                timestep=trajectory.timestep,
                 on_picture=advance,
-            )  # fmt: skip
-        write_png(out, sheet)
+                **look,
+            )
+        write_png(out, finish(sheet))
     else:
         size = (width or 480, round((width or 480) * 4 / 3))
         count = min(frames or trajectory.num_frames, trajectory.num_frames)
-        pictures = render_frames(
-            *meshes,
-            frame_indices=range(count),
-            camera=angle,
-            size=size,
-            vertex_colors=colors,
-            samples=samples,
-        )
-        with progress("rendering", count) as advance:
-            write_video(out, _counted(pictures, count, advance), 1.0 / trajectory.timestep)
+        indices = range(count) if chosen is None else [chosen]
+        pictures = render_frames(*meshes, frame_indices=indices, size=size, **look)
+        if chosen is not None:
+            label = moment_text(chosen, trajectory.timestep)
+            write_png(out, finish(write_label(next(pictures), label)))
+        else:
+            with progress("rendering", count) as advance:
+                film = (finish(picture) for picture in _counted(pictures, count, advance))
+                write_video(out, film, 1.0 / trajectory.timestep)
     print(out)
 
 
-def _counted(items, total: int, advance) -> Iterator[Any]:
-    """Yield items and show how many there were."""
+def _frame_at(moment: str, trajectory: TrajectoryFile) -> int:
+    """Return the frame of a moment of a run."""
+    frame = round(parse_seconds(moment, 1.0 / trajectory.timestep, option="--at") / trajectory.timestep)
+    if frame >= trajectory.num_frames:
+        last = trajectory.num_frames - 1
+        raise ConfigError(f"--at {moment}: the run ends at frame {last}, {last * trajectory.timestep:.2f} s")
+    return frame
+
+
+def _counted(items: Iterator[Any], total: int, advance: Callable[[int, int], Any]) -> Iterator[Any]:
+    """Yield items, and report how many of the total are done."""
     for done, item in enumerate(items, 1):
         yield item
         advance(done, total)

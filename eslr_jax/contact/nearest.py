@@ -232,7 +232,8 @@ def _contacts_at(
     next_points = interpolate(next_body, location, surface)
     here = safe_normalize(interpolate(normals, location, surface))
     side = jnp.sum((position - points) * here, axis=-1)
-    distance = jnp.sqrt(location.squared_distance)
+    is_apart = location.squared_distance > 0  # on the surface the root has no slope
+    distance = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, location.squared_distance, 1.0)), 0.0)
     on_boundary = surface.is_boundary[surface.faces[location.face]]
     is_on_boundary = (
         sum(jnp.where(on_boundary[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY

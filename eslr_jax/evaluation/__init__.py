@@ -1,1 +1,1 @@
-"""How good a trajectory or a model is: metrics, gap, referee, hard cases, reports."""
+"""How good a trajectory or a model is: metrics, optimality gap, reports."""

@@ -94,7 +94,7 @@ def measure_gap(
     trajectory: Trajectory,
     scene: Scene,
     model: ModelConfig | None = None,
-    options: GapOptions = GapOptions(),  # noqa: B008: a tuple of constants
+    options: GapOptions | None = None,
 ) -> OptimalityGap:
     """Compare a network, the solver after few iterations, and the optimum, from the states of a trajectory.
 
@@ -107,6 +107,7 @@ def measure_gap(
         model: Architecture of the network; None compares the solver alone. Static.
         options: What to compare with; static.
     """
+    options = options or GapOptions()
     states, inputs = trajectory_states(trajectory, scene)
     taken = jax.tree.map(lambda leaf: leaf[1 :: options.every], (states, inputs, trajectory.positions[1:]))
     counts = [*options.iterations, _OPTIMUM_ITERATIONS]

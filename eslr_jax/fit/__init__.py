@@ -1,1 +1,1 @@
-"""Fit a garment as a program exported it to a body: units, axes, place, pose, skin, pins, penetrations."""
+"""Fit a garment from another program to a body: unit, axes, place, pose, skin weights, pins, penetrations."""

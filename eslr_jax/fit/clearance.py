@@ -1,4 +1,4 @@
-"""Find where a garment lies inside the body, and take it out."""
+"""Find where a garment lies inside the body, and move it out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.skinning import smooth
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
-MAX_DEPTH = 0.06  # [m] that a vertex is taken out from; deeper ones are in another limb
+MAX_DEPTH = 0.06  # [m] from which a vertex is moved out; deeper ones are in another limb
 _MARGIN = 0.15  # [m] within which distances are exact
 _ROUNDS = 12
 _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
@@ -19,10 +19,10 @@ _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
 def body_heights(
     points: Float[np.ndarray, "points 3"], posture: Posture
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
-    """Return the exact signed distance of points to the touchable skin [m], and the skin's outward normals.
+    """Return the signed distance of points to the touchable skin [m], and the skin's outward normals there.
 
-    The sign is that of the interpolated vertex normal at the closest point. Beyond `_MARGIN` distances are those
-    to the nearest vertex, and normals zero.
+    The sign comes from the interpolated vertex normal at the closest point. Beyond 15 cm, distances are to the
+    nearest vertex and normals are zero.
     """
     heights = posture.heights(points)
     normals = np.zeros_like(points)
@@ -33,7 +33,7 @@ def body_heights(
 
 
 def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `body_heights` does, for points within its margin."""
+    """Return signed distances and normals of points within `_MARGIN` of the skin; see `body_heights`."""
     faces = posture.faces[posture.is_obstacle]
     low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
     centers = posture.positions[faces].mean(axis=1)
@@ -49,7 +49,7 @@ def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np
 
 
 def penetration(heights: Float[np.ndarray, " points"]) -> dict[str, float]:
-    """Return how many points are inside and how deep, for a report."""
+    """Return the number of points inside the body and their largest depth, given signed distances [m]."""
     depth = np.maximum(-heights[heights > -MAX_DEPTH], 0.0)
     return {"inside": int(np.sum(depth > 0)), "depth_max_mm": round(float(depth.max(initial=0.0)) * 1e3, 3)}
 
@@ -58,21 +58,18 @@ def push_out(
     positions: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     posture: Posture,
-    *,
-    clearance: float = CLEARANCE,
 ) -> tuple[Float[np.ndarray, "vertices 3"], dict[str, dict[str, float]]]:
-    """Move vertices that are inside the body, or nearer than `clearance`, out along the skin's normal.
+    """Move vertices that lie inside the body or closer than 3 mm out along the skin's normal.
 
     Their neighbours follow, so that no dents stay.
 
     Args:
-        positions: Garment vertices in the posture's pose [m].
-        faces: Garment triangles.
-        posture: The body.
-        clearance: Distance to keep from the skin [m].
+        positions: Garment vertex positions in the posture's pose [m], shape [vertices, 3].
+        faces: Triangles of the garment, shape [faces, 3].
+        posture: The body in that pose.
 
     Returns:
-        Positions [m], and the penetration before and after and how far vertices moved.
+        New positions [m], and a report of the penetration before and after and of the distances moved.
     """
     result = positions.copy()
     heights, normals = body_heights(result, posture)
@@ -80,7 +77,7 @@ def push_out(
     active = np.flatnonzero(np.abs(heights) < MAX_DEPTH)
     for _ in range(_ROUNDS):
         lift = np.zeros(len(result))
-        lift[active] = np.maximum(clearance - heights[active], 0.0)
+        lift[active] = np.maximum(CLEARANCE - heights[active], 0.0)
         lift[heights < -MAX_DEPTH] = 0.0
         if lift.max(initial=0.0) < 1e-5:
             break

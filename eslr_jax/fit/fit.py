@@ -1,19 +1,22 @@
-"""From a garment as a program exported it to one that can be simulated on a body."""
+"""Make a garment that another program exported ready for simulation on a body."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from eslr_jax.errors import MeshError
+from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.fit.clearance import push_out
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
 from eslr_jax.fit.placement import Placement, find_placement
 from eslr_jax.fit.postures import Posture, arm_postures, rest_posture, unpose
 from eslr_jax.fit.remesh import remesh
+from eslr_jax.fit.waist import Waist, find_waist
 from eslr_jax.geometry.repair import (
     Cleaned,
     consistent_orientation,
@@ -29,23 +32,23 @@ from eslr_jax.types import Body
 
 _SMOOTHING = 3  # Laplacian steps over transferred skin weights, as for the bundled shirts
 _LOOSE_SMOOTHING = 20  # for skirts, or the two legs tear them, as for the bundled dresses
-_LOOSE = 0.05  # [m] from the body; with a tenth of the vertices farther away a garment is loose
-_MAX_COORDINATE = 1e6  # beyond which no unit makes a garment
+_LOOSE = 0.05  # [m] from the body; a garment is loose if a tenth of its vertices are farther away
+_MAX_COORDINATE = 1e6  # beyond it no unit makes a garment
 
 
 def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = None) -> GarmentFile:
     """Clean a garment's mesh, put it on the body, and give it skin weights and pins.
 
-    Lengths, areas and angles stay those of the file, remeshing apart: turning arms down and taking vertices out
-    of the body change the rest positions, not the sewn shape.
+    Lengths, areas and angles stay those of the file, unless it is remeshed. Lowering arms and moving vertices
+    out of the body change the rest positions, not the sewn shape.
 
     Args:
-        source: Of `read_garment_source`.
+        source: Garment of `read_garment_source`.
         body: The body in its rest pose.
-        options: What is not left to recognition.
+        options: What is given instead of recognised.
 
     Returns:
-        The garment; `metadata["fit"]` says what was recognised and done.
+        The garment; `metadata["fit"]` reports what was recognised, done and doubted.
 
     Raises:
         MeshError: The mesh can't be repaired, or does not fit the body.
@@ -56,7 +59,9 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
     check_arrays(mesh.positions, mesh.faces, name=name)
     largest = float(np.abs(mesh.positions).max())
     if largest > _MAX_COORDINATE:
-        raise MeshError(f"{name}: coordinates up to {largest:.3g} are no garment's; check the file")
+        raise MeshError(
+            f"{name}: coordinates up to {largest:.3g} are too large for a garment; check the file"
+        )
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(body) if options.arms == "auto" else [rest_posture(body)]
     placement = find_placement(
@@ -88,14 +93,19 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
         rest = unpose(clear, weights, indices, posture.transforms)
         rest = push_out(rest, faces, postures[0])[0] if options.push_out else rest
     parts = None if mesh.face_parts is None else mesh.face_parts[face_source]
-    is_pinned = np.zeros(len(rest), bool)
+    file_pins = np.zeros(len(rest), bool)
     if source.is_pinned is not None and options.edge_length is None:
         held = vertex_map[source.is_pinned]
-        is_pinned[held[held >= 0]] = True
-    for text in options.pin:
-        is_pinned |= select_vertices(
-            text, rest, faces, vertex_map=vertex_map, face_parts=parts, part_names=mesh.part_names
-        )
+        file_pins[held[held >= 0]] = True
+    select = functools.partial(
+        select_vertices,
+        positions=rest,
+        faces=faces,
+        vertex_map=vertex_map,
+        face_parts=parts,
+        part_names=mesh.part_names,
+    )
+    is_pinned, pinned_by, falling = _pin(options.pin, file_pins, select, find_waist(rest, faces, body))
     uvs = None
     if mesh.corner_uvs is not None and options.edge_length is None:
         uvs = _turn(mesh.corner_uvs[face_source], is_turned)
@@ -117,17 +127,48 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
                 "mesh": report,
                 "penetration": penetration,
                 "pinned": int(is_pinned.sum()),
+                "pinned_by": pinned_by,
+                "warnings": [*placement.warnings, *falling],
             },
         },
     )
 
 
+def _pin(
+    texts: tuple[str, ...], file_pins: np.ndarray, select: Callable[[str], np.ndarray], waist: Waist
+) -> tuple[np.ndarray, str, list[str]]:
+    """Return the pinned vertices, where the pins come from, and a warning if nothing holds the garment.
+
+    Raises:
+        ConfigError: A pin is unknown, or it contradicts another.
+    """
+    is_pinned, nothing = file_pins.copy(), np.zeros_like(file_pins)
+    if "none" in texts:
+        if len(texts) > 1:
+            raise ConfigError("pin 'none' holds nothing; leave out the other pins")
+        is_pinned, pinned_by = nothing, "--pin none"
+    elif texts:
+        if "waist" in texts and not waist.is_held.any():
+            raise ConfigError(f"pin 'waist' holds no vertex: {waist.reason}")
+        for text in texts:
+            is_pinned |= waist.is_held if text == "waist" else select(text)
+        pinned_by = f"--pin {' '.join(texts)}{' and the file' if file_pins.any() else ''}"
+    elif file_pins.any():
+        pinned_by = "the file"
+    else:
+        is_pinned, pinned_by = waist.is_held, waist.reason
+    falls = (waist.is_held.any() or waist.is_falling) and not is_pinned.any()
+    remedy = "give --pin, such as --pin loop:top, or sew its parts with --components join"
+    return is_pinned, pinned_by, [f"nothing holds the garment up: {waist.reason}; {remedy}"] if falls else []
+
+
 def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
-    """Weld open edges and say what became of the mesh."""
+    """Weld open edges; return the mesh and a report."""
     clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
     if not face_areas(clean.positions, clean.faces).sum() > 0:
         raise MeshError(
-            "no face with an area is left once coincident vertices are one; check the mesh, or the weld distance"
+            "no face with an area is left after welding coincident vertices; check the mesh, or give a smaller "
+            "--weld"
         )
     num_used = len(np.unique(faces))
     report = {
@@ -142,7 +183,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
 
 
 def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
-    """Do with separate parts what the options say; positions are in metres."""
+    """Join or drop separate parts as the options say; positions are in metres."""
     if options.components not in ("join", "largest"):
         return clean, {}
     if options.components == "join":
@@ -158,7 +199,7 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]
 
 
 def _turned_faces(clean: Cleaned, posture: Posture) -> np.ndarray:
-    """Return the faces to turn: those that disagree with their neighbours, and parts that face the body."""
+    """Return a mask of the faces to turn: those that disagree with neighbours, and parts that face the body."""
     turn = consistent_orientation(clean.positions, clean.faces)
     crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
     _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
@@ -178,7 +219,7 @@ def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
 def _skin_weights(
     positions: np.ndarray, faces: np.ndarray, posture: Posture, body: Body
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Take skin weights over from the body in the garment's pose."""
+    """Return skin weights and joints of a garment, from the body in the garment's pose."""
     is_loose = np.quantile(posture.heights(positions), 0.9) > _LOOSE
     return transfer_skin_weights(
         positions,
@@ -194,10 +235,13 @@ def _skin_weights(
 def _describe(placement: Placement, posture: Posture) -> dict[str, Any]:
     """Return a placement as plain values."""
     return {
+        "what": placement.describe(),
         "metres_per_unit": placement.factor,
         "up": placement.up,
         "front": placement.front,
+        "origin": placement.origin,
         "moved_m": [round(float(value), 4) for value in placement.translation],
         "arms_below_horizontal_deg": posture.arm_angle,
         "cost": round(placement.cost, 3),
+        "confidence": round(placement.confidence, 3),
     }

@@ -1,4 +1,4 @@
-"""What a user may say about a garment; importing it does no work, for the command line."""
+"""Options of a fit; importing this module does no work, for the command line's sake."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ _JOIN_GAP = 0.01  # [m] across which parts are joined: a seam allowance
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """What is not left to recognition.
+    """What is given instead of recognised.
 
     Attributes:
         units: Unit of the file, or metres per unit.
-        up: The file's axis that points up.
-        front: The file's axis that the wearer faces.
-        keep_place: Do not move the garment along the body; its origin is the body's.
+        up: Axis of the file that points up.
+        front: Axis of the file that the wearer faces.
+        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own.
+            With units, up and front given, nothing is refused.
         arms: Recognise the pose of the arms that the garment was modelled in, or take the body's rest pose.
-        components: What becomes of separate parts: keep them, join their open edges, keep the largest, or
-            refuse them.
+        components: Keep separate parts, join their open edges, keep the largest, or refuse them.
         join_gap: Distance across which `join` sews parts together [m].
-        weld: Distance within which the vertices of open edges are one, relative to the garment's size.
+        weld: Distance within which vertices of open edges become one, relative to the garment's size.
         edge_length: Remesh to this mean edge length [m] (extra `remesh`).
-        pin: Vertices that follow the body: vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or
-            loop:top|bottom|left|right|front|back.
+        pin: Vertices that follow the body: none, waist, vertices:0,5,9, part:NAME, region:y>0.2,x<0.1,
+            loop:NUMBER or loop:top|bottom|left|right|front|back. If not given, the pins in the file, or else the
+            waistband of a garment that does not hang from the shoulders.
         push_out: Move vertices that lie inside the body out of it.
     """
 

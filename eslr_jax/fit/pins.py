@@ -1,4 +1,4 @@
-"""Which vertices follow the body: by number, by part, by region, or by an open edge."""
+"""Vertices that follow the body: chosen by number, part, region or open edge, or by default the waistband."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _SIDES = {
     "back": (2, -1),
 }
 PIN_FORMS = (
-    "vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or loop:top|bottom|left|right|front|back"
+    "none, waist, vertices:0,5,9, part:NAME, region:y>0.2,x<0.1, loop:NUMBER or "
+    "loop:top|bottom|left|right|front|back"
 )
 
 
@@ -33,16 +34,16 @@ def select_vertices(
     face_parts: Int[np.ndarray, " faces"] | None,
     part_names: tuple[str, ...],
 ) -> Bool[np.ndarray, " vertices"]:
-    """Return the vertices that a pin names.
+    """Return a mask of the vertices that a pin names.
 
     Args:
-        text: One of `PIN_FORMS`. Vertices are counted from zero, as in the file; regions are in the body's
-            frame [m], left = +x, up = +y, front = +z; open edges are numbered by their number of vertices,
-            most first, or named by where their middle lies.
-        positions: Vertices in the body's rest pose [m].
-        faces: Triangles.
-        vertex_map: Vertex of every vertex of the file.
-        face_parts: Part of every face, or None.
+        text: One of `PIN_FORMS` but none and waist. Vertices are counted from zero, as in the file. Regions are
+            in the body's frame [m]: left is +x, up is +y, front is +z. Open edges are numbered by their number
+            of vertices, most first, or named by the side on which their middle lies.
+        positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        vertex_map: Vertex of every vertex of the file, shape [source_vertices]; -1 where it was dropped.
+        face_parts: Part of every face, shape [faces], or None.
         part_names: Names of the parts.
 
     Raises:
@@ -70,7 +71,7 @@ def select_vertices(
 
 
 def _numbered(text: str, rest: str, vertex_map: np.ndarray) -> np.ndarray:
-    """Return vertices by their number in the file."""
+    """Return the vertices with the given numbers in the file."""
     try:
         numbers = np.array([int(word) for word in rest.split(",")])
     except ValueError as error:
@@ -87,14 +88,14 @@ def _region(text: str, rest: str, positions: np.ndarray) -> np.ndarray:
     for part in rest.split(","):
         match = _COMPARISON.fullmatch(part)
         if match is None:
-            raise ConfigError(f"pin {text!r}: {part!r} is no comparison such as y>0.2")
+            raise ConfigError(f"pin {text!r}: {part!r} is not a comparison such as y>0.2")
         values, limit = positions[:, "xyz".index(match[1])], float(match[3])
         chosen &= values > limit if match[2] == ">" else values < limit
     return chosen
 
 
 def _loop(text: str, rest: str, positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return an open edge by number or by side."""
+    """Return the vertices of an open edge, given its number or side."""
     loops = boundary_loops(faces)
     if not loops:
         raise ConfigError(f"pin {text!r}: the garment has no open edge")
@@ -108,6 +109,6 @@ def _loop(text: str, rest: str, positions: np.ndarray, faces: np.ndarray) -> np.
 
 
 def _span(positions: np.ndarray) -> str:
-    """Return the extent along every axis."""
+    """Describe the extent along every axis."""
     low, high = positions.min(axis=0), positions.max(axis=0)
     return ", ".join(f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high, strict=True))

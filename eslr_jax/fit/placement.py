@@ -1,9 +1,10 @@
-"""Recognise a garment's unit, axes, place and pose by how well it wraps the body."""
+"""Recognise a garment's unit, axes, place and posture by how well it wraps the body."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,32 +12,30 @@ from jaxtyping import Float, Int
 from eslr_jax.errors import MeshError
 from eslr_jax.fit.options import Axis, Unit
 from eslr_jax.fit.postures import Posture
-from eslr_jax.geometry.topology import face_areas, vertex_areas
+from eslr_jax.fit.scoring import DEEP, Sample, count_pierced, fit_cost, sample_garment, wearing_cost
+from eslr_jax.geometry.validate import UNITS
 
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}  # metres per unit
 _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from a scarf to a long coat
-_SAMPLES = 160  # garment points whose distances are looked at
-_INSIDE, _MAX_INSIDE = 0.01, 0.06  # [m] of depth that costs one, and beyond which nothing more is learnt
-_OUTSIDE, _MAX_OUTSIDE = 0.05, 0.10  # [m] likewise outside, where cloth may hang loose
 _SLIDE_STEP = 0.04  # [m] between tried heights
-_MISFIT = 1.7  # mean cost above which nothing was recognised; 2 is a garment in the air, a wide dress has 1.4
-# What is usual costs less: factors on the mean cost.
-_FEET, _SLID = 1.1, 1.25  # origin on the floor between the feet; origin anywhere
-_TURNED = 1.3  # facing elsewhere than its up axis makes usual
-_RAISED = 1.05  # arms at another angle than the body's
+_NEAR, _MIN_NEAR = 0.06, 0.03  # [m]; share of points nearer than that to the body below which nothing fits
+# What is usual costs less: factors on the cost of a fit.
+_PLACES = {"floor": 1.0, "body": 1.05, "found": 1.3}
+_TURNED = 1.6  # the front is not the one that usually goes with the up axis
+_RAISED = 1.1  # arms at another angle than the body's
 _INCHES = 1.1
-_SMALL, _SMALL_SHARE = 1.5, 0.35  # bounding box less than this share of the body's height: a shirt on a head
-_GOOD = (
-    1.5  # mean cost of a known place beyond which the garment is moved along the body to look for a better
-)
-_LIMBS_INSIDE = 0.03  # share of points deep inside the body, likewise: a limb pierces a garment out of place
+_SMALL, _SMALL_SHARE = 2.5, 0.35  # bounding box less than this share of the body's height: a shirt on a head
+_POOR = 3.0  # cost of a known place above which the garment is moved along the body to look for a better one
+_LIMBS_INSIDE = 0.06  # share of points deep inside the body above which it is moved too
+_RIVAL = 0.05  # [m] mean distance from which two placements are different
+_COST_SPREAD = 0.1  # difference of costs that makes the better one 2.7 times as likely
+DOUBTFUL = 0.9  # confidence below which a person should look
+_SCALES = np.arange(0.88, 1.121, 0.01)  # of the unit, tried to see whether it is another
+_SCALE_TOLERANCE = 0.02  # deviation of the best scale from which it is told
+_LARGER, _SMALLER = 0.15, 0.35  # share of the cost that it must save; a roomy garment fits better if smaller
+_MOVED = 0.3  # cost that a place which was looked for may save against the origin at another scale
 _VECTORS = {
-    "x": (1, 0, 0),
-    "y": (0, 1, 0),
-    "z": (0, 0, 1),
-    "-x": (-1, 0, 0),
-    "-y": (0, -1, 0),
-    "-z": (0, 0, -1),
+    f"{sign}{axis}": np.array([float(axis == other) * (-1 if sign else 1) for other in "xyz"])
+    for sign, axis in itertools.product(("", "-"), "xyz")
 }
 _USUAL_FRONT = {"y": "z", "z": "-y", "x": "y", "-y": "z", "-z": "-y", "-x": "y"}
 
@@ -51,11 +50,27 @@ class Placement:
     posture: int  # index of the posture that the garment was modelled on
     up: str
     front: str
-    cost: float  # mean over points; 0 is skin-tight, 1 is 5 cm away or 1 cm deep
+    origin: str  # of the file: "floor" (between the feet), "body" (the body's own) or "found" (elsewhere)
+    cost: float  # of the fit, times that of what is unusual
+    confidence: float = 1.0  # that no other placement is meant, 0 to 1
+    warnings: tuple[str, ...] = ()
 
-    def apply(self, positions: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+    def apply(self, positions: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*points 3"]:
         """Return positions in the body's frame [m]."""
         return self.factor * positions @ self.rotation.T + self.translation
+
+    def bones(self, posture: Posture) -> Float[np.ndarray, "bones 2 3"]:
+        """Return the bones of a posture in the file's coordinates."""
+        return (posture.bones - self.translation) @ self.rotation / self.factor
+
+    def describe(self) -> str:
+        """Return the placement in a few words."""
+        unit = next((name for name, factor in UNITS.items() if factor == self.factor), "")
+        places = {"floor": "feet at the origin", "body": "the body's origin", "found": "moved along the body"}
+        return (
+            f"{self.factor:g} m per unit{f' ({unit})' * bool(unit)}, {self.up} up, {self.front} front, "
+            f"{places[self.origin]}"
+        )
 
 
 def find_placement(
@@ -69,131 +84,189 @@ def find_placement(
     keep_place: bool = False,
     name: str = "garment",
 ) -> Placement:
-    """Return the unit, axes, place and posture in which a garment wraps the body best.
+    """Return the unit, axes, place and posture in which a garment fits the body best.
 
-    Every combination of what was not given is tried on a sample of points. A point costs more the farther
-    from the body it is, and much more inside it. What is usual (the body's own frame; Y up facing Z, or Z up
-    facing -Y) wins unless something else is clearly better.
+    Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
+    costs less: feet at the origin, Y up and facing Z, or Z up and facing -Y. The confidence compares the best
+    placement with the next best one that differs from it.
 
     Args:
-        positions: Vertices as the file has them.
-        faces: Triangles of a welded mesh.
+        positions: Vertex positions as the file has them, shape [vertices, 3].
+        faces: Triangles of a welded mesh, shape [faces, 3].
         postures: The body in the poses that the garment may have been modelled on; the rest pose first.
         units: Unit of the file, or metres per unit.
-        up: The file's axis that points up.
-        front: The file's axis that the wearer faces.
-        keep_place: Do not move the garment; its origin is the body's.
-        name: What messages call the garment.
+        up: Axis of the file that points up.
+        front: Axis of the file that the wearer faces.
+        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own.
+        name: Name of the garment in messages.
 
     Raises:
-        MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits.
+        MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where
+            everything is given, nothing is refused.
     """
     factors = _factors(positions, postures[0], units, name)
-    sample = _sample(positions, faces)
-    tried = []
-    for factor, (rotation, axes, is_usual) in itertools.product(factors, _rotations(up, front)):
-        turned = factor * sample @ rotation.T
-        base = factors[factor] * (1.0 if is_usual else _TURNED)
-        for k, posture in enumerate(postures):
-            weight = base * (1.0 if k == 0 else _RAISED)
-            for offset, extra in _known_places(posture, keep_place):
-                cost = weight * extra * _cost(posture.heights(turned + offset))
-                tried.append((cost, Placement(factor, rotation, offset, k, *axes, cost)))
-    best = min(tried, key=lambda item: item[0])[1]
-    deep = float(np.mean(postures[best.posture].heights(best.apply(sample)) < -_INSIDE))
-    if not keep_place and (best.cost > _GOOD or deep > _LIMBS_INSIDE):
-        best = min([best, *_slide(sample, tried, factors, postures)], key=lambda placement: placement.cost)
-    misfit = _cost(postures[best.posture].heights(best.apply(sample)))
-    if misfit > _MISFIT:
-        raise MeshError(
-            f"{name}: does not fit the body in any unit, axis or place (the best is off by {misfit:.1f} of "
-            f"{_MISFIT}); give --units, --up and --front, or move it onto the body and give --keep-place"
+    orientations = [
+        Placement(factor, rotation, np.zeros(3), 0, *axes, "floor", weight * (1.0 if is_usual else _TURNED))
+        for (factor, weight), (rotation, axes, is_usual) in itertools.product(
+            factors.items(), _rotations(up, front)
         )
-    return best
+    ]
+    sample = sample_garment(positions, faces)
+    known = list(_known_candidates(sample, orientations, postures))
+    best, rival = _choose(known, sample, postures)
+    if not keep_place and _is_poor(best, sample, postures):
+        best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
+    is_given = keep_place and "auto" not in (units, up, front)
+    near = np.abs(postures[best.posture].heights(best.apply(sample.points))) < _NEAR
+    if near.mean() < _MIN_NEAR and not is_given:
+        options = {"--units": units, "--up": up, "--front": front, "--keep-place": keep_place or "auto"}
+        missing = [option for option, value in options.items() if value == "auto"]
+        raise MeshError(
+            f"{name}: does not fit the body in any unit, axis or place that was tried; give "
+            f"{' and '.join(missing)}, or model it on the body of eslr assets --export body.obj"
+        )
+    margin = np.inf if rival is None else rival.cost - best.cost
+    confidence = float(1.0 / (1.0 + np.exp(-margin / _COST_SPREAD)))
+    warnings = []
+    if confidence < DOUBTFUL and rival is not None:
+        warnings.append(
+            f"the place is doubtful (confidence {confidence:.0%}): {rival.describe()} fits almost as well; look "
+            "at the picture, and give --units, --up, --front or --keep-place"
+        )
+    if near.mean() < _MIN_NEAR:
+        warnings.append("the garment is not on the body, and stays there as asked; look at the picture")
+    if units == "auto":
+        warnings += _scale_warning(best, sample, postures)
+    return dataclasses.replace(best, confidence=confidence, warnings=tuple(warnings))
 
 
-def _known_places(posture: Posture, keep_place: bool) -> list[tuple[np.ndarray, float]]:
-    """Return the body's own origin, and the floor between its feet, with the factors of their costs."""
-    places = [(np.zeros(3), 1.0)]
-    if not keep_place:
-        places.append((np.array([0.0, posture.positions[:, 1].min(), 0.0]), _FEET))
-    return places
+def _known_candidates(
+    sample: Sample, orientations: list[Placement], postures: list[Posture]
+) -> Iterable[Placement]:
+    """Yield every orientation at the known origins, in every posture."""
+    for start, (k, posture), place in itertools.product(orientations, enumerate(postures), ("floor", "body")):
+        offset = np.array([0.0, posture.floor if place == "floor" else 0.0, 0.0])
+        yield _scored(start, sample, postures, posture=k, translation=offset, origin=place)
 
 
-def _slide(
-    sample: np.ndarray,
-    tried: list[tuple[float, Placement]],
-    factors: dict[float, float],
-    postures: list[Posture],
-) -> list[Placement]:
-    """Move the garment along the body, for each orientation in the two extreme postures; refine the best."""
-    orientations = {(p.factor, p.up, p.front): p for _, p in tried}
+def _scored(start: Placement, sample: Sample, postures: list[Posture], **changes) -> Placement:
+    """Return a changed placement with its cost; `start.cost` is the factor of its orientation."""
+    moved = dataclasses.replace(start, **changes)
+    weight = start.cost * _PLACES[moved.origin] * (1.0 if moved.posture == 0 else _RAISED)
+    return dataclasses.replace(
+        moved, cost=weight * fit_cost(moved.apply(sample.points), postures[moved.posture])
+    )
+
+
+def _choose(
+    candidates: list[Placement], sample: Sample, postures: list[Posture]
+) -> tuple[Placement, Placement | None]:
+    """Return the best candidate and its best rival, the cost of pierced bones included.
+
+    That cost is expensive, so it is added in the order of the other costs until no candidate can be better.
+    """
+    done: list[Placement] = []
+    rival = None
+    for candidate in sorted(candidates, key=lambda placement: placement.cost):
+        if rival is not None and candidate.cost > rival.cost:
+            break
+        posture = postures[candidate.posture]
+        extra = wearing_cost(sample, candidate.apply(sample.points), candidate.bones(posture), posture)
+        done.append(dataclasses.replace(candidate, cost=candidate.cost + extra))
+        best = min(done, key=lambda placement: placement.cost)
+        rivals = [other for other in done if _is_rival(best, other, sample)]
+        rival = min(rivals, key=lambda placement: placement.cost, default=None)
+    return min(done, key=lambda placement: placement.cost), rival
+
+
+def _is_rival(best: Placement, other: Placement, sample: Sample) -> bool:
+    """Tell whether another placement puts the garment elsewhere.
+
+    If the garment fits with its feet at the origin, that it fits also where it is moved to says nothing.
+    """
+    key = (best.factor, best.up, best.front)
+    if best.origin == "floor" and other.origin == "found" and key == (other.factor, other.up, other.front):
+        return False
+    apart = np.linalg.norm(best.apply(sample.points) - other.apply(sample.points), axis=1)
+    return bool(apart.mean() > _RIVAL)
+
+
+def _is_poor(best: Placement, sample: Sample, postures: list[Posture]) -> bool:
+    """Tell whether a better place is worth looking for; limbs pierce a garment that is out of place."""
+    posture = postures[best.posture]
+    heights = posture.heights(best.apply(sample.points))
+    is_off = np.mean(heights < -DEEP) > _LIMBS_INSIDE or np.mean(np.abs(heights) < _NEAR) < _MIN_NEAR
+    return (
+        best.cost > _POOR or bool(is_off) or count_pierced(sample, best.bones(posture), posture.is_limb) > 0
+    )
+
+
+def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture]) -> list[Placement]:
+    """Move the garment along the body in the two extreme postures, and refine the best of each orientation."""
     angles = [90.0 if posture.arm_angle is None else posture.arm_angle for posture in postures]
     found = []
-    for start in orientations.values():
-        turned = start.factor * sample @ start.rotation.T
+    for start in orientations:
+        turned = start.apply(sample.points)
         low, high = turned.min(axis=0), turned.max(axis=0)
-        weight = _SLID * factors[start.factor] * _turned(start)
+        tried = []
         for k in {0, int(np.argmin(angles))}:
             posture = postures[k]
-            floor, top = posture.positions[:, 1].min(), posture.positions[:, 1].max()
-            for height in np.arange(floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
+            top = posture.positions[:, 1].max()
+            for height in np.arange(posture.floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
                 offset = np.array([-0.5 * (low[0] + high[0]), height, -0.5 * (low[2] + high[2])])
-                offset[2] += _depth_at(posture, low[1] + height, high[1] + height)
-                cost = weight * _cost(posture.heights(turned + offset))
-                found.append(dataclasses.replace(start, translation=offset, posture=k, cost=cost))
+                offset[2] += _middle_depth(posture, low[1] + height, high[1] + height)
+                tried.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
+        found += [(start, best) for best in sorted(tried, key=lambda placement: placement.cost)[:2]]
     refined = []
-    for start in sorted(found, key=lambda placement: placement.cost)[:3]:
-        turned = start.factor * sample @ start.rotation.T
-        weight = _SLID * factors[start.factor] * _turned(start)
+    for start, best in sorted(found, key=lambda pair: pair[1].cost)[:4]:
+        turned = start.apply(sample.points)
         for k, posture in enumerate(postures):
-            offset = _settle(turned, start.translation, posture)
-            cost = weight * (1.0 if k == 0 else _RAISED) * _cost(posture.heights(turned + offset))
-            refined.append(dataclasses.replace(start, translation=offset, posture=k, cost=cost))
+            offset = _settle(turned, best.translation, posture)
+            refined.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
     return refined
 
 
-def _turned(placement: Placement) -> float:
-    """Return what facing an unusual way costs."""
-    return 1.0 if _USUAL_FRONT[placement.up] == placement.front else _TURNED
-
-
-def _depth_at(posture: Posture, low: float, high: float) -> float:
-    """Return the middle of the body from back to front between two heights [m]."""
+def _middle_depth(posture: Posture, low: float, high: float) -> float:
+    """Return the middle of the trunk from back to front between two heights [m]."""
     points = posture.positions[posture.touchable]
     here = points[(points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0]) < 0.2)]
     return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else 0.0
 
 
 def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndarray:
-    """Move points as one so that they lie neither inside nor far from the body: damped least squares."""
+    """Move points as one until they lie neither inside nor far from the body: damped least squares."""
     for _ in range(12):
         placed = points + offset
         distance, nearest = posture.tree.query(placed)
         vertex = posture.touchable[nearest]
         normals = posture.normals[vertex]
         height = np.einsum("px,px->p", placed - posture.positions[vertex], normals)
-        weight = np.where(height < 0, 1.0, 0.1) * (distance < _MAX_OUTSIDE)
+        weight = np.where(height < 0, 1.0, 0.1) * (distance < 0.1)
         wanted = np.clip(height, 0.005, 0.03) - height
         matrix = np.einsum("p,px,py->xy", weight, normals, normals) + 0.02 * len(points) * np.eye(3)
         offset = offset + np.linalg.solve(matrix, np.einsum("p,p,px->x", weight, wanted, normals))
     return offset
 
 
-def _cost(heights: np.ndarray) -> float:
-    """Return the mean cost of points at these heights over the body."""
-    inside = np.minimum(-heights, _MAX_INSIDE) / _INSIDE
-    outside = np.minimum(heights, _MAX_OUTSIDE) / _OUTSIDE
-    return float(np.mean(np.where(heights < 0, inside, outside)))
-
-
-def _sample(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Pick points evenly over the area, always the same ones, and the extremes."""
-    areas = vertex_areas(face_areas(positions, faces), faces, len(positions))
-    steps = np.cumsum(areas) / areas.sum()
-    picked = np.searchsorted(steps, (np.arange(_SAMPLES) + 0.5) / _SAMPLES)
-    extremes = np.concatenate([positions.argmin(axis=0), positions.argmax(axis=0)])
-    return positions[np.unique(np.concatenate([np.minimum(picked, len(positions) - 1), extremes]))]
+def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> list[str]:
+    """Warn if the garment fits clearly better, or only then at its origin, a few percent larger or smaller."""
+    posture = postures[best.posture]
+    here = fit_cost(best.apply(sample.points), posture)
+    origins = [best.translation]
+    if best.origin == "found":
+        origins = [np.array([0.0, height, 0.0]) for height in (posture.floor, 0.0)]
+    turned = best.factor * sample.points @ best.rotation.T
+    for origin in origins:
+        costs = np.array([fit_cost(scale * turned + origin, posture) for scale in _SCALES])
+        scale = float(_SCALES[np.argmin(costs)])
+        gain = -_MOVED if best.origin == "found" else (_LARGER if scale > 1.0 else _SMALLER) * here
+        if abs(scale - 1.0) > _SCALE_TOLERANCE and costs.min() < here - gain:
+            return [
+                f"the unit is doubtful: {best.factor:g} m per unit was taken, {scale * best.factor:.3g} fits "
+                f"{'without moving' if best.origin == 'found' else 'better'} "
+                f"({1.0 / (scale * best.factor):.3g} units in a metre); give --units"
+            ]
+    return []
 
 
 def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: str) -> dict[float, float]:
@@ -218,13 +291,13 @@ def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: st
 
 
 def _rotations(up: Axis, front: Axis) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
-    """Return rotations of file axes onto (left, up, front) = (x, y, z), with the axes and whether usual."""
+    """Return rotations of file axes onto (left, up, front), with the axes and whether they are usual."""
     result = []
     for vertical in ("y", "z") if up == "auto" else (up,):
         for facing in _VECTORS if front == "auto" else (front,):
             if facing[-1] == vertical[-1]:
                 continue
-            y, z = np.array(_VECTORS[vertical], float), np.array(_VECTORS[facing], float)
+            y, z = _VECTORS[vertical], _VECTORS[facing]
             rotation = np.stack([np.cross(y, z), y, z])
             result.append((rotation, (vertical, facing), _USUAL_FRONT[vertical] == facing or front != "auto"))
     if not result:

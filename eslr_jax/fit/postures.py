@@ -9,24 +9,32 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.motion import joint_transforms, skin_frames
-from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.body.motion import joint_transforms
+from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.types import Body
 
 ARM_ANGLES = (0.0, 25.0, 45.0, 65.0)  # degrees below the horizontal that are tried; 0 is the T-pose
 _OFF_AXIS = 0.04  # of the body's height: joints farther from the middle belong to a limb
+_LIMB = 0.11  # of the body's height: length from which a bone is that of an arm or leg
+_SHOULDERS = 0.8  # of the body's height, for a body without arms
 
 
 @dataclasses.dataclass(frozen=True)
 class Posture:
-    """A body with its arms at one angle, ready for queries of distance."""
+    """A body with its arms at one angle, ready for distance queries."""
 
     positions: Float[np.ndarray, "body_vertices 3"]  # [m]
-    normals: Float[np.ndarray, "body_vertices 3"]
     transforms: Float[np.ndarray, "joints 3 4"]  # rest -> this posture
+    joints: Float[np.ndarray, "joints 3"]  # [m]
+    parents: tuple[int, ...]  # of the joints
     faces: Int[np.ndarray, "body_faces 3"]
     is_obstacle: Bool[np.ndarray, " body_faces"]
-    arm_angle: float | None  # degrees below the horizontal; None: the rest pose as it is
+    arm_angle: float | None  # degrees below the horizontal; None in the rest pose
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "body_vertices 3"]:
+        """Unit normals of the vertices."""
+        return vertex_normals(self.positions, self.faces)
 
     @cached_property
     def touchable(self) -> Int[np.ndarray, " touchable"]:
@@ -38,6 +46,24 @@ class Posture:
         """Search tree of the touchable vertices."""
         return cKDTree(self.positions[self.touchable])
 
+    @cached_property
+    def bones(self) -> Float[np.ndarray, "bones 2 3"]:
+        """Segments from every joint's parent to the joint [m]."""
+        children = [joint for joint, parent in enumerate(self.parents) if parent >= 0]
+        parents = [self.parents[joint] for joint in children]
+        return np.stack([self.joints[parents], self.joints[children]], axis=1)
+
+    @cached_property
+    def is_limb(self) -> Bool[np.ndarray, " bones"]:
+        """Mask of the long bones, those of arms and legs."""
+        lengths = np.linalg.norm(self.bones[:, 1] - self.bones[:, 0], axis=1)
+        return lengths > _LIMB * np.ptp(self.positions[:, 1])
+
+    @property
+    def floor(self) -> float:
+        """Height of the lowest vertex [m]."""
+        return float(self.positions[:, 1].min())
+
     def heights(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """Return the distance of every point to the nearest touchable vertex [m], negative inside."""
         distance, nearest = self.tree.query(points)
@@ -48,49 +74,39 @@ class Posture:
 
 def rest_posture(body: Body) -> Posture:
     """Return the body in its rest pose."""
-    return _posture(body, np.asarray(body.rest_positions, np.float64), _identity(body), None)
+    return _posture(body, np.tile(np.eye(3, 4), (len(body.parents), 1, 1)), None)
 
 
 def arm_postures(body: Body) -> list[Posture]:
-    """Return the rest posture and, where the body has arms, one for each of `ARM_ANGLES` that differs."""
+    """Return the rest posture, followed by one for each of `ARM_ANGLES` that differs if the body has arms."""
     arms = find_arms(body)
     if arms is None:
         return [rest_posture(body)]
     joints = np.asarray(body.joint_rest_positions, np.float64)
-    rest_angles = []
-    for joint, child in arms:
-        bone = joints[child] - joints[joint]
-        rest_angles.append(np.degrees(np.arctan2(-bone[1], abs(bone[0]))))
+    bones = [joints[child] - joints[joint] for joint, child in arms]
+    rest_angles = [np.degrees(np.arctan2(-bone[1], abs(bone[0]))) for bone in bones]
     angles = [angle for angle in ARM_ANGLES if max(abs(angle - rest) for rest in rest_angles) > 5.0]
     rotations = np.zeros((len(angles), len(joints), 3))
-    for (joint, child), rest_angle in zip(arms, rest_angles, strict=True):
-        side = np.sign(joints[child, 0] - joints[joint, 0])
-        rotations[:, joint, 2] = side * np.radians(rest_angle - np.array(angles))
+    for (joint, _), bone, rest_angle in zip(arms, bones, rest_angles, strict=True):
+        rotations[:, joint, 2] = np.sign(bone[0]) * np.radians(rest_angle - np.array(angles))
     translations = np.tile(joints[body.parents.index(-1)], (len(angles), 1))
-    transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    posed = np.asarray(
-        skin_frames(body.rest_positions, body.skin_weights, body.skin_indices, transforms), np.float64
+    transforms = np.asarray(
+        joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
     )
-    turned = [
-        _posture(body, posed[k], np.asarray(transforms[k], np.float64), angle)
-        for k, angle in enumerate(angles)
-    ]
-    return [rest_posture(body), *turned]
+    return [rest_posture(body), *(_posture(body, *pair) for pair in zip(transforms, angles, strict=True))]
 
 
 def find_arms(body: Body) -> list[tuple[int, int]] | None:
-    """Return (upper arm, forearm) joints of both sides by the shape of the rig alone; None without arms.
+    """Return the (upper arm, forearm) joints of both sides, or None if the rig has no arms.
 
-    The joint farthest to a side is a fingertip. Of the bones from it to the middle of the body, the two
-    longest are upper arm and forearm.
+    The joint farthest to a side is a fingertip. Of the bones from there to the middle of the body, the two
+    longest are the upper arm and the forearm. No joint names are needed.
     """
     joints = np.asarray(body.joint_rest_positions, np.float64)
-    positions = np.asarray(body.rest_positions)
-    off_axis = _OFF_AXIS * float(np.ptp(positions[:, 1]))
+    off_axis = _OFF_AXIS * float(np.ptp(np.asarray(body.rest_positions)[:, 1]))
     arms = []
     for side in (1.0, -1.0):
-        tip = int(np.argmax(side * joints[:, 0]))
-        chain = [tip]
+        chain = [int(np.argmax(side * joints[:, 0]))]
         while body.parents[chain[-1]] >= 0 and side * joints[body.parents[chain[-1]], 0] > off_axis:
             chain.append(body.parents[chain[-1]])
         if len(chain) < 3:
@@ -101,28 +117,57 @@ def find_arms(body: Body) -> list[tuple[int, int]] | None:
     return arms
 
 
+def shoulder_height(body: Body) -> float:
+    """Return the height of the upper arm joints in the rest pose [m]; an estimate if the rig has no arms."""
+    arms = find_arms(body)
+    if arms is None:
+        heights = np.asarray(body.rest_positions)[:, 1]
+        return float(heights.min() + _SHOULDERS * np.ptp(heights))
+    return float(np.mean(np.asarray(body.joint_rest_positions)[[joint for joint, _ in arms], 1]))
+
+
 def unpose(
     positions: Float[np.ndarray, "vertices 3"],
     skin_weights: Float[np.ndarray, "vertices influences"],
     skin_indices: Int[np.ndarray, "vertices influences"],
     transforms: Float[np.ndarray, "joints 3 4"],
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Undo linear blend skinning: the rest points that the blended maps take to `positions`."""
-    blended = np.einsum("vi,vixy->vxy", skin_weights, transforms[skin_indices])
+    """Undo linear blend skinning.
+
+    Args:
+        positions: Posed vertex positions [m], shape [vertices, 3].
+        skin_weights: Joint weights, shape [vertices, influences].
+        skin_indices: Joint of every weight, shape [vertices, influences].
+        transforms: Maps of the joints from the rest pose to the pose, shape [joints, 3, 4].
+
+    Returns:
+        The rest positions that the blended maps take to `positions` [m].
+    """
+    blended = _blend(skin_weights, skin_indices, transforms)
     return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
 
 
-def _identity(body: Body) -> np.ndarray:
-    """Return the maps of the rest pose."""
-    return np.tile(np.eye(3, 4), (len(body.parents), 1, 1))
+def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Return the blended map of every vertex, shape [vertices, 3, 4]."""
+    return np.einsum("vi,vixy->vxy", weights, transforms[indices])
 
 
-def _posture(body: Body, positions: np.ndarray, transforms: np.ndarray, angle: float | None) -> Posture:
-    """Return a posture with vertex normals."""
-    faces = np.asarray(body.faces, np.int64)
-    normals = np.zeros_like(positions)
-    crosses = face_cross_products(positions, faces)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], crosses)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    return Posture(positions, normals, transforms, faces, np.asarray(body.is_obstacle), angle)
+def _posture(body: Body, transforms: np.ndarray, angle: float | None) -> Posture:
+    """Return the posture of a body under joint maps."""
+    transforms = np.asarray(transforms, np.float64)
+    rest = np.asarray(body.rest_positions, np.float64)
+    rest_joints = np.asarray(body.joint_rest_positions, np.float64)
+    weights, indices = np.asarray(body.skin_weights, np.float64), np.asarray(body.skin_indices)
+    posed = rest
+    if angle is not None:
+        blended = _blend(weights, indices, transforms)
+        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], rest) + blended[:, :, 3]
+    return Posture(
+        positions=posed,
+        transforms=transforms,
+        joints=np.einsum("jxy,jy->jx", transforms[:, :, :3], rest_joints) + transforms[:, :, 3],
+        parents=body.parents,
+        faces=np.asarray(body.faces, np.int64),
+        is_obstacle=np.asarray(body.is_obstacle),
+        arm_angle=angle,
+    )

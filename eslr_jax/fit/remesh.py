@@ -1,4 +1,4 @@
-"""An even triangulation with a wanted edge length (extra `remesh`)."""
+"""Even triangulations of a given edge length (extra `remesh`)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,15 @@ _ATTEMPTS = 6  # clusterings with a few vertices more; one in ten leaves a verte
 def remesh(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], edge_length: float
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"], Int[np.ndarray, " faces"]]:
-    """Return an even triangulation whose mean edge is about `edge_length` [m], and each face's source face.
+    """Return an even triangulation with a given mean edge length, and the source face of every face.
 
-    Vertices are the centres of equal clusters (Valette and Chassery 2004, the package pyacvd); those on open
-    edges are put back onto the open edges of the source, from which the centres shrink away.
+    Vertices are the centres of equal clusters (Valette and Chassery 2004, the package pyacvd). The centres
+    shrink away from open edges, so boundary vertices are moved back onto the open edges of the source.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        edge_length: Mean edge length to reach [m].
 
     Raises:
         ConfigError: The edge length gives an impossible number of vertices.
@@ -50,7 +55,7 @@ def remesh(
 def _clusterings(
     clustering: Any, positions: np.ndarray, faces: np.ndarray, count: int, edge_length: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cluster until a clean mesh comes out; see `remesh`."""
+    """Return the first clustering that is a clean mesh; see `remesh`."""
     clustering.subdivide(max(1, min(4, int(np.ceil(np.log(25 * count / len(positions)) / np.log(4.0))))))
     cause = ""
     for attempt in range(_ATTEMPTS):
@@ -74,7 +79,7 @@ def _clusterings(
 def _oriented(
     points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray
 ) -> np.ndarray:
-    """Turn triangles so that they face where the source does."""
+    """Turn triangles to the side that the source faces."""
     turn = consistent_orientation(points, triangles)
     triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
     nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
@@ -87,17 +92,13 @@ def _oriented(
 def _onto_open_edges(
     points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray
 ) -> np.ndarray:
-    """Move the vertices of open edges to the closest point of the source's nearest open edge."""
-    loops = boundary_loops(faces)
+    """Move boundary vertices to the closest point of the source's nearest open edge."""
+    loops = [positions[loop] for loop in boundary_loops(faces)]
     result = points.copy()
-    for loop in boundary_loops(triangles):
-        if not loops:
-            break
+    for loop in boundary_loops(triangles) if loops else []:
         middle = points[loop].mean(axis=0)
-        target = positions[
-            min(loops, key=lambda other: np.linalg.norm(positions[other].mean(axis=0) - middle))
-        ]
-        start, end = target, np.roll(target, -1, axis=0)
+        start = min(loops, key=lambda other: np.linalg.norm(other.mean(axis=0) - middle))
+        end = np.roll(start, -1, axis=0)
         along = end - start
         share = np.einsum("lsx,sx->ls", points[loop][:, None] - start, along) / np.sum(along**2, axis=1)
         closest = start + np.clip(share, 0.0, 1.0)[:, :, None] * along

@@ -16,15 +16,15 @@ def closest_points(
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
     """Return the exact closest face of every point, and the closest point's barycentric coordinates in it.
 
-    Candidates are the faces with the nearest centroids. A point is done when no face beyond them can be
-    closer, a face reaching at most the largest centroid-corner distance; the others go again with four
-    times as many.
+    Candidates are the faces with the nearest centroids. A face reaches no farther from its centroid than the
+    largest centroid-corner distance. A point is done when no face beyond its candidates can be closer; the
+    others are tried again with four times as many.
 
     Args:
-        points: Query points [m].
-        positions: Mesh vertices [m].
-        faces: Triangles.
-        num_candidates: Faces looked at per point in the first round.
+        points: Query points [m], shape [points, 3].
+        positions: Mesh vertices [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        num_candidates: Number of candidates per point in the first round.
     """
     corners = np.asarray(positions, np.float64)[faces]
     centroids = corners.mean(axis=1)
@@ -94,5 +94,5 @@ def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """Return the quotient, zero where the denominator is."""
+    """Return the quotient, or the numerator where the denominator is zero."""
     return numerator / np.where(denominator == 0, 1.0, denominator)

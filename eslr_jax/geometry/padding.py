@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ class Bucket(NamedTuple):
 
 
 def round_up(count: int) -> int:
-    """Return the smallest size of the series that holds `count`: sixteen steps between powers of two."""
+    """Return the smallest bucket size that holds `count`; there are sixteen between powers of two."""
     step = max(2 ** (max(count - 1, 1).bit_length() - 1) // STEPS_PER_OCTAVE, 1)
     return -(-count // step) * step
 
@@ -36,23 +36,28 @@ def choose_bucket(garment: Garment) -> Bucket:
     """Return the bucket of an unpadded garment; almost a function of its vertex count alone.
 
     A mesh of n vertices without handles has fewer than 2 n faces, 3 n hinges and 6 n directed edges. Sizes
-    follow those bounds, so garments of like vertex counts share a bucket; a mesh beyond them gets its own
-    counts rounded up. One vertex is always left over, for the padding to point at.
+    follow these bounds, so garments of similar vertex counts share a bucket. A mesh beyond them gets its own
+    counts rounded up. One vertex is always spare, for the padding to point at.
     """
-    vertices = round_up(len(garment.vertex_mask) + 1)
+    have = garment_bucket(garment)
+    vertices = round_up(have.vertices + 1)
+
+    def holding(bound: int, count: int) -> int:
+        return bound if count <= bound else round_up(count)
+
     return Bucket(
         vertices=vertices,
-        faces=_at_least(2 * vertices, len(garment.faces)),
-        hinges=_at_least(3 * vertices, len(garment.hinges)),
-        edges=_at_least(6 * vertices, len(garment.edge_mask)),
-        degree=_round_to(garment.neighbors.shape[1], 2),
-        face_degree=_round_to(garment.face_incidence.shape[1], 2),
-        hinge_degree=_round_to(garment.hinge_incidence.shape[1], 4),
+        faces=holding(2 * vertices, have.faces),
+        hinges=holding(3 * vertices, have.hinges),
+        edges=holding(6 * vertices, have.edges),
+        degree=-(-have.degree // 2) * 2,
+        face_degree=-(-have.face_degree // 2) * 2,
+        hinge_degree=-(-have.hinge_degree // 4) * 4,
     )
 
 
 def garment_bucket(garment: Garment) -> Bucket:
-    """Return the sizes a garment has now."""
+    """Return the present sizes of a garment's arrays."""
     return Bucket(
         vertices=len(garment.vertex_mask),
         faces=len(garment.faces),
@@ -64,32 +69,26 @@ def garment_bucket(garment: Garment) -> Bucket:
     )
 
 
-def common_bucket(buckets: list[Bucket]) -> Bucket:
-    """Return the smallest bucket that holds all of `buckets`, for several garments in one batch."""
+def common_bucket(buckets: Sequence[Bucket]) -> Bucket:
+    """Return the smallest bucket that holds all `buckets`, for several garments in one batch."""
     return Bucket(*(max(sizes) for sizes in zip(*buckets, strict=True)))
-
-
-def stacking_bucket(garments: list[Garment]) -> Bucket:
-    """Return the smallest bucket that holds all garments, with a vertex to spare for padding to point at."""
-    bucket = common_bucket([garment_bucket(garment) for garment in garments])
-    return bucket._replace(vertices=bucket.vertices + 1)
 
 
 def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     """Pad a garment's arrays to a bucket.
 
-    Padded vertices rest at the garment's mean position with zero area and the first vertex's skin; padded
-    faces, hinges and edges point at the last vertex with zero area; incidence tables don't list them.
+    Padded vertices rest at the garment's mean position, with zero area and the first vertex's skin. Padded
+    faces, hinges and edges point at the last vertex and have zero area. Incidence tables don't list them.
 
     Args:
-        garment: A garment; NumPy or JAX leaves.
-        bucket: Sizes to reach; by default `choose_bucket`'s.
+        garment: Garment with NumPy or JAX leaves.
+        bucket: Sizes to reach; that of `choose_bucket` by default.
 
     Returns:
         The padded garment, with NumPy leaves of the same dtypes.
 
     Raises:
-        CapacityError: The bucket is too small, or has no vertex left over for the padding to point at.
+        CapacityError: The bucket is too small, or has no spare vertex.
     """
     bucket = choose_bucket(garment) if bucket is None else bucket
     have = garment_bucket(garment)
@@ -102,42 +101,19 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
         needed = have.vertices + 1
         raise CapacityError(f"padding needs a vertex to point at; give the bucket at least {needed} vertices")
     leaves = {name: np.asarray(getattr(garment, name)) for name in garment.__dataclass_fields__}
-    last = bucket.vertices - 1
-    extra = {key: want - has for key, has, want in zip(Bucket._fields, have, bucket, strict=True)}
-
-    def append(name: str, rows: int, value: object) -> np.ndarray:
-        leaf = leaves[name]
-        block = np.broadcast_to(np.asarray(value, leaf.dtype), (rows, *leaf.shape[1:]))
-        return np.concatenate([leaf, block])
-
-    padded = {
-        name: append(name, extra["vertices"], value)
-        for name, value in {
-            "rest_positions": leaves["rest_positions"].mean(axis=0),
-            "vertex_areas": 0,
-            "vertex_mask": False,
-            "geodesic_embedding": 0,
-            "skin_weights": leaves["skin_weights"][0],
-            "skin_indices": leaves["skin_indices"][0],
-            "is_pinned": False,
-        }.items()
-    }
-    padded |= {
-        "faces": append("faces", extra["faces"], last),
-        "rest_areas": append("rest_areas", extra["faces"], 0),
-        "inverse_rest_frames": append("inverse_rest_frames", extra["faces"], np.eye(2)),
-        "hinges": append("hinges", extra["hinges"], last),
-        "hinge_rest_areas": append("hinge_rest_areas", extra["hinges"], 0),
-        "hinge_rest_angles": append("hinge_rest_angles", extra["hinges"], 0),
-        "senders": append("senders", extra["edges"], last),
-        "receivers": append("receivers", extra["edges"], last),
-        "edge_mask": append("edge_mask", extra["edges"], False),
-    }
+    padded = {}
+    for size, values in _padding_values(leaves, bucket).items():
+        for name, value in values.items():
+            leaf = leaves[name]
+            rows = getattr(bucket, size) - getattr(have, size)
+            block = np.broadcast_to(np.asarray(value, leaf.dtype), (rows, *leaf.shape[1:]))
+            padded[name] = np.concatenate([leaf, block])
     itself = np.arange(have.edges, bucket.edges, dtype=leaves["reverse_edges"].dtype)
     padded["reverse_edges"] = np.concatenate([leaves["reverse_edges"], itself])
-    padded["neighbors"], padded["neighbor_mask"] = _pad_neighbors(
-        leaves["neighbors"], leaves["neighbor_mask"], bucket
-    )
+    neighbors = np.arange(bucket.vertices, dtype=leaves["neighbors"].dtype)[:, None].repeat(bucket.degree, 1)
+    neighbors[: have.vertices, : have.degree] = leaves["neighbors"]
+    extra = ((0, bucket.vertices - have.vertices), (0, bucket.degree - have.degree))
+    padded["neighbors"], padded["neighbor_mask"] = neighbors, np.pad(leaves["neighbor_mask"], extra)
     padded["face_incidence"] = _pad_incidence(
         leaves["face_incidence"], 3, (have.faces, bucket.faces), (bucket.vertices, bucket.face_degree)
     )
@@ -147,36 +123,34 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     return dataclasses.replace(garment, **padded)
 
 
-def _pad_neighbors(neighbors: np.ndarray, mask: np.ndarray, bucket: Bucket) -> tuple[np.ndarray, np.ndarray]:
-    """Return a neighbour table and its mask grown to the bucket; new entries name their own row."""
-    rows, columns = neighbors.shape
-    own = np.arange(bucket.vertices, dtype=neighbors.dtype)[:, None]
-    table = np.repeat(own, bucket.degree, axis=1)
-    table[:rows, :columns] = neighbors
-    return table, np.pad(mask, ((0, bucket.vertices - rows), (0, bucket.degree - columns)))
+def _padding_values(leaves: dict[str, np.ndarray], bucket: Bucket) -> dict[str, dict[str, object]]:
+    """Return the value of padded rows for each field, by the size that counts its rows."""
+    last = bucket.vertices - 1
+    return {
+        "vertices": {
+            "rest_positions": leaves["rest_positions"].mean(axis=0),
+            "vertex_areas": 0,
+            "vertex_mask": False,
+            "geodesic_embedding": 0,
+            "skin_weights": leaves["skin_weights"][0],
+            "skin_indices": leaves["skin_indices"][0],
+            "is_pinned": False,
+        },
+        "faces": {"faces": last, "rest_areas": 0, "inverse_rest_frames": np.eye(2)},
+        "hinges": {"hinges": last, "hinge_rest_areas": 0, "hinge_rest_angles": 0},
+        "edges": {"senders": last, "receivers": last, "edge_mask": False},
+    }
 
 
 def _pad_incidence(
     table: np.ndarray, corners: int, items: tuple[int, int], shape: tuple[int, int]
 ) -> np.ndarray:
-    """Return an incidence table grown to `shape` and from items[0] to items[1] items.
+    """Return an incidence table of a new shape, for items[1] instead of items[0] items.
 
-    Entry corner * items[0] + item becomes corner * items[1] + item; the padding moves along.
+    Entry corner * items[0] + item becomes corner * items[1] + item; so does the padding, corners * items[0].
     """
     corner, item = np.divmod(table, max(items[0], 1))
     padded = np.full(shape, corners * items[1], table.dtype)
-    is_padding = table == corners * items[0]
-    padded[: table.shape[0], : table.shape[1]] = np.where(
-        is_padding, corners * items[1], corner * items[1] + item
-    )
+    moved = np.where(table == corners * items[0], corners * items[1], corner * items[1] + item)
+    padded[: table.shape[0], : table.shape[1]] = moved
     return padded
-
-
-def _at_least(bound: int, count: int) -> int:
-    """Return `bound` where it holds `count`, else `count` rounded up."""
-    return bound if count <= bound else round_up(count)
-
-
-def _round_to(count: int, multiple: int) -> int:
-    """Return `count` rounded up to a multiple."""
-    return math.ceil(count / multiple) * multiple

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
-from eslr_jax.geometry.padding import Bucket, pad_garment, stacking_bucket
+from eslr_jax.geometry.padding import Bucket, common_bucket, garment_bucket, pad_garment
 from eslr_jax.geometry.validate import validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 
@@ -28,7 +28,6 @@ def prepare_garment(
     sewn_positions: Float[np.ndarray, "vertices 3"] | None = None,
     embedding_size: int = 8,
     embedding_mode: EmbeddingMode = "canonical",
-    anchors: Float[np.ndarray, "anchors 3"] | None = None,
     allow_components: bool = False,
     pad: bool = False,
     name: str = "garment",
@@ -38,33 +37,34 @@ def prepare_garment(
     Args:
         rest_positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
         faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
-        skin_weights: Joint weights, normalised to rows that sum to one, shape [vertices, influences].
+        skin_weights: Joint weights, shape [vertices, influences]; rows are normalised to one.
         skin_indices: Joint of every weight, shape [vertices, influences].
-        is_pinned: Vertices that follow their skinned position: a mask, shape [vertices], or indices; none by
-            default.
-        sewn_positions: The shape that lengths, areas and angles are measured on [m], where the rest positions
-            were taken out of the body or into another pose; the rest positions by default, shape [vertices, 3].
-        embedding_size: Coordinates of the geodesic embedding.
-        embedding_mode: See `embedding.geodesic_embedding`.
-        anchors: Body points of embedding mode `landmarks` [m].
+        is_pinned: Vertices that follow their skinned position, as a mask, shape [vertices], or as indices.
+        sewn_positions: Positions on which lengths, areas and angles are measured [m], shape [vertices, 3]; the
+            rest positions by default. They differ where the rest shape was posed or moved out of the body.
+        embedding_size: Number of coordinates of the geodesic embedding.
+        embedding_mode: Kind of geodesic embedding; see `embedding.geodesic_embedding`.
         allow_components: Accept a mesh of several connected components.
         pad: Pad to the garment's bucket.
-        name: What messages call the garment.
+        name: Name of the garment in messages.
 
     Returns:
         The garment, with float32, int32 and bool leaves.
 
     Raises:
         MeshError: The mesh can't be simulated, or an array has the wrong number of rows.
-        ConfigError: The embedding mode is unknown, or the number of anchors is not the embedding's size.
+        ConfigError: The embedding mode is unknown.
     """
     validate_mesh(rest_positions, faces, name=name, allow_components=allow_components)
     validate_orientation(rest_positions, faces, name=name)
-    positions = np.asarray(rest_positions, np.float64)
-    sewn = positions
+    positions = sewn = np.asarray(rest_positions, np.float64)
     if sewn_positions is not None:
         sewn = np.asarray(sewn_positions, np.float64)
-        _check_sewn(name, positions, sewn)
+        if sewn.shape != positions.shape:
+            raise MeshError(
+                f"{name}: sewn positions {sewn.shape} do not fit rest positions {positions.shape}; "
+                "give one row per vertex"
+            )
         validate_mesh(sewn, faces, name=f"{name}, as sewn", allow_components=allow_components)
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
@@ -95,7 +95,7 @@ def prepare_garment(
         hinge_incidence=topology.incidence_table(hinges, num_vertices),
         edge_mask=np.ones(len(senders), bool),
         vertex_mask=np.ones(num_vertices, bool),
-        geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode, anchors),
+        geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode),
         skin_weights=skin_weights / skin_weights.sum(axis=1, keepdims=True),
         skin_indices=skin_indices,
         is_pinned=is_pinned,
@@ -109,9 +109,11 @@ def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list
 
     Args:
         garments: Unpadded garments.
-        bucket: Sizes to reach; by default the smallest that holds all.
+        bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
     """
-    bucket = bucket or stacking_bucket(list(garments))
+    if bucket is None:
+        bucket = common_bucket([garment_bucket(garment) for garment in garments])
+        bucket = bucket._replace(vertices=bucket.vertices + 1)
     return [to_device(pad_garment(garment, bucket)) for garment in garments]
 
 
@@ -121,27 +123,10 @@ def to_device(garment: Garment) -> Garment:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtypes[leaf.dtype.kind]), garment)
 
 
-def _check_sewn(name: str, positions: np.ndarray, sewn: np.ndarray) -> None:
-    """Raise where the sewn shape is not that of the rest positions."""
-    if sewn.shape != positions.shape:
-        raise MeshError(
-            f"{name}: sewn positions {sewn.shape} do not fit rest positions {positions.shape}; "
-            "give one row per vertex"
-        )
-
-
-def _check_rows(
-    name: str,
-    num_vertices: int,
-    skin_weights: np.ndarray,
-    skin_indices: np.ndarray,
-) -> None:
-    """Raise where skinning doesn't fit the mesh."""
-    if (
-        skin_weights.ndim != 2
-        or len(skin_weights) != num_vertices
-        or skin_weights.shape != skin_indices.shape
-    ):
+def _check_rows(name: str, num_vertices: int, skin_weights: np.ndarray, skin_indices: np.ndarray) -> None:
+    """Raise on skin weights that do not fit the mesh, or whose rows can't be normalised."""
+    fits = skin_weights.ndim == 2 and len(skin_weights) == num_vertices
+    if not fits or skin_weights.shape != skin_indices.shape:
         raise MeshError(
             f"{name}: skin weights {skin_weights.shape} and indices {skin_indices.shape} do not fit "
             f"{num_vertices} vertices; give one row per vertex, or use transfer_skin_weights"
@@ -157,11 +142,7 @@ def _check_rows(
 
 
 def _pin_mask(name: str, num_vertices: int, is_pinned: np.ndarray | None) -> Bool[np.ndarray, " vertices"]:
-    """Return which vertices are pinned, from a mask or from their indices.
-
-    Raises:
-        MeshError: The mask doesn't fit the mesh, or an index names a missing vertex.
-    """
+    """Return a mask of the pinned vertices, given a mask or indices; raise where they do not fit the mesh."""
     mask = np.zeros(num_vertices, bool)
     if is_pinned is None:
         return mask

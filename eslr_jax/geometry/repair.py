@@ -1,4 +1,4 @@
-"""Make one clean surface of what modelling programs export: seams, duplicates, loose parts, turned faces."""
+"""Repair the meshes that modelling programs export: seams, duplicates, loose parts, turned faces."""
 
 from __future__ import annotations
 
@@ -10,38 +10,34 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from eslr_jax.geometry.topology import face_areas, half_edges, vertex_components
+from eslr_jax.geometry.topology import face_areas, half_edges, undirected_edges, vertex_components
 
 
 @dataclasses.dataclass(frozen=True)
 class Cleaned:
-    """A mesh without duplicates, and where its vertices and faces come from."""
+    """A repaired mesh, and the source of its vertices and faces."""
 
     positions: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
-    vertex_map: Int[np.ndarray, " source_vertices"]  # vertex of every source vertex; -1 where it was dropped
-    face_source: Int[np.ndarray, " faces"]  # source face of every face
+    vertex_map: Int[np.ndarray, " source_vertices"]  # new vertex of every source vertex; -1: dropped
+    face_source: Int[np.ndarray, " faces"]  # source face of every new face
 
 
 def weld(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    *,
-    tolerance: float = 1e-5,
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, tolerance: float = 1e-5
 ) -> Cleaned:
-    """Join coincident vertices of open edges, then drop collapsed and repeated faces and loose vertices.
+    """Join coincident boundary vertices, then drop collapsed faces, repeated faces and loose vertices.
 
-    Only vertices on open edges are joined: those of a seam that was split for its texture coordinates are,
-    whereas two layers of cloth that touch are not. A joined vertex keeps the position of its first.
+    Only boundary vertices are joined. This closes seams that were split for texture coordinates, and keeps
+    two layers of cloth apart that touch.
 
     Args:
-        positions: Vertex positions, in any unit.
-        faces: Triangles; every index in range.
-        tolerance: Distance within which vertices coincide, relative to the bounding box's diagonal.
+        positions: Vertex positions in any unit, shape [vertices, 3].
+        faces: Triangles with every index in range, shape [faces, 3].
+        tolerance: Distance below which two vertices coincide, relative to the bounding box's diagonal.
     """
     diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    is_open = _open_vertices(faces, len(positions))
-    candidates = np.flatnonzero(is_open)
+    candidates = _boundary_vertices(faces)
     pairs = KDTree(positions[candidates]).query_pairs(tolerance * diagonal, output_type="ndarray")
     return merge_vertices(positions, faces, candidates[pairs])
 
@@ -51,80 +47,71 @@ def merge_vertices(
     faces: Int[np.ndarray, "faces 3"],
     pairs: Int[np.ndarray, "pairs 2"],
 ) -> Cleaned:
-    """Join the given pairs of vertices, and whatever they are chained to; see `weld`."""
+    """Join the given pairs of vertices; a chain of pairs becomes its first vertex. See `weld`."""
     num_vertices = len(positions)
     graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (num_vertices, num_vertices))
     _, label = connected_components(graph, directed=False)
     _, first = np.unique(label, return_index=True)  # labels ascend with their first vertex
-    joined = np.asarray(first)[label[faces]]
-    is_face = (joined != joined[:, [1, 2, 0]]).all(axis=1)
-    kept = np.flatnonzero(is_face)
+    merged = np.asarray(first)[label]
+    joined = merged[faces]
+    kept = np.flatnonzero((joined != joined[:, [1, 2, 0]]).all(axis=1))
     _, earliest = np.unique(np.sort(joined[kept], axis=1), axis=0, return_index=True)
-    kept = kept[np.sort(earliest)]
-    faces = joined[kept]
-    used = np.unique(faces)
-    number = np.full(num_vertices, -1)
-    number[used] = np.arange(len(used))
-    return Cleaned(positions[used], number[faces], number[first[label]], kept)
+    return _select_faces(positions, joined, kept[np.sort(earliest)], merged)
 
 
 def join_components(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gap: float
 ) -> Cleaned:
-    """Sew separate parts together where their open edges come within `gap` of each other.
+    """Sew separate parts together where their boundaries come within `gap` of each other.
 
-    Every open vertex is joined to the nearest open vertex of another part; where one edge has more vertices
-    than the other, several go to one and the slivers between them vanish, if `gap` is at least half the
-    longer edges.
+    Every boundary vertex is joined to the nearest boundary vertex of another part. Where one boundary has more
+    vertices than the other, several are joined to one. The slivers between them vanish if `gap` is at least
+    half the longer edges.
     """
     _, component = vertex_components(faces, len(positions))
-    candidates = np.flatnonzero(_open_vertices(faces, len(positions)))
-    pairs = []
+    candidates = _boundary_vertices(faces)
+    pairs = [np.empty((0, 2), np.int64)]
     for part in np.unique(component[candidates]):
-        own = candidates[component[candidates] == part]
-        others = candidates[component[candidates] != part]
+        is_own = component[candidates] == part
+        own, others = candidates[is_own], candidates[~is_own]
         if not len(others):
             break
         distance, nearest = KDTree(positions[others]).query(positions[own], distance_upper_bound=gap)
         is_near = np.isfinite(distance)
         pairs.append(np.stack([own[is_near], others[nearest[is_near]]], axis=1))
-    found = np.concatenate(pairs) if pairs else np.empty((0, 2), np.int64)
-    return merge_vertices(positions, faces, found)
+    return merge_vertices(positions, faces, np.concatenate(pairs))
 
 
-def largest_component(positions: np.ndarray, faces: np.ndarray) -> Cleaned:
+def largest_component(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Cleaned:
     """Keep the connected part with the largest area."""
     _, component = vertex_components(faces, len(positions))
     owner = component[faces[:, 0]]
-    kept = np.flatnonzero(owner == np.argmax(np.bincount(owner, weights=face_areas(positions, faces))))
-    used = np.unique(faces[kept])
-    number = np.full(len(positions), -1)
-    number[used] = np.arange(len(used))
-    return Cleaned(positions[used], number[faces[kept]], number, kept)
+    largest = np.argmax(np.bincount(owner, weights=face_areas(positions, faces)))
+    return _select_faces(positions, faces, np.flatnonzero(owner == largest), np.arange(len(positions)))
 
 
 def consistent_orientation(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Bool[np.ndarray, " faces"]:
-    """Return which faces to turn so that neighbours agree, most of each part's area staying as it is.
+    """Return which faces to turn so that neighbours agree; most of each part's area stays unturned.
 
-    Faces that meet along an edge with other than two faces, or on a surface with one side, are left to
-    `validate_mesh`.
+    Edges with more than two faces and one-sided surfaces are left for `validate_mesh` to refuse.
     """
-    starts, ends, _ = half_edges(faces)
-    base = int(faces.max()) + 1
-    keys = np.minimum(starts, ends) * base + np.maximum(starts, ends)
-    order = np.argsort(keys, kind="stable")
-    _, begin, count = np.unique(keys[order], return_index=True, return_counts=True)
-    first, second = order[begin[count == 2]], order[begin[count == 2] + 1]
+    starts, _, _ = half_edges(faces)
+    _, edge, counts = undirected_edges(faces)
+    order = np.argsort(edge, kind="stable")
+    begin = (np.cumsum(counts) - counts)[counts == 2]
+    first, second = order[begin], order[begin + 1]
     agrees = starts[first] != starts[second]  # neighbours run along their edge in opposite directions
-    # Every face twice, as it is and turned, joined to the copy of each neighbour that agrees with it: a part
-    # falls into two components, and its faces as they are lie in the one or the other.
+    # Every face stands for two nodes, itself and its turned copy. Each is joined to the copy of the neighbour
+    # that agrees with it, so a part falls into two components, one with every face's better side.
     num_faces = len(faces)
     left, right = first // 3, second // 3
-    opposing = np.where(agrees, 0, num_faces)
+    shift = np.where(agrees, 0, num_faces)
     rows = np.concatenate([left, left + num_faces])
-    columns = np.concatenate([right + across, right + num_faces - across])
+    columns = np.concatenate([right + shift, right + num_faces - shift])
     graph = scipy.sparse.coo_array(
         (np.ones(len(rows), bool), (rows, columns)), (2 * num_faces, 2 * num_faces)
     )
@@ -134,14 +121,17 @@ def consistent_orientation(
     return areas[turned_sheet] > areas[sheet]
 
 
-def _open_vertices(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Return which vertices lie on an edge of a single face."""
-    starts, ends, _ = half_edges(faces)
-    base = num_vertices + 1
-    keys = np.minimum(starts, ends) * base + np.maximum(starts, ends)
-    _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
-    is_single = count[inverse.ravel()] == 1
-    is_open = np.zeros(num_vertices, bool)
-    is_open[starts[is_single]] = True
-    is_open[ends[is_single]] = True
-    return is_open
+def _select_faces(
+    positions: np.ndarray, faces: np.ndarray, kept: np.ndarray, vertex_map: np.ndarray
+) -> Cleaned:
+    """Keep some faces and the vertices they use, and renumber; `vertex_map` is that of `faces`."""
+    used = np.unique(faces[kept])
+    number = np.full(len(positions), -1)
+    number[used] = np.arange(len(used))
+    return Cleaned(positions[used], number[faces[kept]], number[vertex_map], kept)
+
+
+def _boundary_vertices(faces: np.ndarray) -> np.ndarray:
+    """Return the vertices on edges of a single face, in ascending order."""
+    edges, _, counts = undirected_edges(faces)
+    return np.unique(edges[counts == 1])

@@ -1,4 +1,4 @@
-"""Skin weights for a user's own garment, from the body beneath it."""
+"""Skin weights of a garment, taken from the body beneath it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ def transfer_skin_weights(
         body_skin_weights: Weights of the body's vertices, shape [body_vertices, influences].
         body_skin_indices: Joint of every weight, shape [body_vertices, influences].
         faces: Triangles of the garment, shape [faces, 3].
-        smoothing_steps: Laplacian smoothings; each moves a vertex half the way to its neighbours' mean. Loose
-            skirts need about twice as many, or the two legs tear them.
+        smoothing_steps: Number of Laplacian smoothings. Loose skirts need about 20, or the two legs tear them.
 
     Returns:
-        The four largest weights of every vertex, which sum to one, and their joints (int32); both
+        The four largest weights of every vertex, which sum to one, and their joints, both of shape
         [vertices, 4].
     """
     nearest, barycentric = closest_points(positions, body_positions, body_faces)
@@ -54,7 +53,7 @@ def transfer_skin_weights(
 def smooth(
     values: Float[np.ndarray, "vertices features"], faces: Int[np.ndarray, "faces 3"], num_steps: int
 ) -> Float[np.ndarray, "vertices features"]:
-    """Average every vertex's value with its neighbours' mean, `num_steps` times."""
+    """Replace every vertex's value by its mean with the neighbours' mean, `num_steps` times."""
     edges = unique_edges(faces)
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     degrees = np.maximum(np.bincount(rows, minlength=len(values)), 1)

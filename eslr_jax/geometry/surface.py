@@ -21,8 +21,8 @@ def prepare_surface(
     Args:
         rest_positions: All body vertices in any pose without self-contact [m], shape [body_vertices, 3].
         faces: The faces to keep, shape [surface_faces, 3]; other vertices are dropped.
-        boundary: Body vertices where the body goes on with faces that are not kept, shape [boundary_vertices]; cloth
-            beyond them is not in contact. None if all that the body has is kept.
+        boundary: Body vertices where the body goes on with faces that are not kept, shape [boundary_vertices];
+            cloth beyond them is not in contact. None if all that the body has is kept.
     """
     vertex_ids, flat = np.unique(faces, return_inverse=True)
     faces = flat.reshape(-1, 3)

@@ -20,12 +20,12 @@ def half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarra
 
 
 def next_half_edges(half_edge: Int[np.ndarray, " items"]) -> Int[np.ndarray, " items"]:
-    """Return the half-edge that follows each one around its face."""
+    """Return the next half-edge around the same face."""
     return half_edge - half_edge % 3 + (half_edge + 1) % 3
 
 
 def twin_half_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " half_edges"]:
-    """Return for every half-edge the neighbour face's that runs back along it; -1 on the boundary."""
+    """Return for every half-edge the opposite half-edge of the neighbouring face, or -1 on the boundary."""
     starts, ends, _ = half_edges(faces)
     if not len(starts):
         return np.empty(0, np.int64)
@@ -37,29 +37,33 @@ def twin_half_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " half
     return np.where(keys[found] == twin_keys, found, -1)
 
 
-def unique_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "pairs 2"]:
-    """Return every undirected edge once, as (smaller, larger) vertex, sorted."""
+def undirected_edges(
+    faces: Int[np.ndarray, "faces 3"],
+) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " half_edges"], Int[np.ndarray, " pairs"]]:
+    """Return every edge once as (smaller, larger) vertex, the edge of every half-edge, and its face counts.
+
+    The mesh may be broken: an edge may have any number of faces, in any orientation.
+    """
     starts, ends, _ = half_edges(faces)
-    if not len(starts):
-        return np.empty((0, 2), np.int64)
-    base = int(faces.max()) + 1
-    keys = np.unique(np.minimum(starts, ends).astype(np.int64) * base + np.maximum(starts, ends))
-    return np.stack([keys // base, keys % base], axis=1)
+    base = int(faces.max(initial=0)) + 1
+    keys = np.minimum(starts, ends).astype(np.int64) * base + np.maximum(starts, ends)
+    unique, edge, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return np.stack([unique // base, unique % base], axis=1), edge.ravel(), counts
+
+
+def unique_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "pairs 2"]:
+    """Return every edge once, as (smaller, larger) vertex, in ascending order."""
+    return undirected_edges(faces)[0]
 
 
 def directed_edges(
     edges: Int[np.ndarray, "pairs 2"],
 ) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edges"], Int[np.ndarray, " edges"]]:
-    """Return both directions of every edge, sorted by receiver, then sender.
+    """Return senders and receivers of both directions of every edge, and the index of each one's reverse.
 
-    Args:
-        edges: Undirected edges, each once.
-
-    Returns:
-        Senders, receivers, and the index of every directed edge's opposite.
+    The result is sorted by receiver, then by sender.
     """
-    senders = np.concatenate([edges[:, 0], edges[:, 1]])
-    receivers = np.concatenate([edges[:, 1], edges[:, 0]])
+    senders, receivers = np.concatenate([edges, edges[:, ::-1]]).T
     order = np.lexsort((senders, receivers))
     position = np.empty(len(order), np.int64)
     position[order] = np.arange(len(order))
@@ -70,16 +74,15 @@ def directed_edges(
 def neighbor_table(
     senders: Int[np.ndarray, " edges"], receivers: Int[np.ndarray, " edges"], num_vertices: int
 ) -> tuple[Int[np.ndarray, "vertices degree"], Bool[np.ndarray, "vertices degree"]]:
-    """Return every vertex's neighbours in ascending order, padded with the vertex itself, and their mask.
+    """Return the neighbours of every vertex in ascending order, and a mask of the real entries.
 
     Args:
-        senders: Start of every directed edge.
-        receivers: End of every directed edge, sorted ascending.
-        num_vertices: Number of rows of the table.
+        senders: Start vertex of every directed edge, shape [edges].
+        receivers: End vertex of every directed edge in ascending order, shape [edges].
+        num_vertices: Number of rows of the table. A row is padded with its own vertex.
     """
-    degrees = np.bincount(receivers, minlength=num_vertices)
-    slots = np.arange(len(receivers)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
-    table = np.repeat(np.arange(num_vertices)[:, None], max(int(degrees.max(initial=0)), 1), axis=1)
+    slots, degree = _slots(receivers, num_vertices)
+    table = np.repeat(np.arange(num_vertices)[:, None], degree, axis=1)
     mask = np.zeros(table.shape, bool)
     table[receivers, slots] = senders
     mask[receivers, slots] = True
@@ -89,34 +92,37 @@ def neighbor_table(
 def incidence_table(
     indices: Int[np.ndarray, "items corners"], num_rows: int
 ) -> Int[np.ndarray, "rows degree"]:
-    """Return for every row the ascending flat positions in `indices.T` (corner by corner) that name it.
+    """Return for every row the positions in `indices.T.ravel()` that name it, padded with `indices.size`.
+
+    `numerics.gather_corners` reads this table.
 
     Args:
-        indices: Row of every corner of every item (faces, hinges).
-        num_rows: Number of rows that may be named.
-
-    Returns:
-        The table that `numerics.gather_corners` reads, padded with `indices.size`.
+        indices: Vertex of every corner of every item (face or hinge), shape [items, corners].
+        num_rows: Number of vertices.
     """
     flat = indices.T.ravel()
     order = np.argsort(flat, kind="stable")
-    degrees = np.bincount(flat, minlength=num_rows)
-    slots = np.arange(len(flat)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
-    table = np.full((num_rows, max(int(degrees.max(initial=0)), 1)), indices.size)
+    slots, degree = _slots(flat[order], num_rows)
+    table = np.full((num_rows, degree), indices.size)
     table[flat[order], slots] = order
     return table
+
+
+def _slots(rows: np.ndarray, num_rows: int) -> tuple[np.ndarray, int]:
+    """Return the column of every entry of a table, given ascending rows, and the number of columns."""
+    degrees = np.bincount(rows, minlength=num_rows)
+    return np.arange(len(rows)) - np.repeat(np.cumsum(degrees) - degrees, degrees), max(
+        int(degrees.max(initial=0)), 1
+    )
 
 
 def find_hinges(
     faces: Int[np.ndarray, "faces 3"],
 ) -> tuple[Int[np.ndarray, "hinges 4"], Int[np.ndarray, "hinges 2"]]:
-    """Return the interior edges with their opposite vertices, and the two faces of each.
+    """Return the hinges sorted by edge, and the left and right face of each.
 
-    Row (i, j, a, b): the left face runs i -> j -> a, the right face j -> i -> b, and i < j. The mesh must be
-    manifold and consistently oriented (`validate_mesh`).
-
-    Returns:
-        Hinges sorted by (i, j), and the index of their left and right face.
+    A hinge is a row (i, j, a, b): its left face runs i -> j -> a, its right face j -> i -> b, and i < j. The
+    mesh must be manifold and consistently oriented (`validate_mesh`).
     """
     starts, ends, opposites = half_edges(faces)
     twins = twin_half_edges(faces)
@@ -142,6 +148,15 @@ def face_areas(
     return 0.5 * np.linalg.norm(face_cross_products(positions, faces), axis=1)
 
 
+def vertex_normals(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Return the unit normal of every vertex, weighted by face areas; zero where a vertex has no face."""
+    crosses = np.repeat(face_cross_products(positions, faces), 3, axis=0)
+    sums = [np.bincount(faces.ravel(), crosses[:, axis], minlength=len(positions)) for axis in range(3)]
+    return _normalize(np.stack(sums, axis=1))
+
+
 def vertex_areas(
     areas: Float[np.ndarray, " faces"], faces: Int[np.ndarray, "faces 3"], num_vertices: int
 ) -> Float[np.ndarray, " vertices"]:
@@ -152,10 +167,10 @@ def vertex_areas(
 def inverse_rest_frames(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 2 2"]:
-    """Return the inverse of D_m, the rest edges of every face in a frame of its own plane [1/m].
+    """Return the inverse of every face's rest edges D_m = [x0 - x2 | x1 - x2] in the face's plane [1/m].
 
-    D_m = [x0 - x2 | x1 - x2] in the orthonormal frame whose first axis follows x0 - x2 and whose second is
-    the in-plane perpendicular on the side of x1; so D_m is upper triangular with a positive diagonal.
+    The plane's first axis runs along x0 - x2, and its second points to the side of x1. D_m is upper
+    triangular with a positive diagonal.
 
     Source: HOOD, `stretching_energy.py`: frames from the 3-D rest mesh, not from UV coordinates.
     """
@@ -191,23 +206,20 @@ def hinge_angles(
 
 
 def vertex_components(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> tuple[int, np.ndarray]:
-    """Return the number of connected components and the component of every vertex."""
+    """Return the number of connected components, and the component of every vertex, shape [vertices]."""
     starts, ends, _ = half_edges(faces)
     graph = scipy.sparse.coo_array((np.ones(len(starts), bool), (starts, ends)), (num_vertices, num_vertices))
     return connected_components(graph, directed=False)
 
 
 def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " loop"]]:
-    """Return the boundary loops as vertex cycles, each along its faces' half-edges.
+    """Return the boundary loops as vertex cycles, those with the most vertices first.
 
-    Loops are sorted by length, longest first, ties by smallest vertex; each starts at its smallest vertex.
-    The mesh must be manifold, so that a vertex lies on at most one loop.
+    A loop runs along the half-edges of its faces and starts at its smallest vertex. The mesh must be manifold,
+    so that a vertex lies on at most one loop.
     """
     starts, ends, _ = half_edges(faces)
-    if not len(starts):
-        return []
-    base = int(faces.max()) + 1
-    is_boundary = ~np.isin(starts.astype(np.int64) * base + ends, ends.astype(np.int64) * base + starts)
+    is_boundary = twin_half_edges(faces) < 0
     following = dict(zip(starts[is_boundary].tolist(), ends[is_boundary].tolist(), strict=True))
     loops = []
     for first in sorted(following):

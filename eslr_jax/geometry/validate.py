@@ -1,4 +1,4 @@
-"""Checks of user meshes; the first failure raises a `MeshError` that names the place and the remedy."""
+"""Checks of users' meshes; the first failure raises a `MeshError` that names the place and the remedy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from eslr_jax.errors import MeshError
 from eslr_jax.geometry.topology import (
     boundary_loops,
     face_areas,
-    face_cross_products,
     half_edges,
     next_half_edges,
     twin_half_edges,
+    undirected_edges,
     vertex_components,
 )
 
@@ -23,8 +23,7 @@ MIN_DIAGONAL = 0.05  # [m] of the bounding box; smaller is no garment
 MAX_DIAGONAL = 5.0  # [m]
 DUPLICATE_TOLERANCE = 1e-7  # of the bounding box's diagonal
 DEGENERATE_TOLERANCE = 1e-10  # of the longest edge squared
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}  # metres per unit
-MIN_BODY_AGREEMENT = -0.2  # mean cosine with the body's normals; below, the garment is inside out
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}  # metres per unit
 MIN_VOLUME_RATIO = -0.03  # of the volume of a sphere of the same area; below, it is inside out
 MAX_HOLE_SHARE = 0.7  # of the mesh's area; with larger holes it has no inside
 GARMENT_DIAGONAL = 1.0  # [m] a typical garment, to guess the unit by
@@ -42,7 +41,7 @@ def validate_mesh(
     Args:
         positions: Vertex positions [m], shape [vertices, 3].
         faces: Triangles, shape [faces, 3].
-        name: What messages call the mesh.
+        name: Name of the mesh in messages.
         allow_components: Accept several connected components.
 
     Raises:
@@ -99,7 +98,7 @@ def check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
 
 
 def _check_scale(positions: np.ndarray, name: str) -> None:
-    """Raise on a bounding box that is no garment in metres, and guess the unit."""
+    """Raise on a size that no garment in metres has, and guess the unit."""
     diagonal = _diagonal(positions)
     if MIN_DIAGONAL <= diagonal <= MAX_DIAGONAL:
         return
@@ -107,7 +106,7 @@ def _check_scale(positions: np.ndarray, name: str) -> None:
     if diagonal > MAX_DIAGONAL:
         unit, factor = min(UNITS.items(), key=lambda item: abs(np.log(diagonal * item[1] / GARMENT_DIAGONAL)))
         if MIN_DIAGONAL <= diagonal * factor <= MAX_DIAGONAL:
-            raise MeshError(f"{cause}; it looks like {unit}: scale by {factor:g}")
+            raise MeshError(f"{cause}; it seems to be in {unit}: scale by {factor:g}")
     elif diagonal > 0:
         factor = 10.0 ** round(-np.log10(diagonal))
         raise MeshError(f"{cause}; positions must be in metres: scale by about {factor:g}")
@@ -157,35 +156,31 @@ def _check_faces(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
 
 def _check_edges(faces: np.ndarray, name: str) -> None:
     """Raise on edges with more than two faces, and on neighbours that wind in opposite directions."""
-    starts, ends, _ = half_edges(faces.astype(np.int64))
-    base = int(faces.max()) + 1
-    keys = np.minimum(starts, ends) * base + np.maximum(starts, ends)
-    unique, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    starts, ends, _ = half_edges(faces)
+    edges, edge_of, counts = undirected_edges(faces)
     if counts.max() > 2:
         edge = int(np.argmax(counts > 2))
-        users = np.flatnonzero(inverse == edge) // 3
+        users = np.flatnonzero(edge_of == edge) // 3
         raise MeshError(
-            f"{name}: edge {(int(unique[edge] // base), int(unique[edge] % base))} belongs to "
-            f"{counts[edge]} faces {_ids(users[:6])} ({np.sum(counts > 2)} such edges); cloth is a sheet: "
-            "delete or separate the extra faces"
+            f"{name}: edge {_ids(edges[edge])} belongs to {counts[edge]} faces {_ids(users[:6])} "
+            f"({np.sum(counts > 2)} such edges); cloth is a sheet: delete or separate the extra faces"
         )
-    forward = np.bincount(inverse, weights=starts < ends, minlength=len(unique))
+    forward = np.bincount(edge_of, weights=starts < ends, minlength=len(edges))
     is_bad = (counts == 2) & (forward != 1)
     if is_bad.any():
         edge = int(np.argmax(is_bad))
-        users = np.flatnonzero(inverse == edge) // 3
+        users = np.flatnonzero(edge_of == edge) // 3
         raise MeshError(
             f"{name}: faces {users[0]} and {users[1]} wind in opposite directions along edge "
-            f"{(int(unique[edge] // base), int(unique[edge] % base))} ({is_bad.sum()} such edges); "
-            "recalculate normals so that all point outside"
+            f"{_ids(edges[edge])} ({is_bad.sum()} such edges); recalculate normals so that all point outside"
         )
 
 
 def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     """Raise on vertices whose faces form more than one fan (bow-ties).
 
-    Corners are nodes; across every interior edge the corners at each of its ends are joined, so each fan is
-    one component, and a manifold mesh has as many components as vertices.
+    The face corners are the nodes of a graph. Corners of neighbouring faces at the same vertex are joined, so
+    that each fan is a component. A manifold mesh has as many fans as vertices.
     """
     starts, _, _ = half_edges(faces.astype(np.int64))
     twins = twin_half_edges(faces)
@@ -215,15 +210,16 @@ def validate_body(
     *,
     name: str = "body",
 ) -> None:
-    """Check that a body has an inside: its obstacles have no open edges, and its faces point outside.
+    """Check that a body is closed where cloth may touch it, and that its faces point outside.
 
-    Cloth is kept on the side that normals point to; over a hole it would slip in, and be held there.
+    Contact keeps cloth on the side that normals point to. Cloth that slipped in through a hole would be held
+    inside.
 
     Args:
-        positions: Body vertices [m], shape [body_vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside.
-        is_obstacle: Faces that cloth may touch; others may have open edges.
-        name: What messages call the body.
+        positions: Body vertex positions [m], shape [body_vertices, 3].
+        faces: Triangles, counter-clockwise seen from outside, shape [body_faces, 3].
+        is_obstacle: Mask of the faces that cloth may touch, shape [body_faces]; others may have open edges.
+        name: Name of the body in messages.
 
     Raises:
         MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
@@ -248,53 +244,27 @@ def validate_body(
 
 
 def validate_orientation(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    body_positions: Float[np.ndarray, "body_vertices 3"] | None = None,
-    body_faces: Int[np.ndarray, "body_faces 3"] | None = None,
-    *,
-    name: str = "mesh",
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str = "mesh"
 ) -> None:
     """Check that the faces of a garment point outside.
 
-    With a body, outside is where the nearest body face points. Without one, the garment's holes are closed
-    with fans and the sign of the enclosed volume decides, where the holes are small enough to call it
-    enclosed. The mesh is refused only where it clearly disagrees.
+    The garment's holes are closed with fans, and the sign of the enclosed volume decides. Meshes that are
+    mostly hole pass.
 
     Args:
         positions: Vertex positions [m], shape [vertices, 3].
         faces: Triangles of a valid mesh, shape [faces, 3].
-        body_positions: Body vertices in the same pose [m], shape [body_vertices, 3].
-        body_faces: Triangles of the body, counter-clockwise seen from outside.
-        name: What messages call the mesh.
+        name: Name of the mesh in messages.
 
     Raises:
         MeshError: The faces point inside.
     """
-    positions, faces = np.asarray(positions, np.float64), np.asarray(faces, np.int64)
-    if body_positions is not None and body_faces is not None:
-        agreement = _body_agreement(
-            positions, faces, np.asarray(body_positions, np.float64), np.asarray(body_faces)
-        )
-        if agreement < MIN_BODY_AGREEMENT:
-            raise MeshError(f"{name}: its faces point into the body ({agreement:.2f} of 1); flip the normals")
-    elif _enclosed_volume_ratio(positions, faces) < MIN_VOLUME_RATIO:
+    if _enclosed_volume_ratio(np.asarray(positions, np.float64), np.asarray(faces)) < MIN_VOLUME_RATIO:
         raise MeshError(f"{name}: its faces point inside; flip the normals")
 
 
-def _body_agreement(
-    positions: np.ndarray, faces: np.ndarray, body_positions: np.ndarray, body_faces: np.ndarray
-) -> float:
-    """Return the area-weighted mean cosine between garment normals and those of the nearest body faces."""
-    crosses = face_cross_products(positions, faces)
-    body_crosses = face_cross_products(body_positions, body_faces)
-    outward = body_crosses / np.maximum(np.linalg.norm(body_crosses, axis=1, keepdims=True), 1e-30)
-    _, nearest = KDTree(body_positions[body_faces].mean(axis=1)).query(positions[faces].mean(axis=1))
-    return float(np.sum(crosses * outward[nearest]) / np.sum(np.linalg.norm(crosses, axis=1)))
-
-
 def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
-    """Return the closed mesh's volume over that of a sphere of its area; 0 where it is mostly hole."""
+    """Return the volume of the closed mesh relative to a sphere of equal area; 0 if it is mostly hole."""
     centered = positions - positions.mean(axis=0)
     triangles = [centered[faces]]
     for loop in boundary_loops(faces):

@@ -1,1 +1,1 @@
-"""A frame as a graph: features, normalisers, jraph (the only room that imports it beside models)."""
+"""A frame as a graph: features, normalisers, gathers and sums. Only this room and `models` import jraph."""

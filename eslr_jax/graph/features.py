@@ -1,9 +1,9 @@
-"""Node and edge features: HOOD's, and scaled ones that carry the gradient of the potential.
+"""Node and edge features of two kinds: HOOD's, and scaled ones with the gradient of the potential.
 
-HOOD's features are raw and go through running statistics inside the model. Those of the "gradient" kind are
-divided by fixed physical scales instead, or by the garment's mean rest edge length where a quantity grows
-with the mesh spacing, so that one model serves a garment meshed at 1k and at 4k vertices. They are clipped at
-`CLIP`: a vertex thrown far away gives a large input, not an unbounded one.
+HOOD's features are raw, and the model normalises them by running statistics. Features of the kind
+"gradient" are divided by fixed physical scales. What grows with the mesh spacing is divided by the
+garment's mean rest edge length, so that one model serves a garment at 1k and at 4k vertices. They are
+clipped at `CLIP`: a vertex thrown far away gives a large input, but a bounded one.
 
 Source: HOOD's `models/baselines.py` and `utils/connectivity.py` for the first kind.
 """
@@ -13,9 +13,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from eslr_jax.graph.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
 LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
 LAME_LAMBDA_RANGE = (3535.414406069427, 93333.73508005822)  # [Pa] (HOOD)
@@ -40,7 +41,6 @@ HOOD_NODE_SIZE = 11  # + 9 embedding columns = 20
 HOOD_NODE_STATIC = 3  # last columns, which are not normalised
 HOOD_MESH_SIZE, HOOD_MESH_STATIC = 12, 3
 HOOD_WORLD_SIZE = 9
-HOOD_WORLD_VECTORS = 8  # leading columns are (vector, norm) pairs
 
 
 def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -50,41 +50,42 @@ def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 def to_vertices(
     values: Float[Array, "*shape"],
-    garment: Garment,
     weights: Float[Array, " items"],
     incidence: Int[Array, "vertices degree"],
     corners: int,
 ) -> Float[Array, " vertices"]:
-    """Average a material value onto vertices; a scalar is repeated.
+    """Average a material constant of faces or hinges onto the vertices; a scalar is repeated.
 
     Args:
-        values: A scalar, or one value per item.
-        garment: Garment whose vertices are meant.
-        weights: Weight of every item, shape [items]; items of weight zero do not count.
-        incidence: Items of every vertex, see `sum_incident`.
-        corners: Corners of an item.
+        values: One value for all items, or values of shape [items].
+        weights: Weight of every item, shape [items]; an item of weight zero does not count.
+        incidence: Items around every vertex, shape [vertices, degree]; see `numerics.sum_incident`.
+        corners: Number of vertices of an item.
+
+    Returns:
+        Weighted means, shape [vertices]; the mean over all items where a vertex has none.
     """
-    num_vertices = garment.vertex_areas.shape[0]
     if values.ndim == 0:
-        return jnp.broadcast_to(values, (num_vertices,))
+        return jnp.broadcast_to(values, (incidence.shape[0],))
     sums = sum_incident(jnp.stack([values * weights, weights], axis=1), incidence, corners=corners)
     mean = jnp.sum(values * weights) / jnp.maximum(jnp.sum(weights), 1e-30)
     return jnp.where(sums[:, 1] > 0, sums[:, 0] / jnp.where(sums[:, 1] > 0, sums[:, 1], 1), mean)
 
 
 def material_inputs(garment: Garment, material: Material) -> Float[Array, "vertices 3"]:
-    """Return bending stiffness, mu and lambda per vertex, scaled to 0..1 over HOOD's training ranges.
+    """Return bending stiffness, mu and lambda of every vertex, scaled to 0..1 over HOOD's training ranges.
 
-    Bending and mu on a logarithmic scale, lambda on a linear one; values outside of the range leave 0..1.
+    Bending stiffness and mu have a logarithmic scale, lambda a linear one. A fabric outside the ranges gives
+    values outside 0..1.
 
     Source: HOOD's `runners/utils/material.py`.
     """
     hinge_weights = (garment.hinge_rest_areas > 0).astype(garment.rest_areas.dtype)
     bending = to_vertices(
-        material.bending_stiffness, garment, hinge_weights, garment.hinge_incidence, garment.hinges.shape[1]
+        material.bending_stiffness, hinge_weights, garment.hinge_incidence, garment.hinges.shape[1]
     )
     mu, lam = (
-        to_vertices(value, garment, garment.rest_areas, garment.face_incidence, 3)
+        to_vertices(value, garment.rest_areas, garment.face_incidence, 3)
         for value in (material.lame_mu, material.lame_lambda)
     )
 
@@ -105,7 +106,7 @@ def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 def mean_edge_length(garment: Garment) -> Float[Array, ""]:
     """Return the mean length of the rest mesh's edges [m]."""
-    rest = garment.rest_positions[garment.senders] - garment.rest_positions[garment.receivers]
+    rest = _edge_vectors(garment, garment.rest_positions)
     total = jnp.sum(jnp.where(garment.edge_mask, safe_norm(rest), 0))
     return total / jnp.maximum(jnp.sum(garment.edge_mask.astype(rest.dtype)), 1)
 
@@ -119,20 +120,18 @@ def timestep_input(timestep: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def hood_garment_features(
-    garment: Garment,
-    material: Material,
-    position: Float[Array, "vertices 3"],
-    velocity: Float[Array, "vertices 3"],
-    timestep: Float[Array, ""],
+    garment: Garment, material: Material, inputs: GraphInputs
 ) -> Float[Array, "vertices 11"]:
-    """Velocity 3 [m per frame], normal 3, timestep [s], ln mass [ln kg], material inputs 3.
+    """Return velocity 3 [m per frame], normal 3, timestep [s], ln mass [ln kg] and material inputs 3.
 
-    The model inserts the embedding of the vertex type behind the velocity: 20 columns.
+    The model inserts the embedding of the vertex type behind the velocity, which makes 20 columns.
     """
-    column = jnp.broadcast_to(timestep, (position.shape[0], 1))
+    column = jnp.broadcast_to(inputs.timestep, (inputs.position.shape[0], 1))
     mass = log_positive(vertex_masses(garment, material))[:, None]
-    normals = vertex_normals(position, garment.faces, garment.face_incidence)
-    return jnp.concatenate([velocity, normals, column, mass, material_inputs(garment, material)], axis=1)
+    normals = vertex_normals(inputs.position, garment.faces, garment.face_incidence)
+    return jnp.concatenate(
+        [inputs.velocity, normals, column, mass, material_inputs(garment, material)], axis=1
+    )
 
 
 def hood_body_features(
@@ -140,59 +139,64 @@ def hood_body_features(
     normals: Float[Array, "world_edges 3"],
     timestep: Float[Array, ""],
 ) -> Float[Array, "world_edges 11"]:
-    """The same columns for body points; mass and material are -1."""
+    """Return the columns of `hood_garment_features` for body points; mass and material are -1."""
     num_rows = velocity.shape[0]
     column = jnp.broadcast_to(timestep, (num_rows, 1))
     return jnp.concatenate([velocity, normals, column, -jnp.ones((num_rows, 4), velocity.dtype)], axis=1)
 
 
-def hood_mesh_features(
-    garment: Garment, material: Material, position: Float[Array, "vertices 3"], timestep: Float[Array, ""]
+def hood_edge_features(
+    garment: Garment, material: Material, inputs: GraphInputs, edges: Garment | CoarseEdges
 ) -> Float[Array, "edges 12"]:
-    """Sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3."""
-    current = position[garment.senders] - position[garment.receivers]
-    rest = garment.rest_positions[garment.senders] - garment.rest_positions[garment.receivers]
-    inputs = material_inputs(garment, material)
+    """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3.
+
+    Args:
+        garment: Rest mesh.
+        material: Fabric.
+        inputs: State of the garment.
+        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
+    """
+    current = _edge_vectors(edges, inputs.position)
+    rest = _edge_vectors(edges, garment.rest_positions)
+    constants = material_inputs(garment, material)
     return jnp.concatenate(
         [
             current,
             safe_norm(current, keepdims=True),
             rest,
             safe_norm(rest, keepdims=True),
-            jnp.broadcast_to(timestep, (current.shape[0], 1)),
-            (inputs[garment.senders] + inputs[garment.receivers]) / 2,
+            jnp.broadcast_to(inputs.timestep, (current.shape[0], 1)),
+            (constants[edges.senders] + constants[edges.receivers]) / 2,
         ],
         axis=1,
     )
 
 
-def hood_world_features(
-    position: Float[Array, "world_edges 3"],
-    points: Float[Array, "world_edges 3"],
-    next_points: Float[Array, "world_edges 3"],
-    timestep: Float[Array, ""],
-) -> Float[Array, "world_edges 9"]:
-    """Garment minus body point 3 [m], its norm, the same with the body's next frame 4, timestep [s]."""
-    now, later = position - points, position - next_points
+def hood_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 9"]:
+    """Return vertex minus body point 3 [m], its norm, the same with the body's next frame 4, timestep [s]."""
+    now, later = inputs.position - contacts.points, inputs.position - contacts.next_points
     return jnp.concatenate(
         [
             now,
             safe_norm(now, keepdims=True),
             later,
             safe_norm(later, keepdims=True),
-            jnp.broadcast_to(timestep, (now.shape[0], 1)),
+            jnp.broadcast_to(inputs.timestep, (now.shape[0], 1)),
         ],
         axis=1,
     )
 
 
-def hood_reverse_signs(dtype) -> Float[Array, " 9"]:
-    """Return what turns the features of a world edge into those of its opposite: vectors change sign."""
-    return jnp.array([-1, -1, -1, 1, -1, -1, -1, 1, 1], dtype)
+def reverse_world_features(
+    rows: Float[Array, "world_edges features"],
+) -> Float[Array, "world_edges features"]:
+    """Return the features of the opposite world edges: the two leading (vector, norm) pairs change sign."""
+    signs = jnp.ones(rows.shape[1], rows.dtype).at[jnp.array([0, 1, 2, 4, 5, 6])].set(-1)
+    return rows * signs[None]
 
 
 # --- gradient -----------------------------------------------------------------------------------------------
-# Every kind of row has features that stay for a frame, and features that change from pass to pass.
+# Every kind of row has features that stay for a frame, and features that change with every refinement step.
 
 NODE_FRAME_SIZE, NODE_REFINEMENT_SIZE = 14, 18
 MESH_FRAME_SIZE, MESH_REFINEMENT_SIZE = 8, 4
@@ -201,28 +205,23 @@ BODY_FRAME_SIZE = 10
 
 
 def frame_node_features(
-    garment: Garment,
-    material: Material,
-    position: Float[Array, "vertices 3"],
-    velocity: Float[Array, "vertices 3"],
-    timestep: Float[Array, ""],
-    edge_length: Float[Array, ""],
+    garment: Garment, material: Material, inputs: GraphInputs, edge_length: Float[Array, ""]
 ) -> Float[Array, "vertices 14"]:
-    """Velocity 3, normal 3, timestep, density, area over squared spacing, spacing, pinned, material 3."""
-    num_vertices = position.shape[0]
+    """Return velocity 3, normal 3, timestep, density, vertex area, mesh spacing, pinned, material inputs 3."""
+    num_vertices = inputs.position.shape[0]
     density = jnp.broadcast_to(material.density, (num_vertices,))
     area = garment.vertex_areas / edge_length**2
     scalars = [
-        jnp.broadcast_to(timestep_input(timestep), (num_vertices,)),
+        jnp.broadcast_to(timestep_input(inputs.timestep), (num_vertices,)),
         jnp.log(density / DENSITY_SCALE),
         clip(log_positive(area)),
         jnp.broadcast_to(jnp.log(edge_length / EDGE_LENGTH_SCALE), (num_vertices,)),
-        garment.is_pinned.astype(position.dtype),
+        garment.is_pinned.astype(inputs.position.dtype),
     ]
     return jnp.concatenate(
         [
-            clip(velocity / VELOCITY_SCALE),
-            vertex_normals(position, garment.faces, garment.face_incidence),
+            clip(inputs.velocity / VELOCITY_SCALE),
+            vertex_normals(inputs.position, garment.faces, garment.face_incidence),
             jnp.stack(scalars, axis=1),
             material_inputs(garment, material),
         ],
@@ -231,47 +230,35 @@ def frame_node_features(
 
 
 def refinement_node_features(
-    garment: Garment,
-    material: Material,
-    guess: Float[Array, "vertices 3"],
-    inertial_guess: Float[Array, "vertices 3"],
-    gradient: Float[Array, "vertices 3"],
-    step: Float[Array, "vertices 3"],
-    weight: Float[Array, " vertices"],
-    edge_length: Float[Array, ""],
-    correction: Float[Array, "vertices 3"] | None,
-    previous_gradient: Float[Array, "vertices 3"] | None,
+    garment: Garment, material: Material, inputs: GraphInputs, edge_length: Float[Array, ""]
 ) -> Float[Array, "vertices 18"]:
-    """Push-out 3, force 3 and its size, descent step 3 and its size, last correction 3, last force 3 and size.
+    """Return push-out 3, force 4, descent step 4, last correction 3 and last force 4.
 
-    A force f enters by direction and asinh(|f| / (m g)) / 2, with at least `LEAST_GRAVITY` for g. The step
-    is in units of a tenth of the mesh spacing, through tanh; its size through log1p. What the first pass does
-    not know is zero.
+    A force f enters as its direction times s, and s = asinh(|f| / (m g)) / 2, with g at least
+    `LEAST_GRAVITY`. The descent step enters through tanh, in units of a tenth of the mesh spacing, and its
+    size through log1p. The correction and the force of the step before are zero at the first one.
     """
-    if correction is None:
-        correction = jnp.zeros_like(guess)
-    if previous_gradient is None:
-        previous_gradient = jnp.zeros_like(guess)
+    guess, gradient = required(inputs, "guess"), required(inputs, "gradient")
+    zeros = jnp.zeros_like(guess)
+    correction = zeros if inputs.correction is None else inputs.correction
+    previous_gradient = zeros if inputs.previous_gradient is None else inputs.previous_gradient
     mass = vertex_masses(garment, material)
-    heaviness = jnp.maximum(jnp.maximum(weight, LEAST_GRAVITY * mass), 1e-12)[:, None]
+    weight = jnp.maximum(required(inputs, "weight"), LEAST_GRAVITY * mass)
+    unit = jnp.maximum(weight, 1e-12)[:, None]  # a padded vertex has no mass
 
     def force_features(force):
-        size = jnp.arcsinh(safe_norm(force, keepdims=True) / heaviness) / 2
+        size = jnp.arcsinh(safe_norm(force, keepdims=True) / unit) / 2
         return safe_normalize(force) * size, size
 
-    scaled = step / (STEP_SCALE * edge_length)
-    force, force_size = force_features(-gradient)
-    previous, previous_size = force_features(-previous_gradient)
+    scaled = required(inputs, "step") / (STEP_SCALE * edge_length)
     return jnp.concatenate(
         [
-            clip((guess - inertial_guess) / GUESS_SCALE),
-            force,
-            force_size,
+            clip((guess - required(inputs, "inertial_guess")) / GUESS_SCALE),
+            *force_features(-gradient),
             jnp.tanh(scaled),
             jnp.log1p(safe_norm(scaled, keepdims=True)) / 2,
             clip(correction / GUESS_SCALE),
-            previous,
-            previous_size,
+            *force_features(-previous_gradient),
         ],
         axis=1,
     )
@@ -280,9 +267,9 @@ def refinement_node_features(
 def frame_mesh_features(
     garment: Garment, position: Float[Array, "vertices 3"], edge_length: Float[Array, ""]
 ) -> Float[Array, "edges 8"]:
-    """Sender minus receiver 3 and the same at rest 3, in mesh spacings; rest length less one; strain."""
-    current = position[garment.senders] - position[garment.receivers]
-    rest = garment.rest_positions[garment.senders] - garment.rest_positions[garment.receivers]
+    """Return sender minus receiver 3, the same at rest 3, rest length less one, in mesh spacings; strain."""
+    current = _edge_vectors(garment, position)
+    rest = _edge_vectors(garment, garment.rest_positions)
     rest_length = safe_norm(rest, keepdims=True)
     return jnp.concatenate(
         [
@@ -298,12 +285,19 @@ def frame_mesh_features(
 def refinement_mesh_features(
     garment: Garment, guess: Float[Array, "vertices 3"], edge_length: Float[Array, ""]
 ) -> Float[Array, "edges 4"]:
-    """Sender minus receiver at the guess 3, in mesh spacings, and its strain."""
-    rest = garment.rest_positions[garment.senders] - garment.rest_positions[garment.receivers]
-    vector = guess[garment.senders] - guess[garment.receivers]
+    """Return sender minus receiver at the guess 3, in mesh spacings, and its strain."""
+    rest = _edge_vectors(garment, garment.rest_positions)
+    vector = _edge_vectors(garment, guess)
     return jnp.concatenate(
         [clip(vector / edge_length), _strain(vector, safe_norm(rest, keepdims=True))], axis=1
     )
+
+
+def _edge_vectors(
+    edges: Garment | CoarseEdges, position: Float[Array, "vertices 3"]
+) -> Float[Array, "edges 3"]:
+    """Return the vector from receiver to sender of every edge [m]."""
+    return position[edges.senders] - position[edges.receivers]
 
 
 def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, "edges 1"]) -> Float[Array, "edges 1"]:
@@ -316,7 +310,7 @@ def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, "edges 1"
 def frame_world_features(
     position: Float[Array, "world_edges 3"], contacts: Contacts, inertial_guess: Float[Array, "world_edges 3"]
 ) -> Float[Array, "world_edges 10"]:
-    """Offset from the body point now and at the next frame, with norms 8; two signed distances."""
+    """Return the offset from the body point now 4 and at the next frame 4, with norms; signed distances 2."""
     now, later = position - contacts.points, position - contacts.next_points
     return clip(
         jnp.concatenate(
@@ -336,7 +330,7 @@ def frame_world_features(
 def refinement_world_features(
     guess: Float[Array, "world_edges 3"], contacts: Contacts
 ) -> Float[Array, "world_edges 2"]:
-    """Signed distance of the guess to the body's next tangent plane, coarse and in contact widths."""
+    """Return the guess's signed distance to the body's next tangent plane, coarse and in contact widths."""
     distance = plane_distance(guess, contacts)
     return clip(jnp.concatenate([distance / DISTANCE_SCALE, distance / CONTACT_SCALE], axis=1))
 
@@ -351,7 +345,7 @@ def plane_distance(
 def frame_body_features(
     velocity: Float[Array, "world_edges 3"], contacts: Contacts, timestep: Float[Array, ""]
 ) -> Float[Array, "world_edges 10"]:
-    """Velocity of the body point 3, its normal now 3 and at the next frame 3, timestep."""
+    """Return the body point's velocity 3, its normal now 3 and at the next frame 3, and the timestep."""
     return jnp.concatenate(
         [
             clip(velocity / VELOCITY_SCALE),

@@ -11,14 +11,14 @@ from eslr_jax.types import Contacts
 
 @struct.dataclass
 class GraphInputs:
-    """State of a garment and of the body beside it, at one frame or at one pass within a frame.
+    """State of a garment and of the body beside it, at a frame or at one refinement step of a frame.
 
-    Lengths are in metres and velocities in metres per frame, the unit of HOOD's features. Pinned vertices
-    carry their next target in `position` and the way to it in `velocity`.
+    Lengths are in metres. Velocities are in metres per frame, the unit of HOOD's features. Pinned vertices
+    already have their next target as `position`, and their way to it as `velocity`.
 
-    `contacts` and `body_velocity` are None in a scene without a body. The fields from `guess` on are read only
-    where `ModelConfig.features` is "gradient"; `correction` and `previous_gradient` are None, or zero, on the
-    first pass of a frame.
+    `contacts` and `body_velocity` are None in a scene without a body. Only features of the kind "gradient" read
+    the fields from `inertial_guess` on. `correction` and `previous_gradient` are None or zero at the first
+    refinement step of a frame.
     """
 
     position: Float[Array, "vertices 3"]  # [m]
@@ -27,9 +27,7 @@ class GraphInputs:
     contacts: Contacts | None = None
     body_velocity: Float[Array, "vertices 3"] | None = None  # of the nearest body points [m per frame]
     inertial_guess: Float[Array, "vertices 3"] | None = None  # where inertia alone leads [m]
-    guess: Float[Array, "vertices 3"] | None = (
-        None  # current answer: pushed-out inertial guess, or last pass [m]
-    )
+    guess: Float[Array, "vertices 3"] | None = None  # what the step corrects [m]
     gradient: Float[Array, "vertices 3"] | None = None  # of the potential at `guess` [N]
     step: Float[Array, "vertices 3"] | None = None  # preconditioned step down that gradient [m]
     weight: Float[Array, " vertices"] | None = None  # m g [N]
@@ -37,19 +35,31 @@ class GraphInputs:
     previous_gradient: Float[Array, "vertices 3"] | None = None  # before that correction [N]
 
 
+def required(inputs: GraphInputs, name: str) -> Array:
+    """Return a field of `inputs` that a kind of features cannot do without.
+
+    Raises:
+        ValueError: The field is None.
+    """
+    value = getattr(inputs, name)
+    if value is None:
+        raise ValueError(f"GraphInputs.{name} is None, but the features of this model need it; set it")
+    return value
+
+
 def next_refinement(
     inputs: GraphInputs, guess: Float[Array, "vertices 3"], gradient: Float[Array, "vertices 3"]
 ) -> GraphInputs:
-    """Return the inputs of the next pass over the same frame.
+    """Return the inputs of the next refinement step of the same frame.
 
     Args:
-        inputs: The pass just done.
-        guess: Its answer [m], shape [vertices, 3].
-        gradient: Gradient of the potential there [N], shape [vertices, 3].
+        inputs: Inputs of the step just done.
+        guess: Positions that this step predicted [m], shape [vertices, 3].
+        gradient: Gradient of the potential at these positions [N], shape [vertices, 3].
     """
     return inputs.replace(
         guess=guess,
         gradient=gradient,
-        correction=jnp.subtract(guess, inputs.guess),
-        previous_gradient=inputs.gradient,
+        correction=jnp.subtract(guess, required(inputs, "guess")),
+        previous_gradient=required(inputs, "gradient"),
     )

@@ -1,34 +1,28 @@
-"""Cumulative feature statistics.
+"""Running statistics of features.
 
-HOOD accumulates the count, the sum and the sum of squares of every row that it ever saw. In float32 the sums
-lose the small addends after about 1e7 rows and their difference cancels, so the same statistics are kept here
-as mean and sum of squared deviations and merged by Chan's rule, which only ever adds numbers of like size.
+HOOD sums the rows and the squared rows that it has seen. In float32 these sums lose small addends after
+about 1e7 rows, and their difference cancels. Here the same statistics are kept as mean and squared
+deviations, and merged by Chan's rule, which adds only numbers of like size.
 
-Source: HOOD's `utils/normalization.py` for what is accumulated; Chan, Golub and LeVeque (1979) for the merge.
+Source: HOOD's `utils/normalization.py` for what is collected; Chan, Golub and LeVeque (1979) for the merge.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
+
+from eslr_jax.types import Normalizer
 
 MIN_DEVIATION = 1e-8  # floor of the standard deviation (HOOD)
-MAX_UPDATES = 1_000_000  # batches after which statistics freeze (HOOD)
-
-
-@struct.dataclass
-class Normalizer:
-    """Mean and spread of a set of features over every row seen so far."""
-
-    count: Float[Array, ""]  # rows seen
-    mean: Float[Array, " features"]
-    squared_deviations: Float[Array, " features"]  # sum over rows of (x - mean)^2
-    num_updates: Int[Array, ""]
+WARMUP_UPDATES = 100  # graphs seen before weights are trained (HOOD)
+MAX_UPDATES = 1_000_000  # graphs after which statistics freeze (HOOD)
 
 
 def init_normalizer(size: int, dtype=jnp.float32) -> Normalizer:
-    """Return a normaliser that has seen nothing and changes nothing."""
+    """Return a normaliser that has seen no rows; it leaves features unchanged."""
     return Normalizer(
         count=jnp.zeros((), dtype),
         mean=jnp.zeros(size, dtype),
@@ -38,11 +32,11 @@ def init_normalizer(size: int, dtype=jnp.float32) -> Normalizer:
 
 
 def measure(rows: Float[Array, "rows features"], mask: Bool[Array, " rows"] | None = None) -> Normalizer:
-    """Return the statistics of one batch of rows.
+    """Return the statistics of one graph.
 
     Args:
-        rows: Shape [rows, features].
-        mask: Rows that count; the others may be anything, also NaN.
+        rows: Features, shape [rows, features].
+        mask: Which rows count, shape [rows]; the others may hold any value, also NaN.
     """
     mask = jnp.ones(rows.shape[0], bool) if mask is None else mask
     count = jnp.sum(mask).astype(rows.dtype)
@@ -54,10 +48,14 @@ def measure(rows: Float[Array, "rows features"], mask: Bool[Array, " rows"] | No
 
 
 def merge(seen: Normalizer, new: Normalizer) -> Normalizer:
-    """Join the statistics of two sets of rows, until `MAX_UPDATES` sets were seen.
+    """Return the statistics of all rows in `seen` and `new`; of `seen` alone after `MAX_UPDATES` graphs.
 
-    With n rows of mean m and squared deviations s, and N, M, S seen before, delta = m - M:
+    N rows with mean M and squared deviations S meet n rows with m and s. With delta = m - M,
     M' = M + delta n / (N + n) and S' = S + s + delta^2 N n / (N + n).
+
+    Args:
+        seen: Statistics so far.
+        new: Statistics of one more graph.
 
     Source: Chan, Golub and LeVeque (1979), eq. 2.1.
     """
@@ -74,17 +72,31 @@ def merge(seen: Normalizer, new: Normalizer) -> Normalizer:
     )
 
 
+def is_warming_up(statistics: Mapping[str, Normalizer]) -> Bool[Array, ""]:
+    """Return whether a network has seen fewer than `WARMUP_UPDATES` graphs; False for one without statistics.
+
+    HOOD only collects statistics until then, and leaves weights and optimiser unchanged. The normaliser that saw
+    most graphs counts: a scene without a body never adds to the one of world edges.
+
+    Args:
+        statistics: Normalisers by name, the entry "statistics" of a network's weights.
+    """
+    if not statistics:
+        return jnp.array(False)
+    return jnp.max(jnp.stack([one.num_updates for one in statistics.values()])) < WARMUP_UPDATES
+
+
 def standard_deviation(normalizer: Normalizer) -> Float[Array, " features"]:
-    """Return the population standard deviation, floored at `MIN_DEVIATION`; one where nothing was seen."""
+    """Return the population standard deviation, at least `MIN_DEVIATION`; one if no rows were seen."""
     variance = normalizer.squared_deviations / jnp.maximum(normalizer.count, 1)
     return jnp.where(normalizer.count > 0, jnp.maximum(jnp.sqrt(variance), MIN_DEVIATION), 1)
 
 
 def normalize(normalizer: Normalizer, rows: Float[Array, "rows features"]) -> Float[Array, "rows features"]:
-    """Return (rows - mean) / deviation."""
+    """Return (rows - mean) / standard deviation."""
     return (rows - normalizer.mean[None]) / standard_deviation(normalizer)[None]
 
 
 def inverse(normalizer: Normalizer, rows: Float[Array, "rows features"]) -> Float[Array, "rows features"]:
-    """Return rows * deviation + mean, which undoes `normalize`."""
+    """Return rows * standard deviation + mean, which undoes `normalize`."""
     return rows * standard_deviation(normalizer)[None] + normalizer.mean[None]

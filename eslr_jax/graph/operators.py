@@ -1,8 +1,8 @@
-"""Gathers and sums over a graph, each with the backward pass that XLA would not find.
+"""Gathers and sums over the mesh edges of a graph, with backward passes that suit CPU and GPU.
 
-Automatic differentiation turns a gather into a scatter-add, which a CPU does one element at a time and a GPU
-in an order that changes from run to run. A mesh is undirected and its edges are sorted by receiver, so every
-backward pass below is again a gather or a sorted segment sum.
+Automatic differentiation turns a gather into a scatter-add. A CPU does that one element at a time, a GPU in an
+order that changes from run to run. A mesh is undirected and its edges are sorted by receiver, so every backward
+pass below is again a gather or a sorted segment sum.
 """
 
 from __future__ import annotations
@@ -11,77 +11,64 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import jraph
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import segment_sum
-from eslr_jax.types import Garment
 
 
 class MeshTables(NamedTuple):
-    """Index tables of a garment's mesh edges."""
+    """Index tables of the mesh edges, in the form that the operators below read."""
 
     senders: Int[Array, " edges"]
-    receivers: Int[Array, " edges"]  # sorted
-    reverse_edges: Int[Array, " edges"]
-    neighbors: Int[Array, "vertices degree"]  # padded with the number of vertices
-    degree: Float[Array, "vertices 1"]
+    receivers: Int[Array, " edges"]  # ascending
+    reverse_edges: Int[Array, " edges"]  # index of the opposite edge
+    neighbors: Int[
+        Array, "vertices degree"
+    ]  # senders of the incoming edges, padded with the number of vertices
+    degree: Float[Array, "vertices 1"]  # number of neighbours
 
 
-class WorldTables(NamedTuple):
-    """Which world edge belongs to which vertex; None for both where row w is vertex w."""
-
-    vertex: Int[Array, " world_edges"] | None  # the number of vertices where masked
-    slot: Int[Array, " vertices"] | None  # the number of world edges where a vertex has none
-    mask: Float[Array, "world_edges 1"]
-    vertex_mask: Float[Array, "vertices 1"]  # the same mask seen from the vertices
-
-
-def mesh_tables(garment: Garment, dtype) -> MeshTables:
-    """Return the tables of `garment`, with its neighbours padded for `sum_neighbors`."""
-    num_vertices = garment.neighbors.shape[0]
-    return MeshTables(
-        senders=garment.senders,
-        receivers=garment.receivers,
-        reverse_edges=garment.reverse_edges,
-        neighbors=jnp.where(garment.neighbor_mask, garment.neighbors, num_vertices),
-        degree=jnp.sum(garment.neighbor_mask, axis=1, keepdims=True).astype(dtype),
-    )
-
-
-def world_tables(
-    slot: Int[Array, " vertices"],
-    vertex: Int[Array, " world_edges"],
-    mask: Bool[Array, " world_edges"],
-    dtype,
-) -> WorldTables:
-    """Return the tables of the world edges.
+def mesh_tables(graph: jraph.GraphsTuple, dtype) -> MeshTables:
+    """Return the tables that messages along a graph's mesh edges follow.
 
     Args:
-        slot: World edge of every vertex, or the number of world edges.
-        vertex: Vertex of every world edge.
-        mask: World edges in use.
-        dtype: Of the masks.
+        graph: A graph of `graph.build`.
+        dtype: Floating type of the degrees.
     """
-    num_vertices, num_edges = slot.shape[0], mask.shape[0]
-    if num_vertices == num_edges:
-        column = mask.astype(dtype)[:, None]
-        return WorldTables(None, None, column, column)
-    return WorldTables(
-        vertex=jnp.where(mask, vertex, num_vertices),
-        slot=slot,
-        mask=mask.astype(dtype)[:, None],
-        vertex_mask=(slot < num_edges).astype(dtype)[:, None],
+    senders, incoming = graph.senders["mesh"], graph.globals["incoming_edges"]
+    num_vertices, num_edges = incoming.shape[0], senders.shape[0]
+    padded = jnp.concatenate([senders, jnp.full(1, num_vertices, senders.dtype)])
+    return MeshTables(
+        senders=senders,
+        receivers=graph.receivers["mesh"],
+        reverse_edges=graph.globals["reverse_edges"],
+        neighbors=_take(padded, incoming),
+        degree=jnp.sum(incoming < num_edges, axis=1, keepdims=True).astype(dtype),
     )
 
 
-def _take(x: Float[Array, "rows features"], indices: Int[Array, " items"]) -> Float[Array, "items features"]:
-    """Gather rows; indices are known to be in range and not negative."""
+def coarse_tables(graph: jraph.GraphsTuple, level: int) -> MeshTables:
+    """Return the tables that messages along a coarse level's edges follow; there is nothing to smooth.
+
+    Args:
+        graph: A graph of `graph.build` for a hierarchical network.
+        level: Index of the level; 0 is the finest.
+    """
+    edges, name = graph.globals["coarse"][level], f"coarse{level}"
+    num_vertices = edges.is_kept.shape[0]
+    return MeshTables(
+        senders=graph.senders[name],
+        receivers=graph.receivers[name],
+        reverse_edges=edges.reverse_edges,
+        neighbors=jnp.zeros((num_vertices, 0), jnp.int32),
+        degree=jnp.zeros((num_vertices, 1)),
+    )
+
+
+def _take(x: Array, indices: Int[Array, ...]) -> Array:
+    """Gather rows; every index is known to be in range and not negative."""
     return x.at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def _append_zero(x: Float[Array, "rows features"]) -> Float[Array, "rows_and_one features"]:
-    """Append a row of zeros, for indices that mean "none"."""
-    return jnp.concatenate([x, jnp.zeros((1, x.shape[1]), x.dtype)])
 
 
 @jax.custom_vjp
@@ -103,8 +90,7 @@ take_receivers.defvjp(lambda x, tables: (take_receivers(x, tables), tables), _ta
 def take_senders(x: Float[Array, "vertices features"], tables: MeshTables) -> Float[Array, "edges features"]:
     """Return the row of every edge's sender.
 
-    The backward pass sums over the edges that leave a vertex: those that enter it, seen through
-    `reverse_edges`.
+    The backward pass sums over the edges that leave a vertex. They are the reverse edges of those that enter.
     """
     return _take(x, tables.senders)
 
@@ -134,42 +120,11 @@ def sum_neighbors(
     x: Float[Array, "vertices features"], tables: MeshTables
 ) -> Float[Array, "vertices features"]:
     """Sum over the neighbours of every vertex; on an undirected mesh the operator is its own adjoint."""
-    padded = _append_zero(x)
+    padded = jnp.concatenate([x, jnp.zeros((1, x.shape[1]), x.dtype)])
     return sum(_take(padded, tables.neighbors[:, k]) for k in range(tables.neighbors.shape[1]))
 
 
 sum_neighbors.defvjp(
     lambda x, tables: (sum_neighbors(x, tables), tables),
     lambda tables, cotangent: (sum_neighbors(cotangent, tables), None),
-)
-
-
-def to_world(
-    x: Float[Array, "vertices features"], tables: WorldTables
-) -> Float[Array, "world_edges features"]:
-    """Return the row of every world edge's vertex; masked rows are anything finite."""
-    return x if tables.vertex is None else _take_paired(x, tables.vertex, tables.slot)
-
-
-def from_world(
-    x: Float[Array, "world_edges features"], tables: WorldTables
-) -> Float[Array, "vertices features"]:
-    """Return the row of every vertex's world edge; zero where it has none."""
-    return x * tables.mask if tables.vertex is None else _take_paired(x, tables.slot, tables.vertex)
-
-
-@jax.custom_vjp
-def _take_paired(
-    x: Float[Array, "rows features"], indices: Int[Array, " items"], inverse: Int[Array, " rows"]
-) -> Float[Array, "items features"]:
-    """Gather where every row is named at most once, so that the backward pass is the gather by the inverse.
-
-    Both tables hold one past the end for "none", which gathers zero.
-    """
-    return _take(_append_zero(x), indices)
-
-
-_take_paired.defvjp(
-    lambda x, indices, inverse: (_take_paired(x, indices, inverse), (indices, inverse)),
-    lambda tables, cotangent: (_take_paired(cotangent, tables[1], tables[0]), None, None),
 )

@@ -1,1 +1,1 @@
-"""Files: one format a module, reader beside writer; everything is written whole or not at all."""
+"""Read and write files, one format per module; a file is written whole or not at all."""

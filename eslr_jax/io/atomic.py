@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from eslr_jax.errors import AssetError
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it onto `path` when the block succeeds.
 
-    Readers see the old file or the complete new one. The temporary name keeps the suffix of `path`, because
-    many writers choose their format by it. When the block raises, the temporary file is removed and `path`
-    is as before.
+    The temporary path keeps the suffix of `path`, because many writers choose their format by it. If the block
+    raises, the temporary file is removed and `path` is as before.
 
     Args:
-        path: The file to write; its folder must exist.
+        path: Path of the file; its folder must exist.
 
     Yields:
         The path to write to, in the same folder.
 
     Raises:
-        AssetError: If the folder is missing, or the file can't be written or moved into place.
+        AssetError: The folder is missing, or the file can't be written.
     """
     target = Path(path)
     # Hidden, and unique to this call, so that two processes may write the same target.
@@ -50,16 +49,16 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def ensure_output_dir(path: str | Path) -> Path:
-    """Create a folder with its parents, unless it is there, and prove that a file can be written in it.
+    """Create a folder with its parents if it is missing, and check that a file can be written in it.
 
     Args:
-        path: The folder.
+        path: Path of the folder.
 
     Returns:
-        The folder.
+        The path.
 
     Raises:
-        AssetError: If it can't be created, is not a folder, or refuses a file.
+        AssetError: The folder can't be created or written, or the path is a file.
     """
     folder = Path(path).expanduser()
     if folder.exists() and not folder.is_dir():
@@ -78,7 +77,7 @@ def ensure_output_dir(path: str | Path) -> Path:
 
 
 def _flush(path: Path) -> None:
-    """Push a file's bytes, or a folder's entries, to the disk."""
+    """Flush a file's bytes, or a folder's entries, to the disk."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:
@@ -92,5 +91,5 @@ def _flush(path: Path) -> None:
 
 
 def _reason(error: OSError) -> str:
-    """The operating system's own words, without the path that the caller names already."""
+    """Return the operating system's words without the path, which the caller names."""
     return (error.strerror or str(error)).lower()

@@ -1,12 +1,13 @@
-"""Biovision BVH motions: a hierarchy of offsets and Euler channels, then one line of numbers a frame.
+"""Read Biovision BVH motions: a hierarchy of offsets and Euler channels, then one line of numbers per frame.
 
-The rest pose is the one with all rotations zero: each joint at the sum of the offsets above it. Units and the
-up axis are the file's own.
+The rest pose has all rotations zero: each joint is at the sum of the offsets above it. The unit and the up axis
+are the file's own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.parsing import parsing
-from eslr_jax.io.skeleton import (
-    MAX_FRAMES,
-    MAX_JOINTS,
-    Skeleton,
-    SkeletonMotion,
-    chain_rotations,
-    order_joints,
-    unique_names,
-)
+from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets
 
 _CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
 
@@ -40,15 +33,17 @@ class _Joint:
 def read_bvh(path: str | Path) -> SkeletonMotion:
     """Read a BVH file.
 
+    A header whose number of frames is off by one is a warning; the frames that are there are read.
+
     Args:
-        path: The file.
+        path: Path of the file.
 
     Returns:
         The motion at its own frame rate, in its own unit and axes.
 
     Raises:
         AssetError: The file is missing, or is not BVH; the message names the line.
-        MotionError: It has no usable frames.
+        MotionError: The motion has no usable frames.
     """
     with parsing(path, "motion") as file:
         words = _Words(file)
@@ -60,7 +55,7 @@ def read_bvh(path: str | Path) -> SkeletonMotion:
 
 
 class _Words:
-    """The words of a file, one by one, with the number of their line."""
+    """Yields the words of a file one by one, and knows the number of their line."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -101,7 +96,7 @@ class _Words:
 
 
 def _read_hierarchy(words: _Words) -> list[_Joint]:
-    """Read everything before MOTION; end sites are left out."""
+    """Return the joints that stand before MOTION, without end sites."""
     words.expect("HIERARCHY")
     joints: list[_Joint] = []
     opened: list[int] = []  # joints whose brace is open; -1 is an end site
@@ -147,7 +142,7 @@ def _read_hierarchy(words: _Words) -> list[_Joint]:
 
 
 def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
-    """Read the frame count, the frame time and the table of values."""
+    """Return the table of values, [frames, channels], and the time between frames [s]."""
     words.expect("Frames:")
     num_frames = int(words.number_of(int))
     words.expect("Frame")
@@ -158,17 +153,27 @@ def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
     if num_channels == 0:
         raise words.fail("no channels to animate")
     text = " ".join(words.lines[words.number :]).split()
-    if len(text) != num_frames * num_channels:
+    rows = len(text) // num_channels
+    if len(text) % num_channels or abs(rows - num_frames) > 1 or not rows:
         raise words.fail(
             f"{len(text)} numbers follow; {num_frames} frames of {num_channels} channels need "
             f"{num_frames * num_channels}"
         )
-    values = np.array(text, np.float64).reshape(num_frames, num_channels)
+    if rows != num_frames:  # some exporters count wrongly
+        warnings.warn(
+            f"motion file {words.path} says {num_frames} frames and has {rows}; all {rows} are read",
+            UserWarning,
+            stacklevel=4,
+        )
+    values = np.array(text, np.float64).reshape(rows, num_channels)
+    is_bad = ~np.isfinite(values).all(axis=1)
+    if is_bad.any():
+        raise words.fail(f"frame {np.argmax(is_bad)} is not finite")
     return values, frame_time
 
 
 def _pose(name: str, joints: list[_Joint], values: np.ndarray, fps: float) -> SkeletonMotion:
-    """Evaluate the channels."""
+    """Return the motion that the values of the channels tell."""
     num_frames, num_joints = len(values), len(joints)
     local = np.tile(np.eye(3), (num_frames, num_joints, 1, 1))
     offsets = np.tile(np.array([joint.offset for joint in joints]), (num_frames, 1, 1))
@@ -186,18 +191,6 @@ def _pose(name: str, joints: list[_Joint], values: np.ndarray, fps: float) -> Sk
             column += 1
         if axes:
             local[:, index] = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix()
-    parents = tuple(joint.parent for joint in joints)
-    rotations = chain_rotations(local, parents)
-    positions = np.empty((num_frames, num_joints, 3))
-    rest = np.zeros((num_joints, 3))
-    for index, (joint, parent) in enumerate(zip(joints, parents, strict=True)):
-        if parent < 0:
-            positions[:, index], rest[index] = offsets[:, index], joint.offset
-        else:
-            moved = np.einsum("tab,tb->ta", rotations[:, parent], offsets[:, index])
-            positions[:, index] = positions[:, parent] + moved
-            rest[index] = rest[parent] + joint.offset
-    names = unique_names([joint.name for joint in joints])
-    order, new_parents = order_joints(names, list(parents), what=f"motion {name}")
-    skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest[order])
-    return SkeletonMotion(name, skeleton, rotations[:, order], positions[:, order], fps)
+    rest = np.array([joint.offset for joint in joints])
+    names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
+    return pose_offsets(name, names, parents, rest, local, offsets, fps)

@@ -1,4 +1,4 @@
-"""Colours as people write them, and as light adds up."""
+"""Convert colours between sRGB, as people write them, and linear values, as light adds up."""
 
 from __future__ import annotations
 

@@ -1,21 +1,20 @@
-"""A simulated run in the formats of other programs."""
+"""Export a simulated run to the formats of other programs."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from eslr_jax.errors import AssetError, EslrError
+from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import BODY_COLOR, AnimatedMesh, check_meshes, split_seams
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
-from eslr_jax.io.gltf_builder import check_mesh, split_seams
-from eslr_jax.io.gltf_skin import DEFAULT_BODY_COLOR
+from eslr_jax.io.gltf import write_animated_glb
 from eslr_jax.io.mesh_sequence import frame_name, obj_text
 from eslr_jax.io.npz import write_arrays
 from eslr_jax.io.point_cache import write_mdd, write_pc2
@@ -37,17 +36,16 @@ def export_trajectory(
 ) -> Path:
     """Write a run in another program's format.
 
-    Where the garment came from a file, its vertices have that file's order again: a point cache lies on it.
-
     Args:
-        run: Of `read_trajectory`.
-        path: The file to write; a folder for `obj` and `ply`, which are one file a frame.
-        garment: The garment that was simulated; tells the vertex order and the texture coordinates of its file.
-        format: By default what the suffix of `path` says.
+        run: The trajectory, from `read_trajectory`.
+        path: Path of the file; of a new folder for `obj` and `ply`, which are one file per frame.
+        garment: The garment that was simulated. It tells the vertex order of the garment's own file, so that a
+            point cache lies on that file, and its texture coordinates.
+        format: Format of the file; by default what the suffix of `path` says.
         content: What to write; by default both meshes to glb and usd, and the garment to all others.
 
     Returns:
-        The path written.
+        The path that was written.
 
     Raises:
         AssetError: The format is unknown, the run has no body, or the file can't be written.
@@ -55,14 +53,13 @@ def export_trajectory(
     """
     path = Path(path)
     chosen = format or _format_of(path)
-    content = content or ("both" if chosen in _SCENES and run.body_positions is not None else "garment")
+    content = content or ("both" if chosen in _SCENES and run.body is not None else "garment")
     if content == "both" and chosen not in _SCENES:
         raise AssetError(f"{chosen} holds one mesh; export garment and body to a file each")
     meshes = [mesh for kind, mesh in _meshes(run, garment).items() if content in (kind, "both")]
     if not meshes:
         raise AssetError("this run has no body; export the garment")
-    for mesh in meshes:
-        check_mesh(mesh.name, np.asarray(mesh.positions), np.asarray(mesh.faces))
+    check_meshes(meshes, run.timestep)
     if chosen in ("usd", "usda", "usdc"):
         write_usd(path, meshes, run.timestep)
     elif chosen == "glb":
@@ -88,26 +85,36 @@ def _format_of(path: Path) -> Format:
 
 
 def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, AnimatedMesh]:
-    """Return the garment, in its source's order, and the body if there is one.
+    """Return the garment in the vertex order of its file, and the body if there is one.
 
     Raises:
-        AssetError: The garment is another than the one that was simulated.
+        AssetError: The garment is not the one that was simulated.
     """
-    positions, faces, uvs = run.positions, run.faces, None
+    faces, uvs, places = run.faces, None, np.arange(run.positions.shape[1])
     if garment is not None:
         if not np.array_equal(garment.faces, faces):
             raise AssetError("the garment file is not the one of this run; simulate again")
-        uvs, places = garment.corner_uvs, garment.vertex_map
-        if places is not None and len(places) and places.min() >= 0 and places.max() < positions.shape[1]:
-            first = np.full(positions.shape[1], -1, np.int64)  # source vertex of every vertex
-            first[places[::-1]] = np.arange(len(places))[::-1]
+        uvs, order = garment.corner_uvs, garment.vertex_map
+        if order is not None and len(order) and order.min() >= 0 and order.max() < len(places):
+            first = np.full(len(places), -1, np.int64)  # vertex of the garment's file for every vertex
+            first[order[::-1]] = np.arange(len(order))[::-1]
             if (first[faces] >= 0).all():
-                positions, faces = positions[:, places], first[faces]
+                places, faces = order, first[faces]
     name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"
-    meshes = {"garment": AnimatedMesh(name, positions, faces, corner_uvs=uvs)}
-    if run.body_positions is not None and run.body_faces is not None:
-        meshes["body"] = AnimatedMesh("body", run.body_positions, run.body_faces, DEFAULT_BODY_COLOR)
-    return meshes
+    cloth = AnimatedMesh(
+        name, run.positions[:, places], faces, corner_uvs=uvs, velocities=run.velocities[:, places]
+    )
+    if run.body is None:
+        return {"garment": cloth}
+    body = AnimatedMesh(
+        "body",
+        run.body.positions,
+        run.body.faces,
+        BODY_COLOR,
+        rest_positions=run.body.rest_positions,
+        skin=run.body.skin,
+    )
+    return {"garment": cloth, "body": body}
 
 
 def _write_npz(path: Path, mesh: AnimatedMesh, timestep: float) -> None:
@@ -124,15 +131,15 @@ def _write_npz(path: Path, mesh: AnimatedMesh, timestep: float) -> None:
 
 
 def write_sequence(folder: str | Path, mesh: AnimatedMesh, kind: Literal["obj", "ply"]) -> None:
-    """Write one mesh file a frame into a new folder, which appears when it is complete.
+    """Write one mesh file per frame into a new folder, which appears when it is complete.
 
     Args:
-        folder: The folder; it must not exist, or be empty.
+        folder: Path of the folder, which must be empty or not exist.
         mesh: The mesh in motion.
-        kind: File format.
+        kind: Format of the files.
 
     Raises:
-        AssetError: The folder holds files already, or can't be written.
+        AssetError: The folder holds files already, or it can't be written.
     """
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):
@@ -151,8 +158,6 @@ def write_sequence(folder: str | Path, mesh: AnimatedMesh, kind: Literal["obj", 
         os.replace(parts, target)
     except OSError as error:
         raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
-    except EslrError:
-        raise
     finally:
         shutil.rmtree(parts, ignore_errors=True)
 
@@ -173,7 +178,16 @@ def _ply_writer(mesh: AnimatedMesh) -> Callable[[np.ndarray], bytes]:
         np.asarray(mesh.faces), np.asarray(mesh.positions).shape[1], mesh.corner_uvs
     )
     fields = ["x", "y", "z"] + (["s", "t"] if uvs is not None else [])
-    header = _ply_header(fields, len(vertices), len(faces))
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in fields),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    header = ("\n".join(lines) + "\n").encode()
     table = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
     table["count"], table["corners"] = 3, faces
 
@@ -182,17 +196,3 @@ def _ply_writer(mesh: AnimatedMesh) -> Callable[[np.ndarray], bytes]:
         return header + np.concatenate(columns, axis=1).astype("<f4").tobytes() + table.tobytes()
 
     return make
-
-
-def _ply_header(fields: Sequence[str], num_vertices: int, num_faces: int) -> bytes:
-    """Return the header of a binary PLY file."""
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {num_vertices}",
-        *(f"property float {name}" for name in fields),
-        f"element face {num_faces}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    return ("\n".join(lines) + "\n").encode()

@@ -1,4 +1,4 @@
-"""Garment files: the project's own archive, and what is known about a garment from anyone else's file."""
+"""Read and write garments: the project's own archive, and meshes of other programs."""
 
 from __future__ import annotations
 
@@ -12,44 +12,54 @@ from jaxtyping import Bool, Float, Int
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.mesh import MeshFile, read_mesh_file
-from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.pickle import read_pickle
 
 _HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
+_LAYOUT = {
+    "rest_positions": ("f", "vertices 3"),
+    "faces": ("iu", "faces 3"),  # indices are checked when the garment is prepared
+    "skin_weights": ("f", "vertices influences"),
+    "skin_indices": ("iu", "vertices influences"),
+    "pinned": ("biuf", "vertices"),
+    "sewn_positions": ("f", "vertices 3"),
+    "corner_uvs": ("f", "faces 3 2"),
+    "part_names": ("U", "parts"),
+    "face_parts": ("iu", "faces", "parts"),
+    "vertex_map": ("iu", "source_vertices"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class GarmentFile:
-    """The arrays of a garment file, as `prepare_garment` takes them, and what links them to their source."""
+    """A garment that is fitted to a body, and what links it to the file that it came from."""
 
     rest_positions: Float[np.ndarray, "vertices 3"]  # [m], float64, in the body's rest pose
     faces: Int[np.ndarray, "faces 3"]
     skin_weights: Float[np.ndarray, "vertices influences"]
     skin_indices: Int[np.ndarray, "vertices influences"]
     is_pinned: Bool[np.ndarray, " vertices"]
+    # [m], the shape with the garment's own lengths, areas and angles, where the rest pose distorts them
     sewn_positions: Float[np.ndarray, "vertices 3"] | None = None
-    """[m]: the shape that lengths, areas and angles are measured on, where it is not the rest pose's."""
     corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None
     face_parts: Int[np.ndarray, " faces"] | None = None
     part_names: tuple[str, ...] = ()
-    vertex_map: Int[np.ndarray, " source_vertices"] | None = (
-        None  # vertex of every source vertex; -1: dropped
-    )
+    vertex_map: Int[np.ndarray, " source_vertices"] | None = None  # vertex of each source vertex, or -1
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # fabrics, how it was fitted, ...
 
 
 @dataclasses.dataclass(frozen=True)
 class GarmentSource:
-    """A garment of a user, not yet fitted."""
+    """A garment of a user that is not fitted to a body yet."""
 
     mesh: MeshFile
     name: str
-    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # where the file says so
+    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # if the file tells
     is_metric: bool = False  # the format prescribes metres and Y up
 
 
 def is_garment_file(path: str | Path) -> bool:
-    """Tell a file that `write_garment_npz` wrote from a mesh that has to be fitted."""
+    """Tell whether a file is a fitted garment, and not a mesh that has to be fitted first."""
     return Path(path).suffix.lower() == ".npz" and "skin_weights" in read_arrays(path, content="garment")
 
 
@@ -58,6 +68,9 @@ def read_garment_source(text: str | Path) -> GarmentSource:
 
     Args:
         text: Path of a .obj, .ply, .stl, .glb, .npz or .pkl file; `FILE.pkl#NAME` picks one of several.
+
+    Returns:
+        The mesh in the file's units and axes.
 
     Raises:
         AssetError: The file is missing, damaged or of an unknown kind.
@@ -104,36 +117,35 @@ def _read_hood(path: str, name: str) -> GarmentSource:
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:
-    """Read a garment file with the arrays rest_positions, faces, skin_weights, skin_indices and pinned.
+    """Read a garment file.
 
-    `pinned` may be absent: then nothing is pinned. So may everything else that `write_garment_npz` writes.
+    Args:
+        path: Path of an npz archive with rest_positions, faces, skin_weights and skin_indices. Everything else
+            that `write_garment_npz` writes is optional; without `pinned` no vertex is pinned.
+
+    Returns:
+        The garment.
 
     Raises:
-        AssetError: The file is missing or damaged, or an array is missing or does not fit the others.
+        AssetError: The file is missing or damaged, or its arrays don't fit each other.
     """
     return garment_from_arrays(read_arrays(path, content="garment"), path)
 
 
 def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> GarmentFile:
-    """Return the garment of a file's arrays; see `read_garment_npz`.
-
-    Raises:
-        AssetError: An array is missing or does not fit the others.
-    """
+    """Return the garment of a file's arrays; see `read_garment_npz`."""
+    what = f"garment file {path}"
     missing = [
         key for key in ("rest_positions", "faces", "skin_weights", "skin_indices") if key not in arrays
     ]
     if missing:
-        raise AssetError(
-            f"garment file {path} lacks {', '.join(missing)}; it has {', '.join(sorted(arrays))}"
-        )
-    _check_shapes(arrays, path)
+        raise AssetError(f"{what} lacks {', '.join(missing)}; it has {', '.join(sorted(arrays))}")
+    check_layout(arrays, _LAYOUT, what=what, remedy="write it again")
     try:
         metadata = json.loads(str(arrays["metadata"])) if "metadata" in arrays else {}
     except (ValueError, RecursionError) as error:
-        raise AssetError(f"garment file {path} has damaged metadata; fit the garment again") from error
-    sewn = arrays.get("sewn_positions")
-    uvs = arrays.get("corner_uvs")
+        raise AssetError(f"{what} has damaged metadata; fit the garment again") from error
+    sewn, uvs = arrays.get("sewn_positions"), arrays.get("corner_uvs")
     return GarmentFile(
         rest_positions=arrays["rest_positions"].astype(np.float64),
         faces=arrays["faces"].astype(np.int64),
@@ -149,41 +161,6 @@ def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> Garm
     )
 
 
-def _check_shapes(arrays: dict[str, np.ndarray], path: str | Path) -> None:
-    """Raise on arrays whose kinds or numbers of rows do not fit; what they hold is checked when prepared."""
-    vertices, faces = arrays["rest_positions"].shape[:1], arrays["faces"].shape[:1]
-    expected = {
-        "rest_positions": ("f", (*vertices, 3)),
-        "faces": ("iu", (*faces, 3)),
-        "skin_weights": ("f", (*vertices, None)),
-        "skin_indices": ("iu", (*vertices, None)),
-        "pinned": ("biuf", vertices),
-        "sewn_positions": ("f", (*vertices, 3)),
-        "corner_uvs": ("f", (*faces, 3, 2)),
-        "face_parts": ("iu", faces),
-        "part_names": ("U", (None,)),
-        "vertex_map": ("iu", (None,)),
-    }
-    for key, (kinds, shape) in expected.items():
-        if key not in arrays:
-            continue
-        array = arrays[key]
-        fits = array.ndim == len(shape) and all(
-            b in (None, a) for a, b in zip(array.shape, shape, strict=True)
-        )
-        if array.dtype.kind not in kinds or not fits:
-            raise AssetError(
-                f"garment file {path}: {key} is {array.dtype} {array.shape} for {vertices} vertices and {faces} "
-                "faces; write the file again"
-            )
-    if "face_parts" in arrays and arrays["face_parts"].size:
-        parts, count = arrays["face_parts"], len(arrays.get("part_names", ()))
-        if parts.min() < 0 or parts.max() >= count:
-            raise AssetError(
-                f"garment file {path}: face_parts name part {parts.max()} of {count}; fit it again"
-            )
-
-
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
     """Write a garment file, atomically.
 
@@ -194,7 +171,7 @@ def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
 
 
 def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
-    """Return the arrays that stand in a garment's file."""
+    """Return the arrays of a garment file."""
     arrays: dict[str, np.ndarray] = {
         "rest_positions": garment.rest_positions.astype(np.float32),
         "faces": garment.faces.astype(np.int32),

@@ -1,145 +1,159 @@
-"""Animated meshes as one binary glTF 2.0 file (GLB) that Blender and web viewers open.
+"""Write animated meshes as one binary glTF 2.0 file (GLB) that Blender and web viewers open.
 
-Axes: glTF is right-handed, Y up, in metres and seconds, and so are we; nothing is converted here.
-(Blender turns the scene to Z up when it imports.)
+glTF is right-handed, Y up, in metres and seconds, as this package is: nothing is converted.
 
-A free-form mesh, such as a garment, becomes morph targets: frame 0 is the mesh itself, every later frame
-a target, and the weights animation blends linearly from one frame to the next. A skinned body becomes a
-real skin: its rest mesh, one node per joint, and their rotations and translations over time; such a file
-hardly grows with the number of frames.
+A mesh with a skin becomes a skin: its rest mesh, one node per joint, and their rotations and translations over
+time. What joints can't do, and all of the motion of a mesh without a skin, becomes morph targets: a few principal
+shapes whose weights are animated. Each vertex is within 0.2 mm of its place in every frame.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pygltflib as gltf
 
-from eslr_jax.errors import MeshError, MotionError
+from eslr_jax.io.animated import AnimatedMesh, check_meshes, principal_shapes, split_seams, vertex_normals
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.gltf_builder import GlbBuilder, append, check_mesh, split_seams, vertex_normals
-from eslr_jax.io.gltf_skin import SkinnedMesh, add_skinned_mesh
+from eslr_jax.io.gltf_builder import GlbBuilder, append
+from eslr_jax.io.skin import Skin, corrections, influences, local_motion
 
-DEFAULT_CLOTH_COLOR = (0.20, 0.42, 0.62, 1.0)  # sRGB
-
-
-@dataclasses.dataclass(frozen=True)
-class AnimatedMesh:
-    """A triangle mesh whose vertices move freely."""
-
-    name: str
-    positions: np.ndarray  # [frames, vertices, 3], [m]
-    faces: np.ndarray  # [faces, 3]
-    color: tuple[float, float, float, float] = DEFAULT_CLOTH_COLOR  # sRGB and opacity
-    corner_uvs: np.ndarray | None = None  # texture coordinates of every face's corners, v up [faces, 3, 2]
+TOLERANCE = 2e-4  # [m] by which a vertex may be out of place
+_INFLUENCES_PER_SET = 4  # glTF stores skin weights in sets of four
 
 
-def write_animated_glb(
-    path: str | Path,
-    meshes: Sequence[AnimatedMesh],
-    timestep: float,
-    *,
-    skinned_body: SkinnedMesh | None = None,
-    has_normals: bool = True,
-) -> None:
+def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     """Write meshes with their animation as one GLB file, atomically.
 
     Args:
-        path: The file, `*.glb`.
-        meshes: Free-form meshes, each written as morph targets; 24 bytes per vertex and frame.
+        path: Path of the file, `*.glb`.
+        meshes: Meshes with the same number of frames.
         timestep: Time between frames [s]; frame k is at k * timestep.
-        skinned_body: A body written as joints and skin weights.
-        has_normals: Store normals per frame for smooth shading; without them files halve and look faceted.
 
     Raises:
-        MeshError: If a mesh is empty, not finite, or its faces, weights and positions disagree.
-        MotionError: If the meshes have different numbers of frames, or a joint transform is not rigid.
-        AssetError: If the file can't be written.
+        MeshError: A mesh is empty, not finite, or its parts disagree.
+        MotionError: The numbers of frames differ, or a joint does not move rigidly.
+        AssetError: The file can't be written.
     """
-    _check_frames(meshes, skinned_body, timestep)
+    check_meshes(meshes, timestep)
     builder = GlbBuilder()
     for mesh in meshes:
-        _add_morphing_mesh(builder, mesh, timestep, has_normals)
-    if skinned_body is not None:
-        add_skinned_mesh(builder, skinned_body, timestep)
+        _add_mesh(builder, mesh, timestep)
     content = builder.to_bytes()
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
 
-def _check_frames(meshes: Sequence[AnimatedMesh], body: SkinnedMesh | None, timestep: float) -> None:
-    """Raise unless everything to be written has the same frames."""
-    if not np.isfinite(timestep) or timestep <= 0:
-        raise MotionError(f"timestep is {timestep} s; it must be positive")
-    frames = {mesh.name: len(mesh.positions) for mesh in meshes}
-    if body is not None:
-        frames[body.name] = len(body.joint_transforms)
-    if not frames:
-        raise MeshError("no mesh to write; give at least one")
-    if len(set(frames.values())) > 1 or 0 in frames.values():
-        raise MotionError(f"meshes need the same positive number of frames, these have {frames}")
-
-
-def _add_morphing_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float, has_normals: bool) -> None:
-    """Add a mesh whose frame 0 is the base and whose later frames are morph targets."""
-    positions = np.asarray(mesh.positions, np.float32)
-    faces = np.asarray(mesh.faces)
-    if positions.ndim != 3:
-        raise MeshError(
-            f"mesh {mesh.name} has positions of shape {positions.shape}; it needs [frames, vertices, 3]"
-        )
-    check_mesh(mesh.name, positions, faces)
-    if mesh.corner_uvs is not None and np.shape(mesh.corner_uvs) != (len(faces), 3, 2):
-        raise MeshError(
-            f"mesh {mesh.name} has texture coordinates {np.shape(mesh.corner_uvs)} for {len(faces)} faces; "
-            "they must be [faces, 3, 2]"
-        )
-    split, vertices, uvs = split_seams(faces, positions.shape[1], mesh.corner_uvs)
-    base, targets = _frame_attributes(builder, positions, faces, vertices, has_normals)
+def _add_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float) -> None:
+    """Add a mesh with its skin, its morph targets and their animation."""
+    positions, faces = np.asarray(mesh.positions, np.float32), np.asarray(mesh.faces)
+    base, offsets = positions[0], positions - positions[0]
+    if mesh.skin is not None:
+        base = np.asarray(mesh.rest_positions, np.float32)
+        needed = corrections(mesh.skin, base, positions, TOLERANCE)
+        offsets = np.zeros((len(positions), 0, 3)) if needed is None else needed
+    split, vertices, uvs = split_seams(faces, len(base), mesh.corner_uvs)
+    attributes = gltf.Attributes(
+        POSITION=builder.add_points(base[vertices]),
+        NORMAL=builder.add_vertices(vertex_normals(base, faces)[vertices], gltf.VEC3),
+    )
     if uvs is not None:
-        flipped = np.ascontiguousarray(uvs * [1, -1] + [0, 1], np.float32)  # glTF counts v from the top
-        base.TEXCOORD_0 = builder.add_accessor(flipped, gltf.VEC2, target=gltf.ARRAY_BUFFER)
+        flipped = uvs * [1, -1] + [0, 1]  # glTF counts v from the top
+        attributes.TEXCOORD_0 = builder.add_vertices(flipped.astype(np.float32), gltf.VEC2)
+    skin = None
+    if mesh.skin is not None:
+        _add_influences(builder, attributes, mesh.skin, vertices)
+        skin = _add_skin(builder, mesh.name, mesh.skin, timestep)
+    targets, weights = _add_targets(builder, base, offsets, faces, vertices)
     primitive = gltf.Primitive(
-        attributes=base,
+        attributes=attributes,
         indices=builder.add_indices(split, len(vertices)),
         material=builder.add_material(mesh.name, mesh.color),
         targets=targets,
     )
-    num_targets = len(targets)
-    index = append(
-        builder.document.meshes,
-        gltf.Mesh(
-            name=mesh.name,
-            primitives=[primitive],
-            weights=[0.0] * num_targets,
-            extras={"targetNames": [f"frame {frame}" for frame in range(1, num_targets + 1)]},
-        ),
+    names = {"targetNames": [f"shape {shape + 1}" for shape in range(len(targets))]}
+    content = gltf.Mesh(
+        name=mesh.name,
+        primitives=[primitive],
+        weights=[0.0] * len(targets),
+        extras=names if targets else {},
     )
-    node = builder.add_node(gltf.Node(name=mesh.name, mesh=index))
-    if num_targets:
-        # Key frame k switches target k - 1 fully on and all others off; between keys the blend is linear.
-        weights = np.eye(num_targets + 1, num_targets, k=-1, dtype=np.float32)
+    index = append(builder.document.meshes, content)
+    node = builder.add_node(gltf.Node(name=mesh.name, mesh=index, skin=skin))
+    if targets:
         values = builder.add_accessor(weights.reshape(-1), gltf.SCALAR)
-        builder.add_channel(node, "weights", builder.add_times(num_targets + 1, timestep), values)
+        builder.add_channel(node, "weights", builder.add_times(len(positions), timestep), values)
 
 
-def _frame_attributes(
-    builder: GlbBuilder, positions: np.ndarray, faces: np.ndarray, vertices: np.ndarray, has_normals: bool
-) -> tuple[gltf.Attributes, list[gltf.Attributes]]:
-    """Add the vertex data of every frame: the base attributes, then differences from them."""
-    normals = [vertex_normals(frame, faces)[vertices] for frame in positions] if has_normals else []
-    positions = positions[:, vertices]
-    base = gltf.Attributes(POSITION=builder.add_points(positions[0]))
-    if has_normals:
-        base.NORMAL = builder.add_accessor(normals[0], gltf.VEC3, target=gltf.ARRAY_BUFFER)
+def _add_targets(
+    builder: GlbBuilder, base: np.ndarray, offsets: np.ndarray, faces: np.ndarray, vertices: np.ndarray
+) -> tuple[list[gltf.Attributes], np.ndarray]:
+    """Add the principal shapes of offsets [frames, vertices, 3] and of the normals that go with them.
+
+    Returns:
+        The targets, and their weights [frames, targets], which are at most one: Blender's sliders end at ten.
+    """
+    if not offsets.size:
+        return [], np.zeros((len(offsets), 0), np.float32)
+    basis, shapes = principal_shapes(offsets, TOLERANCE)
+    rest = vertex_normals(base, faces)
+    normals = np.stack([vertex_normals(base + offset, faces) - rest for offset in offsets])
+    turned = np.tensordot(basis, normals, axes=(0, 0))
+    largest = np.abs(basis).max(0)
     targets = []
-    for frame in range(1, len(positions)):
-        target = gltf.Attributes(POSITION=builder.add_points(positions[frame] - positions[0]))
-        if has_normals:
-            difference = normals[frame] - normals[0]
-            target.NORMAL = builder.add_accessor(difference, gltf.VEC3, target=gltf.ARRAY_BUFFER)
-        targets.append(target)
-    return base, targets
+    for scale, shape, normal in zip(largest, shapes, turned, strict=True):
+        targets.append(
+            gltf.Attributes(
+                POSITION=builder.add_points((scale * shape).astype(np.float32)[vertices]),
+                NORMAL=builder.add_vertices((scale * normal).astype(np.float32)[vertices], gltf.VEC3),
+            )
+        )
+    return targets, (basis / largest).astype(np.float32)
+
+
+def _add_influences(
+    builder: GlbBuilder, attributes: gltf.Attributes, skin: Skin, vertices: np.ndarray
+) -> None:
+    """Add skin weights in as many sets of four as it takes to keep them all."""
+    weights, indices = (array[vertices] for array in influences(skin))
+    padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
+    dtype = np.uint8 if len(skin.parents) <= np.iinfo(np.uint8).max else np.uint16
+    for name, values in (
+        ("JOINTS", np.pad(indices, padding).astype(dtype)),
+        ("WEIGHTS", np.pad(weights, padding).astype(np.float32)),
+    ):
+        for number in range(values.shape[1] // _INFLUENCES_PER_SET):
+            part = values[:, number * _INFLUENCES_PER_SET : (number + 1) * _INFLUENCES_PER_SET]
+            setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
+
+
+def _add_skin(builder: GlbBuilder, name: str, skin: Skin, timestep: float) -> int:
+    """Add one animated node per joint under a common root, and return the skin that binds them."""
+    rotations, translations = local_motion(skin)
+    parents, first = list(skin.parents), len(builder.document.nodes)
+    for joint, label in enumerate(skin.joint_names):
+        node = gltf.Node(
+            name=label,
+            rotation=rotations[0, joint].tolist(),
+            translation=translations[0, joint].tolist(),
+            children=[first + child for child, parent in enumerate(parents) if parent == joint],
+        )
+        builder.add_node(node, is_root=False)
+    nodes = list(range(first, first + len(parents)))
+    roots = [node for node, parent in zip(nodes, parents, strict=True) if parent < 0]
+    armature = builder.add_node(gltf.Node(name=f"{name} joints", children=roots))
+    if len(rotations) > 1:
+        times = builder.add_times(len(rotations), timestep)
+        for joint, node in enumerate(nodes):
+            for path, kind, values in (
+                ("rotation", gltf.VEC4, rotations),
+                ("translation", gltf.VEC3, translations),
+            ):
+                builder.add_channel(node, path, times, builder.add_accessor(values[:, joint], kind))
+    bind = np.tile(np.eye(4, dtype=np.float32), (len(nodes), 1, 1))
+    bind[:, 3, :3] = -np.asarray(skin.joint_rest_positions)  # column-major: this row is the translation
+    inverse_bind = builder.add_accessor(bind.reshape(-1, 16), gltf.MAT4)
+    content = gltf.Skin(name=name, joints=nodes, skeleton=armature, inverseBindMatrices=inverse_bind)
+    return append(builder.document.skins, content)

@@ -1,11 +1,10 @@
-"""A binary glTF 2.0 document under construction: accessors, materials, nodes and animation channels."""
+"""Build a binary glTF 2.0 document: accessors, materials, nodes and animation channels."""
 
 from __future__ import annotations
 
 import numpy as np
 import pygltflib as gltf
 
-from eslr_jax.errors import MeshError
 from eslr_jax.io.color import srgb_to_linear
 
 _COMPONENT_TYPES = {
@@ -17,7 +16,7 @@ _COMPONENT_TYPES = {
 
 
 class GlbBuilder:
-    """A glTF document under construction, with the binary chunk that its accessors point into."""
+    """Collects the tables of a glTF document and the bytes that they point into."""
 
     def __init__(self) -> None:
         self._scene_nodes: list[int] = []
@@ -56,6 +55,10 @@ class GlbBuilder:
     def add_points(self, points: np.ndarray) -> int:
         """Add positions, or differences of positions, with the bounds that glTF asks of them."""
         return self.add_accessor(points, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
+
+    def add_vertices(self, values: np.ndarray, kind: str) -> int:
+        """Add other values per vertex, such as normals."""
+        return self.add_accessor(values, kind, target=gltf.ARRAY_BUFFER)
 
     def add_indices(self, faces: np.ndarray, num_vertices: int) -> int:
         """Add the triangles, in the smallest type that can't be taken for a primitive restart."""
@@ -111,82 +114,3 @@ def append(items: list, item: object) -> int:
     """Append and return the new item's index."""
     items.append(item)
     return len(items) - 1
-
-
-def check_mesh(name: str, positions: np.ndarray, faces: np.ndarray) -> None:
-    """Raise MeshError unless positions [..., vertices, 3] and faces [faces, 3] form a mesh."""
-    if (
-        positions.shape[-1] != 3
-        or positions.shape[-2] == 0
-        or faces.ndim != 2
-        or faces.shape[1:] != (3,)
-        or not len(faces)
-    ):
-        raise MeshError(
-            f"mesh {name} has positions of shape {positions.shape} and faces of shape {faces.shape}; "
-            "it needs [..., vertices, 3] and [faces, 3]"
-        )
-    if not np.isfinite(positions).all():
-        frame = int(np.argmin(np.isfinite(positions).reshape(len(positions), -1).all(1)))
-        raise MeshError(
-            f"mesh {name} has NaN or infinite positions, first at index {frame}; repair the simulation first"
-        )
-    if faces.min() < 0 or faces.max() >= positions.shape[-2]:
-        raise MeshError(f"mesh {name} has a face that names vertex {faces.max()} of {positions.shape[-2]}")
-
-
-def split_seams(
-    faces: np.ndarray, num_vertices: int, corner_uvs: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Give each vertex one texture coordinate, by splitting those on seams.
-
-    Args:
-        faces: Triangles, shape [faces, 3].
-        num_vertices: Number of vertices.
-        corner_uvs: Texture coordinate of every corner, shape [faces, 3, 2]; None leaves the mesh as it is.
-
-    Returns:
-        Faces; the old vertex of every vertex, the old ones first and in their order; and texture coordinates
-        [vertices, 2], zero for vertices without a face.
-    """
-    if corner_uvs is None:
-        return faces, np.arange(num_vertices), None
-    corners = faces.reshape(-1)
-    values = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
-    keys = np.concatenate([corners[:, None].astype(np.float64), values.astype(np.float64)], axis=1)
-    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    owner = unique[:, 0].astype(np.int64)
-    order = np.lexsort([first, owner])  # of each vertex the coordinate that comes first in the file
-    is_first = np.ones(len(order), bool)
-    is_first[1:] = owner[order][1:] != owner[order][:-1]
-    place = np.empty(len(order), np.int64)
-    place[order[is_first]] = owner[order[is_first]]
-    extra = order[~is_first]
-    extra = extra[np.argsort(first[extra], kind="stable")]
-    place[extra] = num_vertices + np.arange(len(extra))
-    uvs = np.zeros((num_vertices + len(extra), 2), np.float32)
-    uvs[place] = unique[:, 1:]
-    return place[inverse.ravel()].reshape(-1, 3), np.concatenate([np.arange(num_vertices), owner[extra]]), uvs
-
-
-def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the area-weighted face normals around each vertex.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
-
-    Returns:
-        Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
-    """
-    corners = positions[faces].astype(np.float64)
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = np.stack(
-        [
-            np.bincount(faces.reshape(-1), np.repeat(face_normals[:, axis], 3), minlength=len(positions))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0]).astype(np.float32)

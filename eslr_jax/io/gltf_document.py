@@ -1,7 +1,7 @@
-"""A glTF 2.0 file as read: its JSON tables, arrays behind accessors, nodes in world space, key frames.
+"""Read the parts of a glTF 2.0 file: JSON tables, arrays, triangles, nodes in world space, key frames.
 
-The tables stay plain dicts: a damaged file must fail with a named error, so each value is checked where it is
-used. Source: Khronos, glTF 2.0 specification.
+Tables stay plain dicts whose values are checked where they are used: a damaged file ends in a named error.
+Source: Khronos, glTF 2.0 specification.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from eslr_jax.errors import AssetError
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+TRIANGLES = 4  # mode of a primitive
 _MAX_BLANK = 1 << 22  # elements of an accessor that has no data behind it
 _READ_EXTENSIONS = {  # that change nothing here, or are read
     "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform", "KHR_materials_specular",
@@ -74,18 +75,14 @@ class GltfDocument:
         return AssetError(f"{self.path} {cause}; export it again")
 
     def item(self, table: str, index: Any) -> dict[str, Any]:
-        """Return an entry of a table.
-
-        Raises:
-            AssetError: There is none of this index.
-        """
+        """Return an entry of a table; raise AssetError if there is none of this index."""
         entries = self.tables.get(table, [])
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
             raise self.fail(f"names {table} {str(index)[:20]}, which it doesn't have")
         return _table(entries[index])
 
     def items(self, table: str) -> list[dict[str, Any]]:
-        """Return all entries of a table."""
+        """Return all entries of a table; none if the file lacks it."""
         entries = self.tables.get(table, [])
         return [_table(entry) for entry in entries] if isinstance(entries, list) else []
 
@@ -114,9 +111,9 @@ class GltfDocument:
         return [self._buffer(index) for index in range(len(self.items("buffers")))]
 
     def array(self, index: Any) -> np.ndarray:
-        """Return an accessor's values, [count, components] float64, or [count] for scalars.
+        """Return an accessor's values as float64, [count, components], or [count] for scalars.
 
-        Integers of a normalised accessor are divided by their largest value, others are whole floats.
+        Integers of a normalised accessor are divided by their largest value.
         """
         accessor = self.item("accessors", index)
         dtype, width = _TYPES.get(accessor.get("componentType", 0)), _WIDTHS.get(accessor.get("type", ""))
@@ -131,8 +128,20 @@ class GltfDocument:
             result = np.maximum(result / np.iinfo(values.dtype).max, -1.0)
         return result[:, 0] if width == 1 else result
 
+    def triangles(self, primitive: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions [vertices, 3] and triangles [faces, 3] of a mesh primitive."""
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            raise self.fail("has a mesh of strips or lines, not triangles")
+        points = self.array(_table(primitive.get("attributes")).get("POSITION"))
+        if points.shape[1:] != (3,):
+            raise self.fail("has positions that are no points")
+        faces = self.array(primitive["indices"]) if "indices" in primitive else np.arange(len(points))
+        if faces.ndim != 1 or len(faces) % 3 or faces.max() >= len(points):
+            raise self.fail("has faces that are no triangles of its vertices")
+        return points, faces.reshape(-1, 3).astype(np.int64)
+
     def _values(self, view_of: dict[str, Any], dtype: np.dtype, width: int, count: int) -> np.ndarray:
-        """Return the raw values that an accessor or a sparse part points to, [count, width]."""
+        """Return the raw values of an accessor or of a sparse part, [count, width]."""
         if "bufferView" not in view_of:
             if count > _MAX_BLANK:
                 raise self.fail(f"has {count} values without data")
@@ -161,7 +170,7 @@ class GltfDocument:
     def _overwrite(
         self, values: np.ndarray, sparse: dict[str, Any], dtype: np.dtype, width: int
     ) -> np.ndarray:
-        """Return values with those of a sparse accessor put in."""
+        """Return values overwritten by those of a sparse accessor."""
         count = sparse.get("count")
         if type(count) is not int or not 0 < count <= len(values):
             raise self.fail("has an impossible sparse accessor")
@@ -219,10 +228,10 @@ class GltfDocument:
         )
 
     def world_matrices(self, animated: dict[tuple[int, str], np.ndarray], num_frames: int) -> np.ndarray:
-        """Return every node's matrix, [frames, nodes, 4, 4].
+        """Return the matrix from every node to the world, [frames, nodes, 4, 4].
 
         Args:
-            animated: Values of (node, path), shape [frames, 3 or 4]; other nodes keep their own.
+            animated: Values by node and path, shape [frames, 3 or 4]; other nodes are at rest.
             num_frames: Number of frames.
         """
         result = np.tile(np.eye(4), (num_frames, len(self.parents), 1, 1))
@@ -237,7 +246,7 @@ class GltfDocument:
         return result
 
     def key_frames(self, animation: dict[str, Any]) -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
-        """Return (node, path, interpolation, times [s], values) of an animation's channels that move nodes."""
+        """Return (node, path, interpolation, times [s], values) of each channel that moves a node."""
         samplers = animation.get("samplers", [])
         result = []
         for entry in animation.get("channels", []):
@@ -267,14 +276,17 @@ class GltfDocument:
 
 
 def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return key frames sampled at other times, held before the first and after the last.
+    """Sample key frames at given times; before the first key and after the last one values are constant.
 
     Args:
         path: "rotation" (quaternions x, y, z, w), "translation" or "scale".
         kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
         times: Times of the keys [s], ascending, shape [keys].
-        values: Shape [keys, components], or [3 keys, components] for cubic splines.
-        at: Times wanted [s], shape [samples].
+        values: Values of the keys, shape [keys, components], or [3 keys, components] for cubic splines.
+        at: Times of the samples [s], shape [samples].
+
+    Returns:
+        Values, shape [samples, components].
 
     Source: glTF 2.0, appendix C.
     """
@@ -303,7 +315,7 @@ def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at:
 
 
 def _table(value: Any) -> dict[str, Any]:
-    """Return a JSON object, empty for anything else."""
+    """Return a JSON object; an empty one for anything else."""
     return value if isinstance(value, dict) else {}
 
 

@@ -1,7 +1,7 @@
-"""Skinned characters and skeleton animations of glTF 2.0 files (.gltf, .glb, .vrm).
+"""Read skinned characters and their animations from glTF 2.0 files (.gltf, .glb, .vrm).
 
-The rest pose is the bind pose. A skin's inverse bind matrices give it in a space of the mesh's own; which
-matrix takes that space to the world is told by the nodes, and exporters disagree on which: see `_bind_space`.
+The rest pose is the bind pose. The inverse bind matrices of a skin tell it in the mesh's own space. Exporters
+disagree on how that space lies in the world: see `_bind_space`.
 """
 
 from __future__ import annotations
@@ -28,25 +28,18 @@ from eslr_jax.io.skeleton import (
 )
 
 GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
-_TRIANGLES = 4  # primitive mode
 _SCALE_TOLERANCE = 0.01  # by which a bind space may differ in size from the posed skin
 _SAME_SPACE = 1e-4  # relative difference of joints that show the bind pose, in float32
 
 
 @dataclasses.dataclass
 class _Joints:
-    """The joints of all skins of a file, in world space at rest."""
+    """The joints of all skins of a file at rest, in world space."""
 
     nodes: list[int]
     rest_frames: np.ndarray  # [joints, 4, 4]
     skeleton: Skeleton
     spaces: dict[int, np.ndarray]  # skin -> matrix from its mesh space to the world
-
-
-def has_gltf_skin(path: str | Path) -> bool:
-    """Tell whether a glTF file holds a skinned character."""
-    with parsing(path, "body") as file:
-        return bool(GltfDocument(file).items("skins"))
 
 
 def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
@@ -59,14 +52,14 @@ def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
     """Read a skinned character.
 
     Args:
-        path: .gltf, .glb or .vrm file.
+        path: Path of a .gltf, .glb or .vrm file.
         meshes: Names of the meshes, or of their nodes, that make up the body; all skinned ones if empty.
 
     Returns:
-        The character in its bind pose, in world axes; its vertices as the file has them.
+        The character in its bind pose, in world axes, with the vertices of the file.
 
     Raises:
-        AssetError: The file is missing, damaged, has no skinned mesh, or not the meshes that are named.
+        AssetError: The file is missing or damaged, or it lacks a skinned mesh that is named.
     """
     with parsing(path, "body") as file:
         document = GltfDocument(file)
@@ -102,15 +95,15 @@ def read_gltf_motion(path: str | Path, clip: str = "") -> SkeletonMotion:
     """Read an animation of a skinned character's joints.
 
     Args:
-        path: .gltf, .glb or .vrm file.
-        clip: Name of the animation; not needed where there is one.
+        path: Path of a .gltf, .glb or .vrm file.
+        clip: Name of the animation; not needed if there is only one.
 
     Returns:
         The motion, sampled at the rate of its densest keys.
 
     Raises:
-        AssetError: The file is missing, damaged, or has no skin.
-        MotionError: It has no such animation, or the animation moves no joint.
+        AssetError: The file is missing or damaged, or it has no skin.
+        MotionError: The file has no such animation, or the animation moves nothing.
     """
     with parsing(path, "motion") as file:
         document = GltfDocument(file)
@@ -140,7 +133,7 @@ def read_gltf_motion(path: str | Path, clip: str = "") -> SkeletonMotion:
 
 
 def _clip_names(document: GltfDocument) -> tuple[str, ...]:
-    """Names of the animations; those without one are numbered."""
+    """Return the names of the animations; those without a name are numbered."""
     entries = document.items("animations")
     return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
 
@@ -226,9 +219,9 @@ def _bind_space(
 ) -> np.ndarray:
     """Return the matrix that takes a skin's mesh space to the world in the bind pose.
 
-    In the pose that the nodes show, joint j takes the mesh space to the world by G_j B_j. Where they show the
-    bind pose these agree, and are the answer. Else it is the node of the mesh or the parent of the skeleton,
-    whichever has the right size and is nearer to the joints; failing both, the skeleton's first joint.
+    In the pose of the nodes, joint j takes the mesh space to the world by G_j B_j. If the nodes are in the bind
+    pose, these matrices agree and are the answer. Otherwise the answer is the matrix of the mesh's node or of the
+    skeleton's parent, whichever has the right size and is nearer to the joints; else that of the first joint.
     """
     posed = world[nodes] @ bind
     size = np.cbrt(abs(np.linalg.det(posed[0, :3, :3])))
@@ -261,15 +254,7 @@ def _read_node(
         attributes = primitive.get("attributes", {})
         if "JOINTS_0" not in attributes:
             continue
-        if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
-            raise document.fail("has a body of strips or lines, not triangles")
-        points = document.array(attributes.get("POSITION"))
-        if points.shape[1:] != (3,):
-            raise document.fail("has positions that are no points")
-        faces = document.array(primitive["indices"]) if "indices" in primitive else np.arange(len(points))
-        if faces.ndim != 1 or len(faces) % 3 or faces.max() >= len(points):
-            raise document.fail("has faces that are no triangles of its vertices")
-        faces = faces.reshape(-1, 3).astype(np.int64)
+        points, faces = document.triangles(primitive)
         if np.linalg.det(space[:3, :3]) < 0:
             faces = faces[:, ::-1]
         weights, local = _read_weights(document, attributes, len(points))

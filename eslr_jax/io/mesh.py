@@ -1,32 +1,28 @@
-"""Triangle meshes of a user: OBJ, PLY, STL, glTF binary and NumPy archives, as the file has them."""
+"""Read triangle meshes in the units and axes of their files: OBJ, PLY, STL, glTF binary and NumPy archives."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
-import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from trimesh import load_scene
 from trimesh.exchange.ply import load_ply
 from trimesh.exchange.stl import load_stl
 
 from eslr_jax.errors import AssetError, MeshError
+from eslr_jax.io.gltf_document import TRIANGLES, GltfDocument
 from eslr_jax.io.npz import read_arrays
 from eslr_jax.io.parsing import parsing
 
 POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an archive, first match
-MAX_FILE_BYTES = 1 << 30  # of a mesh; no garment comes near
+MAX_FILE_BYTES = 1 << 30  # far more than any garment has
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshFile:
-    """A mesh as its file has it, in the file's units and axes."""
+    """A mesh in the units and axes of its file."""
 
     positions: Float[np.ndarray, "vertices 3"]  # float64
     faces: Int[np.ndarray, "faces 3"]  # int64, unvalidated
@@ -42,14 +38,16 @@ def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np
 
 
 def read_mesh_file(path: str | Path) -> MeshFile:
-    """Read a mesh without repairing it; polygons are cut into triangles.
+    """Read a mesh without repairing it.
 
-    OBJ, PLY and NPZ keep their vertices and order. STL can't share a vertex between faces, and GLB splits
-    vertices where normals or texture coordinates differ, so there vertices at bit-identical positions
-    become one.
+    Polygons are cut into triangles. OBJ, PLY and NPZ keep their vertices and order. In STL and GLB, which store a
+    vertex more than once, vertices at bit-identical positions become one.
 
     Args:
-        path: A .obj, .ply, .stl, .glb or .npz file.
+        path: Path of a .obj, .ply, .stl, .glb or .npz file.
+
+    Returns:
+        The mesh.
 
     Raises:
         AssetError: The file is missing, unreadable or of an unknown kind.
@@ -68,7 +66,7 @@ def read_mesh_file(path: str | Path) -> MeshFile:
 
 
 def _read_obj(path: Path) -> MeshFile:
-    """Read vertices, faces, texture coordinates and part names of an OBJ file; normals are skipped."""
+    """Read vertices, faces, texture coordinates and part names of an OBJ file, without normals."""
     positions: list[list[float]] = []
     uvs: list[list[float]] = []
     polygons: list[list[tuple[int, int]]] = []  # corners as (vertex, texture coordinate or -1)
@@ -104,21 +102,21 @@ def _read_obj(path: Path) -> MeshFile:
 
 
 def _corner(word: str, num_positions: int, num_uvs: int) -> tuple[int, int]:
-    """Read v, v/vt, v//vn or v/vt/vn; OBJ counts from one, negative indices back from the last read."""
+    """Return the vertex and texture coordinate of v, v/vt, v//vn or v/vt/vn, counted from zero; -1 is none."""
     vertex, _, rest = word.partition("/")
     uv = rest.partition("/")[0]
     return _from_zero(int(vertex), num_positions), _from_zero(int(uv), num_uvs) if uv else -1
 
 
 def _from_zero(index: int, count: int) -> int:
-    """Turn an OBJ index into one that counts from zero."""
+    """Return an OBJ index counted from zero; OBJ counts from one, and negative ones back from the last."""
     return index - 1 if index > 0 else count + index
 
 
 def _cut_polygons(
     points: np.ndarray, polygons: list[list[tuple[int, int]]]
 ) -> tuple[list[list[tuple[int, int]]], list[int]]:
-    """Cut polygons into triangles, quads along their shorter diagonal, and return whose triangle each is."""
+    """Cut polygons into triangles, quads along their shorter diagonal; return also each triangle's polygon."""
     triangles, owner = [], []
     for k, polygon in enumerate(polygons):
         if len(polygon) == 4:
@@ -134,7 +132,7 @@ def _cut_polygons(
 
 
 def _parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return the part of every face, and names, from the first way of naming that tells faces apart."""
+    """Return each face's part, and the names, from the first list of names that tells faces apart."""
     for names in choices:
         distinct = tuple(dict.fromkeys(names))
         if len(distinct) > 1:
@@ -158,7 +156,7 @@ def _read_ply(path: Path) -> MeshFile:
 
 
 def _check_ply_header(path: Path) -> None:
-    """Raise on element counts that the file has no bytes for: the parser would allocate them."""
+    """Raise on an element count that the file is too small for: the parser would allocate it."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         for line in stream.read(1 << 16).partition(b"end_header")[0].splitlines():
@@ -168,68 +166,48 @@ def _check_ply_header(path: Path) -> None:
 
 
 def _read_stl(path: Path) -> MeshFile:
-    """Read an STL file and share the corners that have bit-identical positions."""
+    """Read an STL file and share its vertices."""
     with path.open("rb") as stream:
         content = load_stl(stream)
     content = next(iter(content.get("geometry", {}).values()), content)  # text files nest their solids
-    return MeshFile(*_share_vertices(np.asarray(content["vertices"]), np.asarray(content["faces"], np.int64)))
+    positions = np.asarray(content["vertices"]).reshape(-1, 3)
+    kept, place = shared_vertices(positions)
+    return MeshFile(positions[kept], place[np.asarray(content["faces"], np.int64).reshape(-1, 3)])
 
 
 def _read_glb(path: Path) -> MeshFile:
-    """Read all meshes of a glTF binary into one, in the scene's frame, sharing split vertices."""
-    scene = load_scene(_geometry_only(path), file_type="glb", process=False)
-    names, meshes = [], []
-    for name, mesh in scene.geometry.items():  # in the file's order; the graph's is arbitrary
-        for node in sorted(scene.graph.geometry_nodes.get(name, ())) if hasattr(mesh, "faces") else ():
-            names.append(str(name))
-            meshes.append(mesh.copy().apply_transform(scene.graph[node][0]))
-    if not meshes:
+    """Read all triangles of a glTF binary into one mesh, in the scene's frame, and share split vertices."""
+    document = GltfDocument(path)
+    world = document.world_matrices({}, 1)[0]
+    positions, corners, uvs, names, materials, count = [], [], [], [], [], 0
+    for index, node in enumerate(document.items("nodes")):
+        mesh = document.item("meshes", node["mesh"]) if "mesh" in node else {}
+        for primitive in mesh.get("primitives", []):
+            if primitive.get("mode", TRIANGLES) < TRIANGLES:
+                continue  # points and lines
+            points, faces = document.triangles(primitive)
+            positions.append(points @ world[index, :3, :3].T + world[index, :3, 3])
+            corners.append(faces + count)
+            count += len(points)
+            uv = primitive["attributes"].get("TEXCOORD_0")
+            uvs.append(None if uv is None else document.array(uv) * [1, -1] + [0, 1])  # counted from the top
+            material = document.items("materials")[primitive["material"]] if "material" in primitive else {}
+            names += [str(mesh.get("name", f"mesh{node['mesh']}"))] * len(faces)
+            materials += [str(material.get("name", ""))] * len(faces)
+    if not positions:
         return MeshFile(np.empty((0, 3)), np.empty((0, 3), np.int64))
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    corners = np.concatenate([m.faces + offset for m, offset in zip(meshes, offsets[:-1], strict=True)])
-    uvs = [getattr(mesh.visual, "uv", None) for mesh in meshes]
-    has_uvs = all(
-        uv is not None and len(uv) == len(mesh.vertices) for uv, mesh in zip(uvs, meshes, strict=True)
-    )
-    positions = np.concatenate([np.asarray(mesh.vertices) for mesh in meshes])
-    face_parts, part_names = _parts(
-        [[name for name, mesh in zip(names, meshes, strict=True) for _ in range(len(mesh.faces))]]
-    )
+    known = [
+        uv for uv, points in zip(uvs, positions, strict=True) if uv is not None and len(uv) == len(points)
+    ]
+    points, faces = np.concatenate(positions), np.concatenate(corners)
+    kept, place = shared_vertices(points)
+    face_parts, part_names = _parts([names, materials])
     return MeshFile(
-        *_share_vertices(positions, corners.astype(np.int64)),
-        corner_uvs=np.concatenate([np.asarray(uv, np.float64) for uv in uvs])[corners] if has_uvs else None,
+        points[kept],
+        place[faces],
+        corner_uvs=np.concatenate(known)[faces] if len(known) == len(uvs) else None,
         face_parts=face_parts,
         part_names=part_names,
-    )
-
-
-def _geometry_only(path: Path) -> io.BytesIO:
-    """Return a glTF binary without pictures: one plain material, so that texture coordinates are kept.
-
-    Raises:
-        ValueError: It is damaged, refers to other files, or counts more than its bytes hold.
-    """
-    data = path.read_bytes()
-    magic, version, length, chunk, kind = struct.unpack_from("<4sIIII", data)
-    if magic != b"glTF" or kind != 0x4E4F534A or length > len(data) or 20 + chunk > len(data):
-        raise ValueError("no glTF binary, or truncated")
-    content: dict[str, Any] = json.loads(data[20 : 20 + chunk])
-    for accessor in content.get("accessors", []):
-        if not 0 <= accessor["count"] <= len(data) or "bufferView" not in accessor:
-            raise ValueError("an accessor counts more than the file holds")
-    if any("uri" in buffer for buffer in content.get("buffers", [])):
-        raise ValueError("it refers to other files; embed them")
-    for key in ("images", "textures", "samplers", "animations"):
-        content.pop(key, None)
-    content["materials"] = [{}]
-    for mesh in content.get("meshes", []):
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + chunk : length]
-    return io.BytesIO(
-        struct.pack("<4sIIII", magic, version, 20 + len(text) + len(rest), len(text), kind) + text + rest
     )
 
 
@@ -245,14 +223,19 @@ def _read_npz(path: Path) -> MeshFile:
     return MeshFile(arrays[key], arrays["faces"])
 
 
-def _share_vertices(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mesh with bit-identical positions made one vertex, in order of first appearance."""
-    if not len(positions):
-        return positions.reshape(-1, 3), faces.reshape(-1, 3)
-    _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+def shared_vertices(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find vertices at bit-identical positions, which exporters split where normals or textures differ.
+
+    Args:
+        positions: Vertex positions, shape [vertices, 3].
+
+    Returns:
+        Indices of the vertices to keep, in their order, and the place of every vertex among them.
+    """
+    _, first, inverse = np.unique(positions.reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return positions[np.sort(first)], rank[inverse.ravel()][faces]
+    return np.sort(first), rank[inverse.ravel()]
 
 
 _READERS: dict[str, Callable[[Path], MeshFile]] = {

@@ -1,22 +1,22 @@
-"""A mesh of fixed topology in motion: an npz archive, or a folder with one OBJ or PLY file a frame."""
+"""Read a mesh that moves and keeps its faces: an npz archive, or a folder with one OBJ or PLY file per frame."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.mesh import POSITION_KEYS, read_mesh
-from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.motion import read_number
+from eslr_jax.io.npz import check_layout, read_arrays
 from eslr_jax.io.skeleton import MAX_FRAMES
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
 SUFFIXES = (".obj", ".ply")
-DEFAULT_FPS = 30.0  # of folders, whose files have no clock
+DEFAULT_FPS = 30.0  # [1/s], where the files tell no frame rate
 _POSITION_KEYS = (*POSITION_KEYS, "verts")  # the last is HOOD's
 
 
@@ -33,25 +33,14 @@ class MeshSequence:
         """Check the arrays.
 
         Raises:
-            MeshError: There are no frames, vertices or faces, or values that are not finite.
+            MeshError: The arrays don't form a moving mesh, or a value is not finite.
             MotionError: The frame rate is impossible.
         """
-        if self.positions.ndim != 3 or self.positions.shape[2] != 3 or 0 in self.positions.shape:
-            raise MeshError(f"{self.name}: positions {self.positions.shape}; expected [frames, vertices, 3]")
-        if (
-            self.faces.ndim != 2
-            or self.faces.shape[1] != 3
-            or self.faces.dtype.kind not in "iu"
-            or not len(self.faces)
-        ):
-            raise MeshError(
-                f"{self.name}: faces {self.faces.shape} of {self.faces.dtype}; expected [faces, 3]"
-            )
-        count = self.positions.shape[1]
-        if self.faces.min() < 0 or self.faces.max() >= count:
-            raise MeshError(
-                f"{self.name}: a face names vertex {self.faces.max()} of {count}; export it again"
-            )
+        arrays = {"positions": self.positions, "faces": self.faces}
+        layout = {"positions": ("f", "frames vertices 3"), "faces": ("iu", "faces 3", "vertices")}
+        check_layout(arrays, layout, what=self.name, remedy="export it again", error=MeshError)
+        if 0 in self.positions.shape or not len(self.faces):
+            raise MeshError(f"{self.name} has no frames, vertices or faces; export it again")
         is_bad = ~np.isfinite(self.positions).all(axis=(1, 2))
         if is_bad.any():
             raise MeshError(f"{self.name}: frame {np.argmax(is_bad)} is not finite; cut or repair it")
@@ -63,17 +52,17 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
     """Read a mesh in motion.
 
     Args:
-        path: A folder of OBJ or PLY files, in the order of the numbers in their names; or an .npz with `faces`,
-            positions [frames, vertices, 3] under one of rest_positions, positions, vertices or verts, and if it
-            has it `fps` or `timestep`.
-        fps: Frames per second; by default the archive's own, or 30.
+        path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
+            of an .npz with `faces` and positions [frames, vertices, 3], named rest_positions, positions, vertices
+            or verts, and optionally `fps` or `timestep`.
+        fps: Frame rate [1/s]; by default the archive's own, or 30.
 
     Returns:
-        Positions in metres, Y up, as the files have them.
+        The mesh in motion; positions as in the files, which must be in metres with Y up.
 
     Raises:
         AssetError: The path or one of its files can't be read.
-        MeshError: The topology changes, or the mesh is none.
+        MeshError: The faces change, or the arrays form no mesh.
         MotionError: The frame rate is impossible.
     """
     path = Path(path)
@@ -89,15 +78,15 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         raise MeshError(f"{path}: {key} of type {positions.dtype}; expected numbers")
     rate = fps
     if rate is None and "fps" in arrays:
-        rate = _scalar(path, arrays["fps"])
+        rate = read_number(arrays["fps"], f"{path}: fps")
     elif rate is None and "timestep" in arrays:
-        step = _scalar(path, arrays["timestep"])
+        step = read_number(arrays["timestep"], f"{path}: timestep")
         rate = 1.0 / step if step > 0 else 0.0
     return MeshSequence(path.name, positions.astype(np.float64), faces, DEFAULT_FPS if rate is None else rate)
 
 
 def is_mesh_sequence(path: str | Path) -> bool:
-    """Tell a folder, or an archive of positions over time, from other bodies."""
+    """Tell whether a path is a folder or an archive of positions over time, and not a rigged body."""
     path = Path(path)
     if path.is_dir():
         return True
@@ -107,15 +96,8 @@ def is_mesh_sequence(path: str | Path) -> bool:
     return any(array.ndim == 3 for array in arrays.values())
 
 
-def _scalar(path: Path, array: np.ndarray) -> float:
-    """Return the one number that an array holds."""
-    if array.size != 1 or array.dtype.kind not in "fiu":
-        raise MotionError(f"{path}: its frame rate is {array.dtype} {array.shape}; expected a number")
-    return float(array.ravel()[0])
-
-
 def _read_folder(folder: Path, fps: float) -> MeshSequence:
-    """Read one mesh file a frame."""
+    """Read one mesh file per frame."""
     files = sorted(
         (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()),
         key=lambda file: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)],
@@ -143,7 +125,7 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
 
 
 def frame_name(stem: str, frame: int, num_frames: int, suffix: str) -> str:
-    """Return a file name whose alphabetical order is that of the frames."""
+    """Return a file name; names sort alphabetically in the order of the frames."""
     digits = max(4, len(str(max(num_frames - 1, 0))))
     return f"{stem}_{frame:0{digits}d}{suffix}"
 
@@ -155,25 +137,21 @@ def obj_text(
     *,
     uvs: np.ndarray | None = None,
     uv_faces: np.ndarray | None = None,
-    groups: Sequence[str] = (),
 ) -> str:
-    """Return a mesh as the text of an OBJ file; positions to nine digits, which float32 survives exactly.
+    """Return the text of an OBJ file; nine digits keep float32 positions exactly.
 
     Args:
-        name: Of the object.
-        positions: [vertices, 3] [m].
-        faces: [faces, 3].
+        name: Name of the object.
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
         uvs: Texture coordinates, shape [uvs, 2].
-        uv_faces: Texture coordinate of every corner, shape [faces, 3].
-        groups: Lines to put before the faces, such as "usemtl denim".
+        uv_faces: Row of `uvs` for each corner, shape [faces, 3].
     """
     lines = [f"o {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(positions, np.float64))]
     if uvs is not None and uv_faces is not None:
         lines += [f"vt {u:.9g} {v:.9g}" for u, v in np.asarray(uvs, np.float64)]
-        lines += list(groups)
         corners = zip((np.asarray(faces) + 1).tolist(), (np.asarray(uv_faces) + 1).tolist(), strict=True)
         lines += ["f " + " ".join(f"{v}/{t}" for v, t in zip(*corner, strict=True)) for corner in corners]
     else:
-        lines += list(groups)
         lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(faces) + 1).tolist()]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""One named error for every way in which a file can be broken."""
+"""Turn every way in which a file can be broken into one named error."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def parsing(
     form: str = "",
     remedy: str = "export it again",
 ) -> Iterator[Path]:
-    """Check that a file is there, and turn whatever its parser raises into one named error.
+    """Check that a file exists, and turn whatever its parser raises into one named error.
 
     Args:
-        path: The file.
-        content: What the file should be, for messages, e.g. "motion".
-        max_bytes: Largest file accepted [bytes].
-        form: What it can't be read as, where its suffix does not say so, e.g. " as a pickle".
-        remedy: What to do about a damaged file.
+        path: Path of the file.
+        content: What the file should hold, for messages, e.g. "motion".
+        max_bytes: Size of the largest file accepted [bytes].
+        form: Format for messages where the suffix does not tell it, e.g. " as a pickle".
+        remedy: What the user should do about a damaged file.
 
     Yields:
         The path.
@@ -55,6 +55,6 @@ def parsing(
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of an error's text, cut short, or its type when it has none."""
+    """Return the first line of an error's text, cut short, or the error's type if it has no text."""
     lines = str(error).splitlines()
     return lines[0][:200] if lines and lines[0].strip() else type(error).__name__

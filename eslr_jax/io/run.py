@@ -1,4 +1,4 @@
-"""The folder that `eslr simulate` writes: trajectory, garment and report."""
+"""Read the folder that `eslr simulate` writes: trajectory, garment and report."""
 
 from __future__ import annotations
 
@@ -18,15 +18,21 @@ class Run:
 
     name: str
     trajectory: TrajectoryFile
-    garment: GarmentFile | None  # None where only the trajectory is left: then lengths are those of frame 0
-    report: dict[str, Any]
+    garment: GarmentFile | None  # None without garment.npz: then frame 0 is the rest shape
+    report: dict[str, Any]  # of report.json; empty without it
 
 
 def read_run(path: str | Path) -> Run:
-    """Read a run's folder, or a trajectory alone.
+    """Read the folder of a run, or a trajectory and what lies beside it.
+
+    Args:
+        path: Path of the folder, or of a trajectory file.
+
+    Returns:
+        The run.
 
     Raises:
-        AssetError: There is no trajectory, a file is damaged, or the garment is another one.
+        AssetError: There is no trajectory, a file is damaged, or the garment is not the trajectory's.
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent

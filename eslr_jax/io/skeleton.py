@@ -1,6 +1,6 @@
-"""What the readers of bodies and motions hand on: a rigged mesh, and a skeleton that moves.
+"""What readers of bodies and motions return: a rigged mesh, and a skeleton that moves.
 
-Axes are right-handed, Y up, metres where the format has a unit. The rest pose of a file is its bind pose.
+Axes are right-handed, Y up, in metres where the format has a unit. The rest pose of a file is its bind pose.
 """
 
 from __future__ import annotations
@@ -36,13 +36,11 @@ class SkeletonMotion:
 
     name: str
     skeleton: Skeleton
-    rotations: (
-        np.ndarray
-    )  # how each joint has turned since the rest pose, in world axes [frames, joints, 3, 3]
+    rotations: np.ndarray  # in world axes since the rest pose [frames, joints, 3, 3]
     positions: np.ndarray  # [frames, joints, 3]
-    fps: float
-    # None where the format holds a skeleton. Otherwise the skeleton only stands for the body's own, whose root at
-    # rest, turned by this matrix from the file's axes to ours, is to be added to the positions.
+    fps: float  # [1/s]
+    # Only for formats without a skeleton, whose positions are relative to the root of the body's own rest pose:
+    # the matrix that turns that root from the file's axes to ours before it is added.
     root_axes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -88,15 +86,15 @@ def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[li
     """Put parents before children, and every joint under one root.
 
     Args:
-        names: Joints, for messages.
-        parents: Parent of each; -1 is a root. Roots beyond the first become its children.
+        names: Names of the joints, for messages.
+        parents: Parent of each joint; -1 is a root. Further roots become children of the first one.
         what: What messages call the file.
 
     Returns:
         The joints in their new order, and the parent of each in that order.
 
     Raises:
-        AssetError: There are no joints, too many, or a cycle.
+        AssetError: There are no joints, too many joints, or a cycle.
     """
     if not 0 < len(names) <= MAX_JOINTS:
         raise AssetError(f"{what} has {len(names)} joints; expected 1 to {MAX_JOINTS}")
@@ -120,7 +118,7 @@ def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[li
 
 
 def unique_names(names: list[str]) -> list[str]:
-    """Number repeated names: hand, hand.2, ..."""
+    """Return distinct names: a repeated one gets a number, as in hand, hand.2."""
     seen: dict[str, int] = {}
     result = []
     for name in names:
@@ -130,7 +128,7 @@ def unique_names(names: list[str]) -> list[str]:
 
 
 def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to each matrix, [..., 3, 3]: scale and shear are dropped."""
+    """Return the rotation nearest to each matrix [..., 3, 3], without its scale and shear."""
     left, _, right = np.linalg.svd(matrices)
     sign = np.sign(np.linalg.det(left @ right))
     left[..., :, 2] *= np.where(sign == 0, 1.0, sign)[..., None]
@@ -138,7 +136,15 @@ def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
 
 
 def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-    """Multiply local rotation matrices [frames, joints, 3, 3] down the chain."""
+    """Multiply local rotations down the chain of joints.
+
+    Args:
+        local: Rotations relative to the parent, shape [frames, joints, 3, 3].
+        parents: Parent of each joint, which comes before it; -1 is a root.
+
+    Returns:
+        Rotations in world axes, shape [frames, joints, 3, 3].
+    """
     result = np.array(local, np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -146,25 +152,76 @@ def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
     return result
 
 
-def chain_positions(rotations: np.ndarray, root: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return posed joints [frames, joints, 3] of rigid bones.
+def chain_offsets(rotations: np.ndarray, offsets: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
+    """Add offsets, turned as the parents have turned, down the chain of joints.
 
     Args:
-        rotations: Global rotations since the rest pose, shape [frames, joints, 3, 3].
-        root: Position of joint 0, shape [frames, 3].
-        skeleton: Joints at rest.
+        rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
+        offsets: Position of each joint relative to its parent in the rest pose's axes, shape [frames, joints, 3].
+        parents: Parent of each joint, which comes before it; -1 is a root.
+
+    Returns:
+        Joint positions, shape [frames, joints, 3].
     """
-    result = np.empty(rotations.shape[:3])
-    for joint, parent in enumerate(skeleton.parents):
-        if parent < 0:
-            result[:, joint] = root
-        else:
-            bone = skeleton.rest_positions[joint] - skeleton.rest_positions[parent]
-            result[:, joint] = result[:, parent] + rotations[:, parent] @ bone
+    result = np.array(offsets, np.float64)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            moved = np.einsum("tab,tb->ta", rotations[:, parent], result[:, joint])
+            result[:, joint] = result[:, parent] + moved
     return result
 
 
+def chain_positions(rotations: np.ndarray, root: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Return the posed joints of rigid bones.
+
+    Args:
+        rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
+        root: Position of joint 0, shape [frames, 3].
+        skeleton: Joints at rest.
+
+    Returns:
+        Joint positions, shape [frames, joints, 3].
+    """
+    rest = skeleton.rest_positions
+    offsets = np.tile(rest - rest[np.maximum(skeleton.parents, 0)], (len(rotations), 1, 1))
+    offsets[:, np.asarray(skeleton.parents) < 0] = np.asarray(root)[:, None]
+    return chain_offsets(rotations, offsets, skeleton.parents)
+
+
+def pose_offsets(
+    name: str,
+    joint_names: list[str],
+    parents: list[int],
+    rest_offsets: np.ndarray,
+    local: np.ndarray,
+    offsets: np.ndarray,
+    fps: float,
+) -> SkeletonMotion:
+    """Return the motion of joints that are each told relative to their parent.
+
+    Args:
+        name: Name of the motion.
+        joint_names: Name of each joint.
+        parents: Parent of each joint; -1 is a root.
+        rest_offsets: Position of each joint relative to its parent at rest, shape [joints, 3].
+        local: Rotation of each joint relative to its parent, shape [frames, joints, 3, 3].
+        offsets: Position of each joint relative to its parent, shape [frames, joints, 3].
+        fps: Frame rate [1/s].
+
+    Raises:
+        AssetError: The joints form no tree.
+        MotionError: The motion is not finite, or its frame rate impossible.
+    """
+    names = unique_names(joint_names)
+    order, new_parents = order_joints(names, parents, what=f"motion {name}")
+    chain = tuple(new_parents)
+    rotations = chain_rotations(local[:, order], chain)
+    rest = chain_offsets(np.tile(np.eye(3), (1, len(order), 1, 1)), rest_offsets[None, order], chain)[0]
+    skeleton = Skeleton(tuple(names[joint] for joint in order), chain, rest)
+    return SkeletonMotion(name, skeleton, rotations, chain_offsets(rotations, offsets[:, order], chain), fps)
+
+
 def rotation_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Axis-angle vectors [..., 3] [rad] to matrices [..., 3, 3]."""
+    """Return the rotation matrices [..., 3, 3] of axis-angle vectors [..., 3] [rad]."""
     vectors = np.asarray(vectors, np.float64)
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)

@@ -1,7 +1,7 @@
-"""SMPL, SMPL-H and SMPL-X: body models from the user's own .npz or .pkl, and motions given as their parameters.
+"""Read SMPL, SMPL-H and SMPL-X: body models from the user's own .npz or .pkl, and motions as their parameters.
 
-Nothing of these models ships here; their licence asks every user to fetch them. Motions: AMASS .npz (Z up), and
-the pickles of HOOD and of the VTO dataset (Y up). They hold rotations of joints that are told by number, and no
+The models don't ship with this package: their licence asks every user to fetch them. Motions are AMASS .npz
+(Z up) and the pickles of HOOD and of the VTO dataset (Y up), which hold rotations of numbered joints and no
 skeleton.
 
 Source: Loper et al. 2015 (doi:10.1145/2816795.2818013); Pavlakos et al. 2019 (arXiv:1904.05866); AMASS,
@@ -33,7 +33,7 @@ from eslr_jax.io.skeleton import (
 
 NUM_SHAPES = 10  # leading shape directions kept; later files hold up to 400
 MAX_VERTICES = 1 << 20
-HOOD_FPS = 30.0  # HOOD and the VTO dataset store no frame rate; theirs is this
+HOOD_FPS = 30.0  # [1/s] of HOOD and of the VTO dataset, whose files don't tell it
 
 _BODY = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
@@ -58,8 +58,8 @@ _MODEL_KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table")
 _OPTIONAL_KEYS = ("shapedirs", "posedirs", "joint_names")
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # to Y up
 
-# A person who stands in a T-pose, for motions whose own body is not at hand [m]: straight limbs, with segments of
-# Drillis and Contini (1966) for a height of 1.7 m. Only directions and the length of the legs are used.
+# A person of 1.7 m in a T-pose [m], for motions that come without a body: straight limbs with the segments of
+# Drillis and Contini (1966). Only directions and the length of the legs are used.
 _T_POSE = {
     "pelvis": (0, 0, 0), "hip": (0.09, -0.08, 0), "knee": (0.09, -0.495, 0), "ankle": (0.09, -0.915, 0),
     "foot": (0.09, -0.96, 0.13), "spine1": (0, 0.11, 0), "spine2": (0, 0.24, 0), "spine3": (0, 0.3, 0),
@@ -72,7 +72,7 @@ _T_POSE = {
 
 
 def is_smpl_model(path: str | Path) -> bool:
-    """Tell an .npz of a SMPL model from other archives by its keys."""
+    """Tell whether an .npz holds a SMPL model, by its keys."""
     return {"v_template", "kintree_table"} <= set(read_arrays(path, content="body", names=_MODEL_KEYS))
 
 
@@ -80,15 +80,15 @@ def read_smpl_body(path: str | Path) -> RiggedMesh:
     """Read a body model in the layout of SMPL.
 
     Args:
-        path: .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and if present shapedirs,
-            posedirs and joint_names; 24, 52 or 55 joints are SMPL's, SMPL-H's and SMPL-X's, other numbers
-            need joint_names.
+        path: Path of an .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and optionally
+            shapedirs, posedirs and joint_names. A model with other than 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)
+            joints needs joint_names.
 
     Returns:
         The mean body at rest, with its shape and pose blend shapes.
 
     Raises:
-        AssetError: The file is missing, damaged, or lacks a part of a body model.
+        AssetError: The file is missing or damaged, or it lacks a part of a body model.
     """
     path = Path(path)
     if path.suffix.lower() == ".pkl":
@@ -105,7 +105,7 @@ def read_smpl_body(path: str | Path) -> RiggedMesh:
 
 
 def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
-    """Build the body of a model's arrays."""
+    """Return the body of a model's arrays."""
     positions = _numbers(path, values, "v_template", (None, 3))
     count = len(positions)
     if not 0 < count <= MAX_VERTICES:
@@ -143,7 +143,7 @@ def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
 
 
 def _numbers(path: Path, values: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return an array of numbers of this shape, None standing for any length."""
+    """Return an array of numbers of a shape, in which None is any length."""
     array = np.asarray(values[key])
     fits = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
@@ -178,7 +178,7 @@ def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str
 
 
 def _regressor(path: Path, value: Any, joints: int, count: int) -> Any:
-    """Return the matrix from vertices to joints, dense or sparse as the file has it."""
+    """Return the matrix from vertices to joints, dense or sparse as in the file."""
     matrix = value if scipy.sparse.issparse(value) else np.asarray(value)
     if matrix.shape != (joints, count) or matrix.dtype.kind not in "fiu":
         raise AssetError(
@@ -191,11 +191,17 @@ def _regressor(path: Path, value: Any, joints: int, count: int) -> Any:
 
 
 def read_amass(path: str | Path) -> SkeletonMotion:
-    """Read an AMASS .npz: `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`), Z up.
+    """Read a motion of AMASS.
+
+    Args:
+        path: Path of an .npz with `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`), Z up.
+
+    Returns:
+        The motion, Y up.
 
     Raises:
         AssetError: The file is missing or damaged.
-        MotionError: It lacks a part, or is no motion of 22, 24, 52 or 55 joints.
+        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
     """
     keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
     values = read_arrays(path, content="motion", names=keys)
@@ -211,14 +217,17 @@ def read_amass(path: str | Path) -> SkeletonMotion:
 
 
 def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
-    """Read a motion of HOOD or of the VTO dataset, Y up, 30 frames per second.
+    """Read a motion of HOOD or of the VTO dataset.
 
     Args:
-        path: .pkl with `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
+        path: Path of a .pkl with `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
+
+    Returns:
+        The motion at 30 frames per second.
 
     Raises:
-        AssetError: The file is missing, damaged, or holds anything but plain data.
-        MotionError: It lacks a part, or is no motion of 22, 24, 52 or 55 joints.
+        AssetError: The file is missing or damaged, or it holds anything but plain data.
+        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
     """
     values = read_pickle(path, content="motion")
     values = values if isinstance(values, dict) else {}
@@ -241,14 +250,14 @@ def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
 
 
 def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray) -> SkeletonMotion:
-    """Return the motion of a table of axis-angle rotations [rad] and translations [m].
+    """Return the motion of a table of rotations and translations.
 
     Args:
-        path: The file, for messages.
-        poses: Shape [frames, 3 joints].
-        moves: Shape [frames, 3].
-        fps: Frames per second.
-        axes: From the file's axes to ours.
+        path: Path of the file, for messages.
+        poses: Axis-angle rotations [rad], shape [frames, 3 joints].
+        moves: Translations of the root [m], shape [frames, 3].
+        fps: Frame rate [1/s].
+        axes: Rotation matrix from the file's axes to ours, shape [3, 3].
     """
     poses, moves = np.asarray(poses), np.asarray(moves)
     is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
@@ -278,7 +287,7 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
 
 
 def _standing_skeleton(joints: int) -> Skeleton:
-    """Return SMPL's joints on a person who stands in a T-pose."""
+    """Return SMPL's joints of a person in a T-pose."""
     names = JOINT_NAMES[joints]
     parents = list(_BODY_PARENTS)
     for place in range(len(_BODY), joints):

@@ -1,10 +1,13 @@
-"""A simulated garment with the body that it moved on, in one npz file.
+"""Read and write the trajectory of a garment, with the body that it moved on, as one npz file.
 
-Layout: `positions`, `velocities` [frames, vertices, 3], `faces` [faces, 3], `timestep`, `metadata` (JSON
-text) and `format`; with a body also `body_positions` [frames, body_vertices, 3] and `body_faces`
-[body_faces, 3], and what finding its contacts again takes: `body_rest_positions` [body_vertices, 3] and
-`contact_faces` [contact_faces, 3], those of the body that were searched, and `contact_boundary` [boundary_vertices],
-the body vertices where it goes on with others. SI units, Y up, float32.
+Layout, in SI units, Y up, float32: `format`, `metadata` (JSON text), `timestep`, `positions`, `velocities`
+[frames, vertices, 3] and `faces` [faces, 3]. Optional parts, whole or absent:
+
+- `friction_loads` [frames, vertices];
+- the fabric: `material_density`, `material_lame_mu`, ..., each a scalar or one value per element;
+- the body: `body_positions` [frames, body_vertices, 3], `body_faces`, `body_rest_positions`, `contact_faces` and
+  `contact_boundary`;
+- the body's skin: `body_skin_weights`, `body_skin_indices`, `body_joint_transforms`, ...
 """
 
 from __future__ import annotations
@@ -18,127 +21,175 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
+from eslr_jax.io.skin import Skin
+from eslr_jax.types import Material
 
-FORMAT = "eslr-trajectory-1"
+FORMAT = "eslr-trajectory-2"
+_OLD_FORMAT = "eslr-trajectory-1"  # its metadata is the run's report
 _REQUIRED = ("format", "positions", "velocities", "faces", "timestep", "metadata")
+_BODY = {  # field of BodyTrack -> array
+    "positions": "body_positions",
+    "faces": "body_faces",
+    "rest_positions": "body_rest_positions",
+    "contact_faces": "contact_faces",
+    "contact_boundary": "contact_boundary",
+}
+_SKIN = {field.name: f"body_{field.name}" for field in dataclasses.fields(Skin)}
+_MATERIAL = {field.name: f"material_{field.name}" for field in dataclasses.fields(Material)}
+_LAYOUT = {
+    "timestep": ("f", ""),
+    "positions": ("f", "frames vertices 3"),
+    "velocities": ("f", "frames vertices 3"),
+    "faces": ("iu", "faces 3", "vertices"),
+    "friction_loads": ("f", "frames vertices"),
+    "body_positions": ("f", "frames body_vertices 3"),
+    "body_faces": ("iu", "body_faces 3", "body_vertices"),
+    "body_rest_positions": ("f", "body_vertices 3"),
+    "contact_faces": ("iu", "contact_faces 3", "body_vertices"),
+    "contact_boundary": ("iu", "boundary_vertices", "body_vertices"),
+    "body_joint_transforms": ("f", "frames joints 3 4"),
+    "body_joint_rest_positions": ("f", "joints 3"),
+    "body_parents": ("iu", "joints"),
+    "body_joint_names": ("U", "joints"),
+    "body_skin_weights": ("f", "body_vertices influences"),
+    "body_skin_indices": ("iu", "body_vertices influences", "joints"),
+}
+_REMEDY = "write it again"
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyTrack:
+    """A body in motion, and the part of it that cloth could reach."""
+
+    positions: np.ndarray  # [frames, body_vertices, 3] [m]
+    faces: np.ndarray  # [body_faces, 3]
+    rest_positions: np.ndarray  # [body_vertices, 3] [m]
+    contact_faces: np.ndarray  # [contact_faces, 3], the faces that were searched for contacts; may be empty
+    contact_boundary: np.ndarray  # [boundary_vertices], where they adjoin faces that were not searched
+    skin: Skin | None = None  # the joints that moved it
 
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryFile:
     """What a trajectory file holds."""
 
-    positions: np.ndarray  # [frames, vertices, 3], [m]
-    velocities: np.ndarray  # [frames, vertices, 3], [m/s]
+    positions: np.ndarray  # [frames, vertices, 3] [m]
+    velocities: np.ndarray  # [frames, vertices, 3] [m/s]
     faces: np.ndarray  # [faces, 3]
-    body_positions: np.ndarray | None  # [frames, body_vertices, 3], [m]; None without a body
-    body_faces: np.ndarray | None  # [body_faces, 3]
-    timestep: float  # seconds between frames
-    metadata: dict[str, Any]  # JSON-compatible: garment, motion, versions, ...
-    body_rest_positions: np.ndarray | None = None  # [body_vertices, 3], [m]; None in files of older versions
-    contact_faces: np.ndarray | None = None  # [contact_faces, 3], body faces in the cloth's reach; likewise
-    contact_boundary: np.ndarray | None = (
-        None  # [boundary_vertices], body vertices at their boundary; likewise
-    )
+    timestep: float  # time between frames [s]
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # garment, motion, ...: values of JSON
+    body: BodyTrack | None = None
+    friction_loads: np.ndarray | None = None  # [frames, vertices], normal force that friction acts with [N]
+    material: Material | None = None  # NumPy leaves
 
     @property
     def num_frames(self) -> int:
-        """Number of frames, the start included."""
-        return self.positions.shape[0]
+        """Number of frames, the first one included."""
+        return len(self.positions)
 
 
-def write_trajectory(
-    path: str | Path,
-    *,
-    positions: np.ndarray,
-    velocities: np.ndarray,
-    faces: np.ndarray,
-    timestep: float,
-    body_positions: np.ndarray | None = None,
-    body_faces: np.ndarray | None = None,
-    body_rest_positions: np.ndarray | None = None,
-    contact_faces: np.ndarray | None = None,
-    contact_boundary: np.ndarray | None = None,
-    metadata: Mapping[str, Any] | None = None,
-) -> None:
+def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
     """Write a trajectory, atomically.
 
     Args:
-        path: The file, usually `*.npz`.
-        positions: Garment vertex positions [m], shape [frames, vertices, 3].
-        velocities: Garment vertex velocities [m/s], shape [frames, vertices, 3].
-        faces: Garment triangles, shape [faces, 3].
-        timestep: Time between frames [s].
-        body_positions: Body vertex positions [m], shape [frames, body_vertices, 3]; None without a body.
-        body_faces: Body triangles, shape [body_faces, 3].
-        body_rest_positions: Body vertex positions at rest [m], shape [body_vertices, 3].
-        contact_faces: Body triangles that the simulation searched for contacts, shape [contact_faces, 3].
-        contact_boundary: Body vertices where the body goes on with other triangles, shape [boundary_vertices].
-        metadata: Anything JSON can hold.
+        path: Path of the file, usually `*.npz`.
+        trajectory: What to write.
 
     Raises:
-        AssetError: If the arrays disagree, the metadata is no JSON, or the file can't be written.
+        AssetError: The arrays disagree, the metadata is no JSON, or the file can't be written.
     """
     try:
-        text = json.dumps(dict(metadata or {}), allow_nan=False)
+        text = json.dumps(dict(trajectory.metadata), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise AssetError(
             f"metadata of trajectory {path} can't be written as JSON: {error}; use plain values"
         ) from error
-    arrays = {
-        "format": np.array(FORMAT),
-        "positions": np.asarray(positions, np.float32),
-        "velocities": np.asarray(velocities, np.float32),
-        "faces": np.asarray(faces, np.int32),
-        "timestep": np.array(timestep, np.float64),
-        "metadata": np.array(text),
+    arrays: dict[str, Any] = {
+        "format": FORMAT,
+        "metadata": text,
+        "timestep": np.float64(trajectory.timestep),
+        "positions": trajectory.positions,
+        "velocities": trajectory.velocities,
+        "faces": trajectory.faces,
     }
-    if body_positions is not None:
-        arrays["body_positions"] = np.asarray(body_positions, np.float32)
-    if body_faces is not None:
-        arrays["body_faces"] = np.asarray(body_faces, np.int32)
-    if body_rest_positions is not None:
-        arrays["body_rest_positions"] = np.asarray(body_rest_positions, np.float32)
-    if contact_faces is not None:
-        arrays["contact_faces"] = np.asarray(contact_faces, np.int32)
-    if contact_boundary is not None:
-        arrays["contact_boundary"] = np.asarray(contact_boundary, np.int32)
-    _check(arrays, path)
-    write_arrays(path, arrays)
+    if trajectory.friction_loads is not None:
+        arrays["friction_loads"] = trajectory.friction_loads
+    body = trajectory.body
+    for part, names in (
+        (trajectory.material, _MATERIAL),
+        (body, _BODY),
+        (None if body is None else body.skin, _SKIN),
+    ):
+        if part is not None:
+            arrays |= {name: getattr(part, field) for field, name in names.items()}
+    result = {name: _stored(name, np.asarray(value)) for name, value in arrays.items()}
+    _check(result, path)
+    write_arrays(path, result)
+
+
+def _stored(name: str, array: np.ndarray) -> np.ndarray:
+    """Return an array in the type that it is stored in."""
+    if name == "timestep" or array.dtype.kind not in "fiu":
+        return array
+    return array.astype(np.int32 if "i" in _LAYOUT.get(name, "f")[0] else np.float32)
 
 
 def read_trajectory(path: str | Path) -> TrajectoryFile:
-    """Read what `write_trajectory` wrote.
+    """Read what `write_trajectory` wrote, now or in an older version.
 
     Args:
-        path: The file.
+        path: Path of the file.
 
     Returns:
-        Arrays, timestep and metadata.
+        The trajectory. An older file may lack the body's rest pose and contact faces; its first frame and all of
+        its faces take their place.
 
     Raises:
-        AssetError: If the file is missing, truncated, damaged, or no trajectory.
+        AssetError: The file is missing, truncated, damaged, or no trajectory.
     """
     arrays = read_arrays(path, content="trajectory")
+    if str(arrays.get("format")) == _OLD_FORMAT:
+        arrays = _converted(arrays)
     _check(arrays, path)
     try:
         metadata = json.loads(str(arrays["metadata"]))
     except (ValueError, RecursionError) as error:
-        raise AssetError(f"trajectory {path} has damaged metadata ({error}); write it again") from error
+        raise AssetError(f"trajectory {path} has damaged metadata ({error}); {_REMEDY}") from error
     if not isinstance(metadata, dict):
-        raise AssetError(f"trajectory {path} has metadata that is no table; write it again")
+        raise AssetError(f"trajectory {path} has metadata that is no table; {_REMEDY}")
+    body = skin = material = None
+    if "body_skin_weights" in arrays:
+        values: dict[str, Any] = {field: arrays[name] for field, name in _SKIN.items()}
+        values["parents"] = tuple(int(parent) for parent in values["parents"])
+        values["joint_names"] = tuple(str(name) for name in values["joint_names"])
+        skin = Skin(**values)
+    if "body_positions" in arrays:
+        body = BodyTrack(**{field: arrays[name] for field, name in _BODY.items()}, skin=skin)
+    if "material_density" in arrays:
+        fabric: dict[str, Any] = {field: arrays[name] for field, name in _MATERIAL.items()}
+        material = Material(**fabric)
     return TrajectoryFile(
-        positions=arrays["positions"],
-        velocities=arrays["velocities"],
-        faces=arrays["faces"],
-        body_positions=arrays.get("body_positions"),
-        body_faces=arrays.get("body_faces"),
-        timestep=float(arrays["timestep"]),
-        metadata=metadata,
-        body_rest_positions=arrays.get("body_rest_positions"),
-        contact_faces=arrays.get("contact_faces"),
-        contact_boundary=arrays.get("contact_boundary"),
+        arrays["positions"],
+        arrays["velocities"],
+        arrays["faces"],
+        float(arrays["timestep"]),
+        metadata,
+        body,
+        arrays.get("friction_loads"),
+        material,
     )
+
+
+def _converted(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of a file of the first format as those of today."""
+    result = {**arrays, "format": np.array(FORMAT)}
+    positions, faces = arrays.get("body_positions"), arrays.get("body_faces")
+    if positions is not None and faces is not None and len(positions):
+        result.setdefault("body_rest_positions", positions[0])
+        result.setdefault("contact_faces", faces)
+        result.setdefault("contact_boundary", np.empty(0, np.int32))
+    return result
 
 
 def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
@@ -149,68 +200,20 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
             f"{path} is no trajectory: it has no {', '.join(missing)}; give a file that `eslr simulate` wrote"
         )
     if str(arrays["format"]) != FORMAT:
-        raise AssetError(f"{path} has format {str(arrays['format'])[:40]!r}, not {FORMAT!r}; write it again")
-    if (
-        arrays["timestep"].shape != ()
-        or arrays["timestep"].dtype.kind != "f"
-        or not 0 < arrays["timestep"] < np.inf
-    ):
+        raise AssetError(f"{path} has format {str(arrays['format'])[:40]!r}, not {FORMAT!r}; {_REMEDY}")
+    for names in (_BODY, _SKIN, _MATERIAL):
+        lost = [name for name in names.values() if name not in arrays]
+        if 0 < len(lost) < len(names):
+            raise AssetError(f"trajectory {path} lacks {', '.join(lost)} beside the rest; {_REMEDY}")
+    if "body_skin_weights" in arrays and "body_positions" not in arrays:
+        raise AssetError(f"trajectory {path} has the skin of a body that is not there; {_REMEDY}")
+    check_layout(arrays, _LAYOUT, what=f"trajectory {path}", remedy=_REMEDY)
+    if not len(arrays["positions"]) or not 0 < arrays["timestep"] < np.inf:
         raise AssetError(
-            f"trajectory {path} has timestep {arrays['timestep']}; it must be a positive number of seconds"
+            f"trajectory {path} has {len(arrays['positions'])} frames at a timestep of {arrays['timestep']} s; "
+            "it needs one or more, and a positive timestep"
         )
-    _check_mesh(arrays, "positions", "faces", path)
-    if arrays["velocities"].shape != arrays["positions"].shape or arrays["velocities"].dtype.kind != "f":
-        raise AssetError(
-            f"trajectory {path} has velocities of shape {arrays['velocities'].shape} for positions of shape "
-            f"{arrays['positions'].shape}; they must agree"
-        )
-    if ("body_positions" in arrays) != ("body_faces" in arrays):
-        raise AssetError(
-            f"trajectory {path} has only one of body_positions and body_faces; give both or neither"
-        )
-    if "body_positions" in arrays:
-        _check_mesh(arrays, "body_positions", "body_faces", path)
-        if len(arrays["body_positions"]) != len(arrays["positions"]):
-            raise AssetError(
-                f"trajectory {path} has {len(arrays['positions'])} garment frames and "
-                f"{len(arrays['body_positions'])} body frames; they must agree"
-            )
-    if ("body_rest_positions" in arrays) != ("contact_faces" in arrays):
-        raise AssetError(
-            f"trajectory {path} has only one of body_rest_positions and contact_faces; give both or neither"
-        )
-    if "contact_faces" in arrays:
-        rest = arrays["body_rest_positions"]
-        if "body_positions" not in arrays or rest.shape != arrays["body_positions"].shape[1:]:
-            raise AssetError(
-                f"trajectory {path} has body_rest_positions of shape {rest.shape}; they must be those of its body"
-            )
-        _check_mesh(
-            {**arrays, "body_rest_positions": rest[None]}, "body_rest_positions", "contact_faces", path
-        )
-    boundary = arrays.get("contact_boundary")
-    if boundary is not None and (boundary.ndim != 1 or boundary.dtype.kind not in "iu"):
-        raise AssetError(
-            f"trajectory {path} has contact_boundary of shape {boundary.shape} and type {boundary.dtype}; "
-            "it must be [boundary_vertices] of integers"
-        )
-
-
-def _check_mesh(arrays: Mapping[str, np.ndarray], positions: str, faces: str, path: str | Path) -> None:
-    """Raise AssetError unless two arrays form an animated triangle mesh."""
-    points, triangles = arrays[positions], arrays[faces]
-    if points.ndim != 3 or points.shape[0] == 0 or points.shape[2] != 3 or points.dtype.kind != "f":
-        raise AssetError(
-            f"trajectory {path} has {positions} of shape {points.shape} and type {points.dtype}; "
-            "it must be [frames, vertices, 3] of floats"
-        )
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        raise AssetError(
-            f"trajectory {path} has {faces} of shape {triangles.shape} and type {triangles.dtype}; "
-            "it must be [faces, 3] of integers"
-        )
-    if triangles.size and not (triangles.min() >= 0 and triangles.max() < points.shape[1]):
-        raise AssetError(
-            f"trajectory {path} has {faces} that name vertex {triangles.max()} or {triangles.min()} "
-            f"of {points.shape[1]}; write it again"
-        )
+    for name in _MATERIAL.values():
+        array = arrays.get(name)
+        if array is not None and (array.dtype.kind != "f" or array.ndim > 1 or not (array > 0).all()):
+            raise AssetError(f"trajectory {path}: {name} must hold positive numbers; {_REMEDY}")

@@ -1,6 +1,6 @@
-"""Linear attention by random features, and the exact attention that it approximates.
+"""Linear attention by random features.
 
-Attention weights w_ij proportional to k(q_i, k_j) with k(q, k) = phi(q) . phi(k) need no matrix of all pairs:
+Attention weights w_ij in proportion to phi(q_i) . phi(k_j) need no matrix of all pairs:
 sum_j w_ij v_j = phi(q_i) (sum_j phi(k_j) v_j) / (phi(q_i) . sum_j phi(k_j)).
 
 Source: Choromanski et al., "Rethinking Attention with Performers" (2021).
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-SOFTMAX_EPSILON = 1e-6  # keeps the denominator positive; larger values pull towards the mean of v
+SOFTMAX_EPSILON = 1e-6  # keeps the denominator positive; a larger one pulls the result to the mean of v
 RELU_EPSILON = 1e-3  # PyTorch Geometric's generalised kernel
 
 
@@ -22,8 +22,8 @@ def orthogonal_projection(num_features: int, size: int, seed: int) -> np.ndarray
 
     Args:
         num_features: Number of directions.
-        size: Their dimension.
-        seed: Of the generator; the same seed gives the same directions on every machine.
+        size: Dimension of a direction.
+        seed: Seed of NumPy's generator; it gives the same directions on every machine.
 
     Returns:
         Directions, shape [num_features, size].
@@ -39,19 +39,6 @@ def orthogonal_projection(num_features: int, size: int, seed: int) -> np.ndarray
     return np.concatenate(blocks)[:num_features]
 
 
-def exact_attention(
-    queries: Float[Array, "rows size"],
-    keys: Float[Array, "rows size"],
-    values: Float[Array, "rows width"],
-    mask: Bool[Array, " rows"] | None = None,
-) -> Float[Array, "rows width"]:
-    """Return softmax(q k^T / sqrt(size)) v over the rows in `mask`; quadratic, for tests and small meshes."""
-    scores = queries @ keys.T / np.sqrt(queries.shape[1])
-    if mask is not None:
-        scores = jnp.where(mask[None], scores, -jnp.inf)
-    return jax.nn.softmax(scores, axis=1) @ values
-
-
 def softmax_features(
     queries: Float[Array, "rows size"],
     keys: Float[Array, "rows size"],
@@ -59,9 +46,9 @@ def softmax_features(
 ) -> tuple[Float[Array, "rows features"], Float[Array, "rows features"]]:
     """Return positive features whose products estimate exp(q . k / sqrt(size)), up to a factor per query.
 
-    phi(x) = exp(w . x - |x|^2 / 2). Numerator and denominator share any factor per query and any factor
-    common to all keys, so -|q|^2 / 2 is dropped, the largest exponent of a query is subtracted from its row,
-    and that of all keys together from all keys: subtracting it per key as well would change the weights.
+    phi(x) = exp(w . x - |x|^2 / 2). A factor per query, or one common to all keys, cancels between numerator and
+    denominator. So -|q|^2 / 2 is dropped, and exponents are shifted by the largest of each query's row and by the
+    largest of all keys. A shift per key would change the weights.
 
     Source: Choromanski et al. (2021), lemma 1, with the stabiliser corrected.
     """
@@ -98,13 +85,13 @@ def linear_attention(
     values: Float[Array, "rows width"],
     mask: Bool[Array, " rows"] | None = None,
 ) -> Float[Array, "rows width"]:
-    """Return the average of `values` weighted by products of features, in time linear in the rows.
+    """Return for every query the average of `values`, weighted by its attention; in time linear in the rows.
 
     Args:
-        query_features: Positive features of the queries.
-        key_features: Positive features of the keys.
-        values: What is averaged.
-        mask: Rows that are attended to.
+        query_features: Positive features of the queries, shape [rows, features].
+        key_features: Positive features of the keys, shape [rows, features].
+        values: Rows to average, shape [rows, width].
+        mask: Which rows may be attended to, shape [rows]; None for all.
     """
     if mask is not None:
         key_features = jnp.where(mask[:, None], key_features, 0)

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple, cast
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import jraph
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.graph.operators import WorldTables, world_tables
-from eslr_jax.models.attention import orthogonal_projection
+from eslr_jax.graph.build import Topology
 from eslr_jax.models.gsa import GsaBlock
 from eslr_jax.models.mlp import MLP
-from eslr_jax.types import Garment
 
-CORRECTION_GAIN = 0.02  # a new network then hardly changes the guess that it corrects
+CORRECTION_GAIN = 0.02  # a new network hardly moves the guess that it corrects
 OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5, "subspace": 5}  # a vector, and two gates
+
+
+class Places(NamedTuple):
+    """Where the garment's vertices lie on it."""
+
+    embedding: Float[Array, "vertices embedding"]  # geodesic embedding [m]
+    mask: Bool[Array, " vertices"]  # vertices that are not padding
 
 
 class TwoBranches(nn.Module):
@@ -30,7 +37,8 @@ class TwoBranches(nn.Module):
         config, size = self.config, self.config.latent_size
         if config.attention_blocks:
             self.blocks = stack(GsaBlock, config, config.attention_blocks)
-            self.projection = self.variable("constants", "projection", _projection, config)
+            shape = (config.attention_features, config.attention_size)
+            self.projection = self.variable("constants", "projection", jnp.zeros, shape)
         self.decoder = MLP(
             2 * size if config.attention_blocks else size,
             size,
@@ -45,30 +53,44 @@ class TwoBranches(nn.Module):
         self,
         processed: Float[Array, "vertices latent"],
         encoded: Float[Array, "vertices latent"],
-        garment: Garment,
+        places: Places,
     ) -> Float[Array, "vertices outputs"]:
         """Run the attention branch and decode.
 
         Args:
-            processed: Vertex latents behind the stack of layers.
-            encoded: Those of the encoder, which the attention starts from.
-            garment: Gives the embedding and the mask.
+            processed: Vertex latents behind the stack of layers, shape [vertices, latent].
+            encoded: Vertex latents of the encoder, from which attention starts, shape [vertices, latent].
+            places: Embedding and mask of the vertices.
+
+        Raises:
+            ConfigError: The garment has another number of geodesic coordinates than the network reads.
         """
         config = self.config
         hidden = self.decoder.start(processed, 0, bias=True)
         if config.attention_blocks:
-            _check_embedding(config, garment)
-            inputs = (garment.geodesic_embedding, garment.vertex_mask, self.projection.value)
-            attended, _ = self.blocks(encoded, inputs)
+            size = places.embedding.shape[1]
+            if size != config.embedding_size:
+                raise ConfigError(
+                    f"the garment has {size} geodesic coordinates and the model embedding_size = "
+                    f"{config.embedding_size}; prepare the garment with that embedding_size"
+                )
+            attended, _ = self.blocks(encoded, (*places, self.projection.value))
             hidden = hidden + self.decoder.start(attended, config.latent_size)
         return self.decoder.finish(hidden)
 
 
-def stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Module:
-    """Return `length` copies of a module with their own weights, compiled once.
+def stack(module: type[nn.Module], config: ModelConfig, length: int, **attributes: Any) -> nn.Module:
+    """Return `length` copies of a module, each with its own weights, compiled once.
 
-    Of a layer, the backward pass keeps everything ("none" is recomputed), the results of its matrix products
-    ("products"), or its inputs alone ("layers": a third of the memory, for a quarter more time).
+    `ModelConfig.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
+    results of its matrix products ("products"), or its inputs alone ("layers": a third of the memory, for a
+    quarter more time).
+
+    Args:
+        module: Class of the module, with `ModelConfig` as its first attribute.
+        config: Architecture.
+        length: Number of copies.
+        **attributes: Other attributes of the module.
     """
     if config.remat != "none":
         keeps = jax.checkpoint_policies.dots_saveable if config.remat == "products" else None
@@ -80,30 +102,11 @@ def stack(module: type[nn.Module], config: ModelConfig, length: int) -> nn.Modul
         in_axes=nn.broadcast,
         length=length,
     )
-    return scanned(config)
+    return scanned(config, **attributes)
 
 
-def graph_world_tables(graph: jraph.GraphsTuple, dtype) -> WorldTables:
-    """Return the tables of a graph's world edges."""
-    entries = graph.globals
-    return world_tables(entries["world_slot"], graph.receivers["world"], entries["world_mask"], dtype)
-
-
-def _check_embedding(config: ModelConfig, garment: Garment) -> None:
-    """Compare the garment's geodesic embedding with the one that the network expects.
-
-    Raises:
-        ConfigError: They have different numbers of coordinates.
-    """
-    size = garment.geodesic_embedding.shape[1]
-    if size != config.embedding_size:
-        raise ConfigError(
-            f"the garment has {size} geodesic coordinates and the model embedding_size = "
-            f"{config.embedding_size}; prepare the garment with that embedding_size"
-        )
-
-
-def _projection(config: ModelConfig) -> Float[Array, "features size"]:
-    """Return the random directions of the attention, the same in every block."""
-    directions = orthogonal_projection(config.attention_features, config.attention_size, config.seed)
-    return jnp.asarray(directions, jnp.float32)
+def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "vertices 1"]:
+    """Return one for every vertex with a world edge, zero for the others; zeros without a body."""
+    rows = graph.nodes["garment"].shape[0]
+    mask = cast(Topology, graph.globals).get("world_mask", jnp.zeros(rows, bool))
+    return mask.astype(dtype)[:, None]

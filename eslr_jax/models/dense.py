@@ -1,7 +1,7 @@
-"""The products, biases and norms of every layer, with backward passes that suit a CPU.
+"""Matrix products, biases and norms of every layer, with backward passes that suit a CPU.
 
-XLA sums the columns of a tall matrix one strided element at a time on a CPU; as a product with a row of ones
-the same sum runs at the speed of a matrix product.
+On a CPU, XLA sums the columns of a tall matrix one strided element at a time. As a product with a row of ones the
+same sum runs at the speed of a matrix product.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ TALL = 512  # rows from which a weight gradient pays for a transposed copy
 def kernel_spread(gain: float):
     """Return an initialiser that fills a kernel with the standard deviation of its weights.
 
-    `registry.init_model` multiplies them by normal numbers from NumPy: the same on every machine, and without
-    the seconds that compiling a random generator per kernel takes.
+    `registry.init_model` multiplies the kernels by normal numbers from NumPy. These are the same on every
+    machine, and no random generator is compiled per kernel, which would take seconds.
 
     Args:
-        gain: Variance of a weight times its fan-in.
+        gain: Variance of a weight times the number of the kernel's inputs.
     """
 
     def fill(key, shape, dtype=jnp.float32):
@@ -38,7 +38,7 @@ def kernel_spread(gain: float):
 def matmul(
     x: Float[Array, "rows inputs"], w: Float[Array, "inputs outputs"], precision: Precision = "float32"
 ) -> Float[Array, "rows outputs"]:
-    """Return x @ w, with operands rounded to bfloat16 and float32 sums where `precision` says so."""
+    """Return x @ w; for "bfloat16" with operands rounded to that type and sums in float32."""
     return _matmul_bfloat16(x, w) if precision == "bfloat16" else x @ w
 
 
@@ -85,7 +85,7 @@ layer_norm.defvjp(_layer_norm_forward, _layer_norm_backward)
 
 
 def _dot_bfloat16(a, b, contract_a: int, contract_b: int):
-    """Contract bfloat16 matrices into float32; a bfloat16 result would be slower than no bfloat16 at all."""
+    """Contract bfloat16 matrices into float32; a bfloat16 result would be slower than float32 operands."""
     dimensions = (((contract_a,), (contract_b,)), ((), ()))
     return jax.lax.dot_general(a, b, dimensions, preferred_element_type=jnp.float32)
 

@@ -1,4 +1,4 @@
-"""Self-attention over all garment vertices, told where they lie by their geodesic embedding.
+"""Self-attention over all garment vertices, which know their place by the geodesic embedding.
 
 Symbols of the paper: V (`x`), E_G (`embedding`).
 
@@ -23,8 +23,8 @@ QUERY_GAIN = 0.3  # initial size of queries and keys: random features are accura
 class GsaBlock(nn.Module):
     """x + W_o attention(W_q [x, E_G], W_k [x, E_G], W_v x), one head, linear in the vertices.
 
-    `attention_norm` normalises x in front, `attention_feedforward` adds a perceptron behind; both are off in
-    the paper's reading, whose parameter count has no room for them.
+    `attention_norm` puts a LayerNorm in front and `attention_feedforward` a perceptron behind. Both are off
+    in the paper's reading, whose parameter count has no room for them.
     """
 
     config: ModelConfig
@@ -40,8 +40,8 @@ class GsaBlock(nn.Module):
         """Return the next latents, in the form that `nn.scan` asks for.
 
         Args:
-            x: Vertex latents.
-            inputs: Geodesic embedding [m], mask of the vertices, random directions.
+            x: Vertex latents, shape [vertices, latent].
+            inputs: Geodesic embedding [m], vertex mask and random directions.
         """
         config, (embedding, mask, projection) = self.config, inputs
         size, width, precision = config.attention_size, config.latent_size, config.precision
@@ -67,7 +67,7 @@ class GsaBlock(nn.Module):
         return x, None
 
     def _norm(self, name: str, x: Float[Array, "vertices latent"]) -> Float[Array, "vertices latent"]:
-        """LayerNorm with its own weights."""
+        """Apply a LayerNorm with weights of its own."""
         scale = self.param(f"{name}_scale", nn.initializers.ones, (x.shape[1],))
         bias = self.param(f"{name}_bias", nn.initializers.zeros, (x.shape[1],))
         return layer_norm(x, scale.astype(x.dtype), bias.astype(x.dtype))

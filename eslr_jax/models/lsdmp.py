@@ -1,13 +1,16 @@
 """Laplacian-smoothed dual message passing.
 
-Symbols of the paper: v (`garment`, `body`), e^m (`mesh`), e^w (`world`, and `world_reverse` from garment to
-body), f_e (`mesh_mlp`, `world_mlp`), f_v (`vertex_mlp`), f'_v (`smooth_mlp`), N(i) neighbours of vertex i.
+Symbols of the paper: v (`garment`, `body`), e^m (`mesh`), e^w (`edges` from body to garment, `reverse` from
+garment to body), f_e (`mesh_mlp`, `world_mlp`), f_v (`vertex_mlp`), f'_v (`smooth_mlp`), N(i) neighbours of
+vertex i.
 
-What the paper leaves open follows MeshGraphNet and HOOD, by options of `ModelConfig`. One default differs:
-HOOD updates its body vertices, through which garment vertices near the same one hear of each other. Here
-every world edge ends at its own nearest point on the body, a row with that one edge, which could only hand a
-vertex its own message back; so body rows keep their encoding, and a layer costs a quarter less. `update_body`
-restores HOOD's way. The number of weights is the same, the two directions share f_e and both ends share f_v.
+The paper leaves open what follows; the choices are those of MeshGraphNet and HOOD. f_e, f_v and f'_v give
+increments, for edges and vertices alike. N(i) of eq. 3 includes the body point of i's world edge, and every
+smoothing adds e_ij again. One default differs from HOOD, which updates its body vertices: garment vertices
+near the same one hear of each other through it. Here every world edge has a body row of its own, which
+could only return a vertex's own message. So body rows keep their encoding, and a layer costs a quarter
+less. `ModelConfig.update_body` restores HOOD's way, with the same number of weights: both directions share
+f_e, garment and body share f_v and f'_v.
 
 Source: paper, eqs. 1-4.
 """
@@ -23,26 +26,36 @@ from jaxtyping import Array, Float
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph.operators import (
     MeshTables,
-    WorldTables,
-    from_world,
     sum_neighbors,
     sum_receivers,
     take_receivers,
     take_senders,
-    to_world,
 )
 from eslr_jax.models.mlp import MLP
 
 
+class WorldLatents(NamedTuple):
+    """Latents around the body. Row w belongs to garment vertex w."""
+
+    body: Float[Array, "vertices latent"]
+    edges: Float[Array, "vertices latent"]  # from body to garment
+    reverse: Float[Array, "vertices latent"] | None  # from garment to body; None where body rows are constant
+
+
 class Latents(NamedTuple):
-    """What passes from layer to layer; None where a scene has no body, or its rows are not updated."""
+    """What passes from layer to layer."""
 
     garment: Float[Array, "vertices latent"]
     mesh: Float[Array, "edges latent"]
     mesh_sum: Float[Array, "vertices latent"]  # of `mesh` over the edges that enter a vertex
-    body: Float[Array, "world_edges latent"] | None = None
-    world: Float[Array, "world_edges latent"] | None = None  # body to garment
-    world_reverse: Float[Array, "world_edges latent"] | None = None  # garment to body
+    world: WorldLatents | None = None  # None in a scene without a body
+
+
+class LayerTables(NamedTuple):
+    """What is the same in every layer."""
+
+    mesh: MeshTables
+    world_mask: Float[Array, "vertices 1"]  # one where a vertex has a world edge; zeros without a body
 
 
 class LsdmpLayer(nn.Module):
@@ -51,80 +64,67 @@ class LsdmpLayer(nn.Module):
     config: ModelConfig
 
     def setup(self) -> None:
-        """Declare the four perceptrons."""
+        """Declare the perceptrons."""
         self.mesh_mlp = make_mlp(self.config, 3)
         self.world_mlp = make_mlp(self.config, 3)
         self.vertex_mlp = make_mlp(self.config, 3)
         if self.config.smoothing_steps:
             self.smooth_mlp = make_mlp(self.config, 1)
 
-    def __call__(self, latents: Latents, tables: tuple[MeshTables, WorldTables | None]):
+    def __call__(self, latents: Latents, tables: LayerTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
-        latents = self.pass_messages(latents, *tables)
+        latents = self.pass_messages(latents, tables)
         if self.config.smoothing_steps:
-            latents = self.smooth(latents, *tables)
+            latents = self.smooth(latents, tables)
         return latents, None
 
-    def pass_messages(self, latents: Latents, mesh: MeshTables, world: WorldTables | None) -> Latents:
+    def pass_messages(self, latents: Latents, tables: LayerTables) -> Latents:
         """Update edges from both ends, then vertices from the sums over their edges.
 
-        e_ij = f_e(e_ij, v_i, v_j) and v_i = f_v(v_i, sum_j e_ij^m, sum_j e_ij^w); with `residual` both are
-        increments. Concatenations are never formed: every piece meets its own rows of the first kernel, the
-        vertices before they are gathered by the edges.
+        e_ij += f_e(v_i, v_j, e_ij) and v_i += f_v(v_i, sum_j f_e^m, sum_j f_e^w). No concatenation is
+        formed: every piece is multiplied by its own rows of the first kernel, vertices before the edges
+        gather them.
 
         Source: paper, eqs. 1 and 2.
         """
-        size, is_residual = self.config.latent_size, self.config.residual
-        garment, body = latents.garment, latents.body
-        edge = self.mesh_mlp
-        ends = take_receivers(edge.start(garment, 0, bias=True), mesh) + take_senders(
-            edge.start(garment, size), mesh
+        size, garment, world = self.config.latent_size, latents.garment, latents.world
+        edge, vertex = self.mesh_mlp, self.vertex_mlp
+        ends = take_receivers(edge.start(garment, 0, bias=True), tables.mesh) + take_senders(
+            edge.start(garment, size), tables.mesh
         )  # summed first: one kernel gathers both
-        mesh_step = edge.finish(edge.start(latents.mesh, 2 * size) + ends)
-        mesh_sum = sum_receivers(mesh_step, mesh)
-        vertex = self.vertex_mlp
-        hidden = vertex.start(garment, 0, bias=True) + vertex.start(mesh_sum, size)
-        step = Latents(garment=garment, mesh=mesh_step, mesh_sum=mesh_sum, body=body)
+        messages = edge.finish(edge.start(latents.mesh, 2 * size) + ends)
+        message_sum = sum_receivers(messages, tables.mesh)
+        hidden = vertex.start(garment, 0, bias=True) + vertex.start(message_sum, size)
         if world is not None:
-            edge, here = self.world_mlp, to_world(garment, world)
-            to_garment = edge.start(here, 0) + edge.start(body, size)
-            step = step._replace(
-                world=edge.finish(to_garment + edge.start(latents.world, 2 * size, bias=True))
-            )
-            hidden = hidden + from_world(vertex.start(step.world, 2 * size), world)
-            if self.config.update_body:
-                to_body = edge.start(body, 0) + edge.start(here, size)
-                step = step._replace(
-                    world_reverse=edge.finish(
-                        to_body + edge.start(latents.world_reverse, 2 * size, bias=True)
-                    )
-                )
-                at_body = vertex.start(body, 0, bias=True) + vertex.start(step.world_reverse, 2 * size)
-                step = step._replace(body=vertex.finish(at_body))
-        step = step._replace(garment=vertex.finish(hidden))
-        if not is_residual:
-            return step
-        keeps_body = world is not None and not self.config.update_body
+            edge = self.world_mlp
+            ends = edge.start(garment, 0) + edge.start(world.body, size)
+            to_garment = edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))
+            hidden = hidden + vertex.start(to_garment, 2 * size) * tables.world_mask
+            world = self._pass_to_body(garment, world)._replace(edges=world.edges + to_garment)
         return Latents(
-            *(
-                old if new is None or (keeps_body and name == "body") else old + new
-                for name, old, new in zip(Latents._fields, latents, step, strict=True)
-            )
+            garment + vertex.finish(hidden), latents.mesh + messages, latents.mesh_sum + message_sum, world
         )
 
-    def smooth(self, latents: Latents, mesh: MeshTables, world: WorldTables | None) -> Latents:
+    def _pass_to_body(self, garment: Float[Array, "vertices latent"], world: WorldLatents) -> WorldLatents:
+        """Update reverse world edges and body rows, unless these are constant."""
+        if world.reverse is None:
+            return world
+        size, edge, vertex = self.config.latent_size, self.world_mlp, self.vertex_mlp
+        ends = edge.start(world.body, 0) + edge.start(garment, size)
+        messages = edge.finish(ends + edge.start(world.reverse, 2 * size, bias=True))
+        hidden = vertex.start(world.body, 0, bias=True) + vertex.start(messages, 2 * size)
+        return world._replace(body=world.body + vertex.finish(hidden), reverse=world.reverse + messages)
+
+    def smooth(self, latents: Latents, tables: LayerTables) -> Latents:
         """Average over neighbours and their edges a few times, then update the vertices.
 
         Source: paper, eqs. 3 and 4.
         """
-        garment, body = propagate(latents, mesh, world, self.config)
-        garment = self.smooth_mlp(garment)
-        updates_body = world is not None and self.config.update_body
-        body = self.smooth_mlp(body) if updates_body else latents.body
-        if self.config.residual:
-            garment = latents.garment + garment
-            body = latents.body + body if updates_body else body
-        return latents._replace(garment=garment, body=body)
+        garment, body = propagate(latents, tables, self.config.smoothing_steps)
+        world = latents.world
+        if world is not None and body is not None:
+            world = world._replace(body=world.body + self.smooth_mlp(body))
+        return latents._replace(garment=latents.garment + self.smooth_mlp(garment), world=world)
 
 
 def make_mlp(config: ModelConfig, num_pieces: int) -> MLP:
@@ -134,41 +134,34 @@ def make_mlp(config: ModelConfig, num_pieces: int) -> MLP:
 
 
 def propagate(
-    latents: Latents, mesh: MeshTables, world: WorldTables | None, config: ModelConfig
-) -> tuple[Float[Array, "vertices latent"], Float[Array, "world_edges latent"] | None]:
-    """Smooth vertex latents: p_i = 1 / |N(i)| sum_(j in N(i)) (p_j + e_ij), `smoothing_steps` times.
+    latents: Latents, tables: LayerTables, num_steps: int
+) -> tuple[Float[Array, "vertices latent"], Float[Array, "vertices latent"] | None]:
+    """Smooth vertex latents: p_i = 1 / |N(i)| sum_(j in N(i)) (p_j + e_ij), `num_steps` times.
 
-    The mean of e_ij does not change between the steps and is taken once. A vertex without neighbours keeps
-    its latent. A body row has one neighbour, the garment vertex at the other end of its world edge.
+    The mean of e_ij is the same in every step and computed once. A vertex without neighbours keeps its latent. A
+    body row has one neighbour, the garment vertex at the other end of its world edge.
 
     Returns:
-        Smoothed latents of the garment's vertices, and of the body rows where they are updated.
+        Smoothed latents of the garment, and of the body rows; None for these where they are constant.
 
     Source: paper, eq. 3.
     """
-    garment, body = latents.garment, latents.body
-    uses_world = world is not None and config.smooth_world_edges
-    moves_body = world is not None and config.update_body
-    degree, edge_sum = mesh.degree, latents.mesh_sum
-    if uses_world:
-        degree = degree + world.vertex_mask
-        arriving = latents.world if moves_body else latents.world + body
-        edge_sum = edge_sum + from_world(arriving, world)
+    garment, world = latents.garment, latents.world
+    degree, edge_sum = tables.mesh.degree, latents.mesh_sum
+    if world is not None:
+        degree = degree + tables.world_mask
+        arriving = world.edges + world.body if world.reverse is None else world.edges
+        edge_sum = edge_sum + arriving * tables.world_mask
     inverse = jnp.where(degree > 0, 1 / jnp.maximum(degree, 1), 0)
     edge_mean = edge_sum * inverse
-    fixed_body = None if moves_body or not uses_world else from_world(body, world) * inverse
-    for step in range(config.smoothing_steps):
-        adds_edges = config.readd_edges or step == 0
-        total = sum_neighbors(garment, mesh)
-        if uses_world and moves_body:
-            total = total + from_world(body, world)
-        smoothed = total * inverse
-        if adds_edges:
-            smoothed = smoothed + edge_mean
-        elif fixed_body is not None:
-            smoothed = smoothed + fixed_body
-        if moves_body:
-            body = to_world(garment, world)
-            body = body + latents.world_reverse if adds_edges else body
-        garment = smoothed
+    body = None
+    if world is None or world.reverse is None:
+        for _ in range(num_steps):
+            garment = sum_neighbors(garment, tables.mesh) * inverse + edge_mean
+    else:
+        body = world.body
+        for _ in range(num_steps):
+            total = sum_neighbors(garment, tables.mesh) + body * tables.world_mask
+            body = garment + world.reverse
+            garment = total * inverse + edge_mean
     return jnp.where(degree > 0, garment, latents.garment), body

@@ -12,19 +12,20 @@ INITIAL_GAIN = 1.5  # variance of a weight times its fan-in
 
 
 class MLP(nn.Module):
-    """Linear-ReLU per hidden layer, Linear, LayerNorm.
+    """A linear layer and ReLU per hidden layer, a linear layer, a LayerNorm.
 
-    The first layer is kept apart: the product with a concatenation is the sum of the products with its
-    pieces, and a piece that belongs to a vertex is multiplied before it is gathered by the edges.
+    The first layer can be applied to the pieces of a concatenated input one by one (`start`): its product
+    with the whole is the sum of its products with the pieces. So vertex latents are multiplied before the
+    edges gather them.
 
     Attributes:
-        input_size: Width of the (concatenated) input.
-        hidden_size: Width of the hidden layers.
-        output_size: Width of the output.
+        input_size: Number of columns of the concatenated input.
+        hidden_size: Number of columns of the hidden layers.
+        output_size: Number of columns of the output.
         hidden_layers: Number of hidden layers; 0 is a single linear layer.
         norm: End with a LayerNorm.
-        output_gain: Factor on the last layer's initial weights.
-        precision: Operands of the products.
+        output_gain: Factor on the initial weights of the last layer.
+        precision: Type of the operands of matrix products.
     """
 
     input_size: int
@@ -55,28 +56,28 @@ class MLP(nn.Module):
             self.norm_bias = self.param("norm_bias", nn.initializers.zeros, (self.output_size,))
 
     def __call__(self, x: Float[Array, "rows inputs"]) -> Float[Array, "rows outputs"]:
-        """Apply all layers to rows of the full input."""
+        """Apply all layers to the whole input."""
         return self.finish(self.start(x, 0, bias=True))
 
     def start(
         self, x: Float[Array, "rows piece"], offset: int, *, bias: bool = False
     ) -> Float[Array, "rows hidden"]:
-        """Return a piece's share of the first layer, before its ReLU.
+        """Return what a piece of the input adds to the first layer, before the ReLU.
 
         Args:
-            x: Rows of the piece.
-            offset: Column of the full input at which the piece begins.
-            bias: Add the first layer's bias; exactly one piece has to.
+            x: Piece of the input, shape [rows, piece].
+            offset: Column of the whole input at which the piece begins.
+            bias: Add the first layer's bias; True for exactly one piece.
         """
         kernel = self.kernels[0][offset : offset + x.shape[1]]
         hidden = matmul(x, kernel.astype(x.dtype), self.precision)
         return add_bias(hidden, self.biases[0].astype(x.dtype)) if bias else hidden
 
     def finish(self, hidden: Float[Array, "rows hidden"]) -> Float[Array, "rows outputs"]:
-        """Apply everything behind the first product.
+        """Apply the layers behind the first product.
 
         Args:
-            hidden: Sum of all pieces' `start`.
+            hidden: Sum of `start` over all pieces, shape [rows, hidden].
         """
         for kernel, bias in zip(self.kernels[1:], self.biases[1:], strict=True):
             product = matmul(jnp.maximum(hidden, 0), kernel.astype(hidden.dtype), self.precision)

@@ -1,37 +1,40 @@
 """Encode, process, decode: ESLR, and with fewer parts MeshGraphNet.
 
 The encoders' latents go through a stack of LSDMP layers and, beside it, through a stack of GSA blocks; the
-decoder reads both. Without smoothing and attention this is MeshGraphNet as HOOD's baselines have it.
+decoder reads both. Without smoothing and attention this is MeshGraphNet as in HOOD's baselines.
 
 Source: paper, section on the simulation pipeline.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.graph import features
-from eslr_jax.graph.build import feature_sizes
-from eslr_jax.graph.normalizer import Normalizer, normalize
-from eslr_jax.graph.operators import (
-    MeshTables,
-    WorldTables,
-    mesh_tables,
-    sum_receivers,
-)
-from eslr_jax.models.branches import TwoBranches, graph_world_tables, stack
+from eslr_jax.graph.build import Rows, feature_sizes
+from eslr_jax.graph.normalizer import normalize
+from eslr_jax.graph.operators import mesh_tables, sum_receivers
+from eslr_jax.models.branches import Places, TwoBranches, stack, world_mask
 from eslr_jax.models.dense import kernel_spread
-from eslr_jax.models.lsdmp import Latents, LsdmpLayer
+from eslr_jax.models.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents
 from eslr_jax.models.mlp import MLP
-from eslr_jax.types import Garment
+from eslr_jax.types import Normalizer
 
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 Statistics = dict[str, Normalizer]
+
+
+class EncodedWorld(NamedTuple):
+    """The part of `Encoded` that a body adds."""
+
+    body: Float[Array, "vertices latent"]  # finished: a body row has no features that change
+    edges: Float[Array, "vertices hidden"]  # body to garment
+    reverse: Float[Array, "vertices hidden"] | None  # garment to body; None where body rows are constant
 
 
 class Encoded(NamedTuple):
@@ -39,11 +42,8 @@ class Encoded(NamedTuple):
 
     garment: Float[Array, "vertices hidden"]
     mesh: Float[Array, "edges hidden"]
-    body: Float[Array, "world_edges latent"] | None  # finished: nothing about the body changes
-    world: Float[Array, "world_edges hidden"] | None
-    world_reverse: Float[Array, "world_edges hidden"] | None
-    mesh_tables: MeshTables
-    world_tables: WorldTables | None
+    tables: LayerTables
+    world: EncodedWorld | None  # None in a scene without a body
 
 
 class EncodeProcessDecode(TwoBranches):
@@ -71,111 +71,115 @@ class EncodeProcessDecode(TwoBranches):
         self.declare_decoder()
 
     def __call__(
-        self, graph: jraph.GraphsTuple, garment: Garment, statistics: Statistics | None = None
+        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
     ) -> Float[Array, "vertices outputs"]:
-        """Apply the network to a full graph.
+        """Return the raw output for a whole graph.
 
         Args:
-            graph: Of `build_graph`.
-            garment: The same garment; gives the topology, the embedding and the mask.
-            statistics: Of the "garment" (and body), "mesh" and "world" features, for HOOD's kind.
+            graph: Graph of `build_graph`.
+            places: Embedding and mask of the vertices.
+            statistics: Normalisers of the rows "garment" (and body), "mesh" and "world", for HOOD's features.
         """
-        return self.process(self.encode_frame(graph, garment, statistics), garment)
+        return self.process(self.encode_frame(graph, statistics), places)
 
-    def encode_frame(
-        self, graph: jraph.GraphsTuple, garment: Garment, statistics: Statistics | None = None
-    ) -> Encoded:
-        """Return the encoders' first layers on a full graph, or on the features that stay for a frame."""
+    def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
+        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
+
+        Args:
+            graph: Graph of `build_graph` or of `build_frame_graph`.
+            statistics: Normalisers, see `__call__`.
+        """
         nodes, edges = self.normalized(graph, statistics)
-        is_hood = self.config.features == "hood"
-        has_body = "world" in edges
-        body = None
-        if has_body:
-            body = (self.garment_encoder if is_hood else self.body_encoder)(nodes["body"])
         dtype = nodes["garment"].dtype
+        world = None
+        if "world" in edges:
+            body_encoder = self.garment_encoder if self.config.features == "hood" else self.body_encoder
+            first_layers = {
+                name: self.world_encoder.start(edges[name], 0, bias=True)
+                for name in ("world", "world_reverse")
+                if name in edges
+            }
+            world = EncodedWorld(
+                body=body_encoder(nodes["body"]),
+                edges=first_layers["world"],
+                reverse=first_layers.get("world_reverse"),
+            )
         return Encoded(
             garment=self.garment_encoder.start(nodes["garment"], 0, bias=True),
             mesh=self.mesh_encoder.start(edges["mesh"], 0, bias=True),
-            body=body,
-            world=self.world_encoder.start(edges["world"], 0, bias=True) if has_body else None,
-            world_reverse=(
-                self.world_encoder.start(edges["world_reverse"], 0, bias=True)
-                if "world_reverse" in edges
-                else None
-            ),
-            mesh_tables=mesh_tables(garment, dtype),
-            world_tables=graph_world_tables(graph, dtype) if has_body else None,
+            tables=LayerTables(mesh_tables(graph, dtype), world_mask(graph, dtype)),
+            world=world,
         )
 
     def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
-        """Add the features of a pass to those of its frame.
+        """Add the features of a refinement step to those of its frame.
 
         Args:
-            encoded: Of `encode_frame` on the frame's features.
-            changing: Of `build_refinement_graph`.
+            encoded: Hidden layers of `encode_frame` for the frame's features.
+            changing: Graph of `build_refinement_graph`.
         """
-        nodes, edges = changing.nodes, changing.edges
-        encoded = encoded._replace(
+        nodes, edges, world = changing.nodes, changing.edges, encoded.world
+        if world is not None:
+            rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
+            reverse = None if world.reverse is None else world.reverse + rows
+            world = world._replace(edges=world.edges + rows, reverse=reverse)
+        return encoded._replace(
             garment=encoded.garment + self.garment_encoder.start(nodes["garment"], features.NODE_FRAME_SIZE),
             mesh=encoded.mesh + self.mesh_encoder.start(edges["mesh"], features.MESH_FRAME_SIZE),
+            world=world,
         )
-        if encoded.world is not None:
-            world = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
-            encoded = encoded._replace(world=encoded.world + world)
-            if encoded.world_reverse is not None:
-                encoded = encoded._replace(world_reverse=encoded.world_reverse + world)
-        return encoded
 
-    def process(self, encoded: Encoded, garment: Garment) -> Float[Array, "vertices outputs"]:
+    def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
         """Finish the encoders, run both stacks and decode."""
-        has_body = encoded.world is not None
         vertices = self.garment_encoder.finish(encoded.garment)
         mesh = self.mesh_encoder.finish(encoded.mesh)
-        latents = Latents(
-            garment=vertices,
-            mesh=mesh,
-            mesh_sum=sum_receivers(mesh, encoded.mesh_tables),
-            body=encoded.body,
-            world=self.world_encoder.finish(encoded.world) if has_body else None,
-            world_reverse=(
-                self.world_encoder.finish(encoded.world_reverse)
-                if encoded.world_reverse is not None
-                else None
-            ),
-        )
-        latents, _ = self.layers(latents, (encoded.mesh_tables, encoded.world_tables))
-        return self.decode(latents.garment, vertices, garment)
+        world = None
+        if encoded.world is not None:
+            finish, given = self.world_encoder.finish, encoded.world
+            reverse = None if given.reverse is None else finish(given.reverse)
+            world = WorldLatents(given.body, finish(given.edges), reverse)
+        latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
+        latents, _ = self.layers(latents, encoded.tables)
+        return self.decode(latents.garment, vertices, places)
 
-    def normalized(
-        self, graph: jraph.GraphsTuple, statistics: Statistics | None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return node and edge features as the encoders read them."""
+    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
+        """Return node and edge features as the encoders read them.
+
+        Raises:
+            ValueError: The features are HOOD's and `statistics` is None.
+        """
         if self.config.features != "hood":
             return graph.nodes, graph.edges
         if statistics is None:
             raise ValueError('features = "hood" needs the statistics of its normalisers')
-        nodes, edges = self.with_types(graph), graph.edges
 
-        def scale(rows, name, num_static):
+        def scale(
+            rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
+        ) -> Float[Array, "_ features"]:
             changing = rows.shape[1] - num_static
-            scaled = normalize(statistics[name], rows[:, :changing])
+            scaled = normalize(normalizer, rows[:, :changing])
             return jnp.concatenate([scaled, rows[:, changing:]], axis=1)
 
-        nodes = {name: scale(rows, "garment", features.HOOD_NODE_STATIC) for name, rows in nodes.items()}
-        static = {"mesh": features.HOOD_MESH_STATIC}
+        nodes = {
+            name: scale(rows, statistics["garment"], features.HOOD_NODE_STATIC)
+            for name, rows in self.with_types(graph).items()
+        }
         edges = {
-            name: scale(rows, "mesh" if name == "mesh" else "world", static.get(name, 0))
-            for name, rows in edges.items()
+            name: scale(rows, statistics["world"], 0)
+            if name.startswith("world")
+            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
+            for name, rows in cast(Rows, graph.edges).items()
         }
         return nodes, edges
 
-    def with_types(self, graph: jraph.GraphsTuple) -> dict[str, Float[Array, "rows 20"]]:
-        """Insert the embedding of the vertex types behind the velocity, as HOOD orders its columns."""
+    def with_types(self, graph: jraph.GraphsTuple) -> Rows:
+        """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""
 
-        def insert(rows: Float[Array, "rows 11"], types: Int[Array, " rows"]):
+        def insert(rows: Float[Array, "_ 11"], types: Int[Array, " _"]) -> Float[Array, "_ 20"]:
             embedding = self.type_embedding.astype(rows.dtype)[types]
             return jnp.concatenate(
                 [rows[:, :VELOCITY_COLUMNS], embedding, rows[:, VELOCITY_COLUMNS:]], axis=1
             )
 
-        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in graph.nodes.items()}
+        nodes = cast(Rows, graph.nodes)
+        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in nodes.items()}

@@ -1,28 +1,32 @@
 """Named configurations, and the functions that make, apply and count a network's weights.
 
-A network's weights are a plain dictionary: "params" are trained, "constants" are the random directions of the
-attention, "statistics" the normalisers of HOOD's features and of the output. Only "params" belongs in an
-optimiser.
+A network's weights are a dictionary: "params" are trained, "constants" are the random directions of the
+attention, "statistics" are the normalisers of HOOD's features and of the output. Only "params" belongs in
+an optimiser.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import jraph
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import CheckpointError
 from eslr_jax.graph import features, normalizer
-from eslr_jax.graph.build import feature_sizes
-from eslr_jax.models.network import Encoded, EncodeProcessDecode
+from eslr_jax.graph.build import COARSE_SETS, Rows, Topology, feature_sizes
+from eslr_jax.models.attention import orthogonal_projection
+from eslr_jax.models.branches import Places
+from eslr_jax.models.hood import NUM_LEVELS, HierarchicalNetwork
+from eslr_jax.models.network import Encoded, EncodeProcessDecode, Statistics
 from eslr_jax.models.smoothing import EncodedVertices, SmoothingNetwork
-from eslr_jax.types import Garment
+from eslr_jax.types import CoarseEdges, Garment
 
 Params = dict[str, Any]
 
@@ -58,10 +62,12 @@ MEDIUM = dataclasses.replace(
 DEEP = dataclasses.replace(
     MEDIUM, message_passing_steps=6, attention_blocks=2, refinement_steps=1, remat="products"
 )
-# One pass as a start for the solver: it costs three to four of its iterations and saves more.
+# One step as the solver's initial guess: it costs three to four iterations and saves more.
 SMOOTH = dataclasses.replace(
     _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
+# The published hierarchical network, "postcvpr".
+HOOD = dataclasses.replace(_without_attention(_without_smoothing(PAPER)), hierarchical=True, update_body=True)
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
     "eslr-10": dataclasses.replace(PAPER, message_passing_steps=10, attention_blocks=3),
@@ -69,6 +75,7 @@ MODELS: dict[str, ModelConfig] = {
     "gsa-15": _without_smoothing(PAPER),
     "mgn-15": _without_attention(_without_smoothing(PAPER)),
     "mgn-48": dataclasses.replace(_without_attention(_without_smoothing(PAPER)), message_passing_steps=48),
+    "hood": HOOD,
     "eslr-small": SMALL,
     "lsdmp-small": _without_attention(SMALL),
     "gsa-small": _without_smoothing(SMALL),
@@ -83,56 +90,58 @@ MODELS: dict[str, ModelConfig] = {
 
 def make_network(config: ModelConfig) -> EncodeProcessDecode | SmoothingNetwork:
     """Return the module that a configuration describes."""
+    if config.hierarchical:
+        return HierarchicalNetwork(config)
     return EncodeProcessDecode(config) if config.edge_latents else SmoothingNetwork(config)
 
 
 def init_model(config: ModelConfig, seed: int = 0) -> Params:
-    """Return new weights; they fit any garment.
+    """Return new weights, which fit any garment.
 
     Args:
-        config: Architecture.
-        seed: Of the initial weights; that of the random attention directions is `config.seed`.
+        config: Architecture; its own seed is that of the random attention directions.
+        seed: Seed of the initial weights.
     """
-    graph, garment = _example(config)
-    statistics = _new_statistics(config)
-    module = make_network(config)
-    weights = jax.jit(lambda key: module.init(key, graph, garment, statistics))(jax.random.key(0))
     generator = np.random.default_rng(seed)
 
     def draw(path, spread):
         is_kernel = not any(word in path[-1].key for word in ("bias", "scale"))
         return spread * generator.standard_normal(spread.shape, np.float32) if is_kernel else spread
 
-    trained = jax.tree_util.tree_map_with_path(draw, weights["params"])
-    return {**weights, "params": trained, "statistics": statistics}
+    params = jax.jit(lambda: _declare(config))()
+    params["params"] = jax.tree_util.tree_map_with_path(draw, params["params"])
+    if config.attention_blocks:
+        directions = orthogonal_projection(config.attention_features, config.attention_size, config.seed)
+        params["constants"] = {"projection": jnp.asarray(directions, jnp.float32)}
+    return params
 
 
 def apply_model(
     config: ModelConfig, params: Params, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
-    """Return the network's raw output, see `scale_output`.
+    """Return the network's raw output; see `scale_output`.
 
     Args:
         config: Architecture; static.
-        params: Weights of `init_model`.
-        graph: Of `build_graph` with the same config.
-        garment: The same garment.
+        params: Weights.
+        graph: Graph of `build_graph` with the same config.
+        garment: The graph's garment, for its geodesic embedding and vertex mask.
     """
-    return make_network(config).apply(_variables(params), graph, garment, params["statistics"])
+    return make_network(config).apply(_variables(params), graph, _places(garment), params["statistics"])
 
 
 def encode_frame(
-    config: ModelConfig, params: Params, frame: jraph.GraphsTuple, garment: Garment
+    config: ModelConfig, params: Params, graph: jraph.GraphsTuple, garment: Garment
 ) -> Encoded | EncodedVertices:
-    """Do once per frame what does not change between its passes.
+    """Return what all refinement steps of a frame share.
 
     Args:
-        config: Architecture, with `features` "gradient"; static.
+        config: Architecture with features "gradient"; static.
         params: Weights.
-        frame: Of `build_frame_graph`.
-        garment: The same garment.
+        graph: Graph of `build_frame_graph`.
+        garment: The graph's garment.
     """
-    return make_network(config).apply(_variables(params), frame, garment, method="encode_frame")
+    return make_network(config).apply(_variables(params), graph, method="encode_frame")
 
 
 def apply_refinement(
@@ -142,18 +151,18 @@ def apply_refinement(
     changing: jraph.GraphsTuple,
     garment: Garment,
 ) -> Float[Array, "vertices outputs"]:
-    """Return the raw output of one pass; equals `apply_model` on the joined graph.
+    """Return the raw output of one refinement step; equals `apply_model` on the joined graph.
 
     Args:
-        config: Architecture, with `features` "gradient"; static.
+        config: Architecture with features "gradient"; static.
         params: Weights.
-        encoded: Of `encode_frame`.
-        changing: Of `build_refinement_graph`.
-        garment: The same garment.
+        encoded: Result of `encode_frame`.
+        changing: Graph of `build_refinement_graph`.
+        garment: The graph's garment, for its geodesic embedding and vertex mask.
     """
 
-    def run(module: EncodeProcessDecode | SmoothingNetwork):
-        return module.process(module.encode_refinement(encoded, changing), garment)
+    def run(module: Any):
+        return module.process(module.encode_refinement(encoded, changing), _places(garment))
 
     return make_network(config).apply(_variables(params), method=run)
 
@@ -161,7 +170,12 @@ def apply_refinement(
 def scale_output(
     config: ModelConfig, params: Params, output: Float[Array, "vertices 3"]
 ) -> Float[Array, "vertices 3"]:
-    """Return the output's vectors in physical units: metres, or for "acceleration" metres per frame squared.
+    """Return the output's vectors in physical units: metres, or metres per frame squared for "acceleration".
+
+    Args:
+        config: Architecture; static.
+        params: Weights.
+        output: First three columns of the raw output, shape [vertices, 3].
 
     Source: HOOD's output normaliser, applied backwards, for accelerations.
     """
@@ -176,40 +190,48 @@ def measure_statistics(
     graph: jraph.GraphsTuple,
     garment: Garment,
     acceleration: Float[Array, "vertices 3"] | None = None,
-) -> dict[str, normalizer.Normalizer]:
-    """Return what the normalisers see in one graph; training only.
+) -> Statistics:
+    """Return the statistics of one graph, which training merges into those of the network.
 
     Args:
-        config: Architecture; static. Features of the "gradient" kind have no statistics.
+        config: Architecture; static. Features "gradient" are not normalised.
         params: Weights.
-        graph: Of `build_graph`.
-        garment: The same garment.
-        acceleration: Target accelerations [m per frame^2], those of the skinned garment in HOOD.
+        graph: Graph of `build_graph`.
+        garment: The graph's garment, for its masks.
+        acceleration: Target accelerations [m per frame^2], shape [vertices, 3]; in HOOD those of the skinned
+            garment. None leaves out the output's statistics.
 
     Source: HOOD's `utils/normalization.py`.
     """
-    measured = {}
+    measured: Statistics = {}
     if config.features == "hood":
         nodes = make_network(config).apply(_variables(params), graph, method="with_types")
         nodes = jax.lax.stop_gradient(nodes)
+        edges = cast(Rows, graph.edges)
         masks = {"garment": garment.vertex_mask, "mesh": garment.edge_mask}
-        masks.update(dict.fromkeys(("body", "world", "world_reverse"), graph.globals.get("world_mask")))
+        coarse = cast(Topology, graph.globals).get("coarse", ())
+        masks |= {name: level.edge_mask for name, level in zip(COARSE_SETS, coarse, strict=False)}
+        world = {name: rows for name, rows in edges.items() if name.startswith("world")}
+        mesh = {name: rows for name, rows in edges.items() if name not in world}
         groups = (
             ("garment", nodes, features.HOOD_NODE_STATIC),
-            ("mesh", {"mesh": graph.edges["mesh"]}, features.HOOD_MESH_STATIC),
-            ("world", {name: rows for name, rows in graph.edges.items() if name != "mesh"}, 0),
+            ("mesh", mesh, features.HOOD_MESH_STATIC),
+            ("world", world, 0),
         )
         for name, group, num_static in groups:
             if group:
-                rows, mask = _stack_rows(group, masks)
+                rows = jnp.concatenate(list(group.values()))
+                mask = jnp.concatenate(
+                    [masks[kind] if kind in masks else graph.globals["world_mask"] for kind in group]
+                )
                 measured[name] = normalizer.measure(rows[:, : rows.shape[1] - num_static], mask)
     if config.output == "acceleration" and acceleration is not None:
         measured["output"] = normalizer.measure(acceleration, garment.vertex_mask)
     return measured
 
 
-def merge_statistics(params: Params, measured: dict[str, normalizer.Normalizer]) -> Params:
-    """Return weights whose normalisers have also seen what `measure_statistics` measured."""
+def merge_statistics(params: Params, measured: Statistics) -> Params:
+    """Return weights whose normalisers include what `measure_statistics` measured."""
     seen = params["statistics"]
     merged = {name: normalizer.merge(seen[name], new) for name, new in measured.items()}
     return {**params, "statistics": {**seen, **merged}}
@@ -221,13 +243,12 @@ def count_parameters(params: Params) -> int:
 
 
 def check_params(config: ModelConfig, params: Params) -> None:
-    """Compare weights with an architecture before they reach compiled code.
+    """Compare the shapes of weights with an architecture; nothing is computed, and tracers are accepted.
 
     Raises:
         CheckpointError: A weight is missing, unknown, or of another shape.
     """
-    expected = _shapes(jax.eval_shape(lambda: init_model(config)))  # nothing is compiled or computed
-    given = _shapes(params)
+    expected, given = _expected_shapes(config), _shapes(params)
     for name in sorted(expected.keys() | given.keys()):
         if expected.get(name) != given.get(name):
             raise CheckpointError(
@@ -236,10 +257,24 @@ def check_params(config: ModelConfig, params: Params) -> None:
             )
 
 
+@functools.cache
+def _expected_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every array of an architecture by its path."""
+    return _shapes(jax.eval_shape(lambda: _declare(config)))
+
+
 def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
     """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
+
+
+def _declare(config: ModelConfig) -> Params:
+    """Return weights as their modules declare them, before anything is drawn; see `dense.kernel_spread`."""
+    statistics = _new_statistics(config)
+    graph, places = _example(config)
+    variables = make_network(config).init(jax.random.key(0), graph, places, statistics)
+    return {**variables, "statistics": statistics}
 
 
 def _variables(params: Params) -> Params:
@@ -247,20 +282,19 @@ def _variables(params: Params) -> Params:
     return {name: params[name] for name in ("params", "constants") if name in params}
 
 
-def _stack_rows(
-    group: dict[str, Float[Array, "_ features"]], masks: dict[str, Bool[Array, " _"]]
-) -> tuple[Float[Array, "rows features"], Bool[Array, " rows"]]:
-    """Put rows that share a normaliser on top of each other."""
-    return jnp.concatenate(list(group.values())), jnp.concatenate([masks[name] for name in group])
+def _places(garment: Garment) -> Places:
+    """Return embedding and mask of a garment's vertices."""
+    return Places(garment.geodesic_embedding, garment.vertex_mask)
 
 
-def _new_statistics(config: ModelConfig) -> dict[str, normalizer.Normalizer]:
+def _new_statistics(config: ModelConfig) -> Statistics:
     """Return empty normalisers for what the configuration normalises."""
     statistics = {}
     if config.features == "hood":
         sizes = feature_sizes(config)
+        embedded = features.NUM_TYPES + (NUM_LEVELS if config.hierarchical else 0)
         statistics["garment"] = normalizer.init_normalizer(
-            sizes["garment"] + features.NUM_TYPES - features.HOOD_NODE_STATIC
+            sizes["garment"] + embedded - features.HOOD_NODE_STATIC
         )
         statistics["mesh"] = normalizer.init_normalizer(sizes["mesh"] - features.HOOD_MESH_STATIC)
         statistics["world"] = normalizer.init_normalizer(sizes["world"])
@@ -269,46 +303,29 @@ def _new_statistics(config: ModelConfig) -> dict[str, normalizer.Normalizer]:
     return statistics
 
 
-def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Garment]:
-    """Return the smallest graph and garment that touch every weight: one edge, two body points."""
-    sizes = feature_sizes(config)
-    zeros, pair = jnp.zeros, jnp.arange(2)
-    names = {"world", "world_reverse"} if config.update_body else {"world"}
+def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Places]:
+    """Return the smallest graph that touches every weight: one edge, two body points."""
+    sizes, zeros, pair = feature_sizes(config), jnp.zeros, jnp.arange(2)
+    worlds = ("world", "world_reverse") if config.update_body else ("world",)
     graph = jraph.GraphsTuple(
         nodes={"garment": zeros((2, sizes["garment"])), "body": zeros((2, sizes["body"]))},
-        edges={"mesh": zeros((2, sizes["mesh"])), **{name: zeros((2, sizes["world"])) for name in names}},
-        senders={"mesh": pair[::-1], **dict.fromkeys(names, pair)},
-        receivers={"mesh": pair, **dict.fromkeys(names, pair)},
+        edges={"mesh": zeros((2, sizes["mesh"])), **{name: zeros((2, sizes["world"])) for name in worlds}},
+        senders={"mesh": pair[::-1], **dict.fromkeys(worlds, pair)},
+        receivers={"mesh": pair, **dict.fromkeys(worlds, pair)},
         globals={
+            "reverse_edges": pair[::-1],
+            "incoming_edges": pair[:, None],
             "garment_type": zeros(2, jnp.int32),
             "body_type": zeros(2, jnp.int32),
             "world_mask": jnp.ones(2, bool),
-            "world_slot": pair,
         },
         n_node=None,
         n_edge=None,
     )
-    garment = Garment(
-        rest_positions=zeros((2, 3)),
-        faces=zeros((0, 3), jnp.int32),
-        rest_areas=zeros(0),
-        inverse_rest_frames=zeros((0, 2, 2)),
-        hinges=zeros((0, 4), jnp.int32),
-        hinge_rest_areas=zeros(0),
-        hinge_rest_angles=zeros(0),
-        vertex_areas=jnp.ones(2),
-        senders=pair[::-1],
-        receivers=pair,
-        reverse_edges=pair[::-1],
-        neighbors=pair[::-1, None],
-        neighbor_mask=jnp.ones((2, 1), bool),
-        face_incidence=zeros((2, 0), jnp.int32),
-        hinge_incidence=zeros((2, 0), jnp.int32),
-        edge_mask=jnp.ones(2, bool),
-        vertex_mask=jnp.ones(2, bool),
-        geodesic_embedding=zeros((2, config.embedding_size)),
-        skin_weights=jnp.ones((2, 1)),
-        skin_indices=zeros((2, 1), jnp.int32),
-        is_pinned=zeros(2, bool),
-    )
-    return graph, garment
+    if config.hierarchical:
+        level = CoarseEdges(pair[::-1], pair, pair[::-1], jnp.ones(2, bool), jnp.ones(2, bool))
+        for name in COARSE_SETS:
+            graph.edges[name] = graph.edges["mesh"]
+            graph.senders[name], graph.receivers[name] = level.senders, level.receivers
+        graph.globals["coarse"] = (level,) * len(COARSE_SETS)
+    return graph, Places(zeros((2, config.embedding_size)), jnp.ones(2, bool))

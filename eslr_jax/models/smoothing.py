@@ -1,8 +1,8 @@
-"""A network that smooths vertex latents and sends no messages: the cheapest pass.
+"""A network that smooths vertex latents and sends no messages: the cheapest refinement step.
 
-Of LSDMP this keeps Laplacian smoothing and leaves out the edges. Their perceptrons take three quarters of a pass,
-six edges to a vertex; and where the potential's gradient is an input, a vertex already knows what its springs,
-hinges and contacts want. Features of a vertex's world edge and of its body point join the vertex's own.
+It keeps Laplacian smoothing of LSDMP and leaves out the edges, whose perceptrons take three quarters of the
+time (six edges to a vertex). With the potential's gradient as an input, a vertex knows what its springs,
+hinges and contacts want. The features of a vertex's world edge and of its body point join its own.
 """
 
 from __future__ import annotations
@@ -17,23 +17,22 @@ from jaxtyping import Array, Float
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph import features
 from eslr_jax.graph.build import feature_sizes
-from eslr_jax.graph.operators import MeshTables, WorldTables, from_world, mesh_tables, sum_neighbors
-from eslr_jax.models.branches import TwoBranches, graph_world_tables, stack
+from eslr_jax.graph.operators import MeshTables, mesh_tables, sum_neighbors
+from eslr_jax.models.branches import Places, TwoBranches, stack, world_mask
 from eslr_jax.models.lsdmp import make_mlp
 from eslr_jax.models.mlp import MLP
-from eslr_jax.types import Garment
 
 
 class EncodedVertices(NamedTuple):
     """The encoder's hidden layer, as far as a frame's constant features decide it."""
 
     hidden: Float[Array, "vertices hidden"]
-    mesh_tables: MeshTables
-    world_tables: WorldTables | None
+    tables: MeshTables
+    world_mask: Float[Array, "vertices 1"]
 
 
 class SmoothingLayer(nn.Module):
-    """v_i + f_v(v_i, p_i^1, ..., p_i^K), where p^k is the mean of p^(k-1) over the neighbours and p^0 is v.
+    """v_i += f_v(v_i, p_i^1, ..., p_i^K), where p^k is the mean of p^(k-1) over the neighbours and p^0 is v.
 
     Source: paper, eq. 3 without its edges; all K smoothings are read, not the last alone.
     """
@@ -44,18 +43,18 @@ class SmoothingLayer(nn.Module):
         """Declare the perceptron."""
         self.vertex_mlp = make_mlp(self.config, 1 + self.config.smoothing_steps)
 
-    def __call__(self, latents: Float[Array, "vertices latent"], mesh: MeshTables):
+    def __call__(self, latents: Float[Array, "vertices latent"], tables: MeshTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
-        inverse = jnp.where(mesh.degree > 0, 1 / jnp.maximum(mesh.degree, 1), 0)
+        inverse = jnp.where(tables.degree > 0, 1 / jnp.maximum(tables.degree, 1), 0)
         hidden, smoothed = self.vertex_mlp.start(latents, 0, bias=True), latents
         for step in range(1, self.config.smoothing_steps + 1):
-            smoothed = sum_neighbors(smoothed, mesh) * inverse
+            smoothed = sum_neighbors(smoothed, tables) * inverse
             hidden = hidden + self.vertex_mlp.start(smoothed, step * self.config.latent_size)
         return latents + self.vertex_mlp.finish(hidden), None
 
 
 class SmoothingNetwork(TwoBranches):
-    """The whole network, with the calls of `EncodeProcessDecode`."""
+    """The whole network, with the methods of `EncodeProcessDecode`."""
 
     def setup(self) -> None:
         """Declare encoder, stacks and decoder."""
@@ -73,35 +72,32 @@ class SmoothingNetwork(TwoBranches):
         self.declare_decoder()
 
     def __call__(
-        self, graph: jraph.GraphsTuple, garment: Garment, statistics: None = None
+        self, graph: jraph.GraphsTuple, places: Places, statistics: object = None
     ) -> Float[Array, "vertices outputs"]:
-        """Apply the network to a full graph; see `EncodeProcessDecode`."""
-        return self.process(self.encode_frame(graph, garment), garment)
+        """Return the raw output for a whole graph; see `EncodeProcessDecode`."""
+        return self.process(self.encode_frame(graph), places)
 
-    def encode_frame(
-        self, graph: jraph.GraphsTuple, garment: Garment, statistics: None = None
-    ) -> EncodedVertices:
-        """Return the encoder's first layer on a full graph, or on the features that stay for a frame."""
+    def encode_frame(self, graph: jraph.GraphsTuple, statistics: object = None) -> EncodedVertices:
+        """Return the encoder's first layer, for a whole graph or for the features that stay for a frame."""
         nodes = graph.nodes["garment"]
-        hidden, tables = self.encoder.start(nodes, 0, bias=True), None
+        hidden, mask = self.encoder.start(nodes, 0, bias=True), world_mask(graph, nodes.dtype)
         if "world" in graph.edges:
-            tables = graph_world_tables(graph, nodes.dtype)
             rows = self.encoder.start(graph.nodes["body"], self.body_column)
             rows = rows + self.encoder.start(graph.edges["world"], self.world_column)
-            hidden = hidden + from_world(rows, tables)
-        return EncodedVertices(hidden, mesh_tables(garment, nodes.dtype), tables)
+            hidden = hidden + rows * mask
+        return EncodedVertices(hidden, mesh_tables(graph, nodes.dtype), mask)
 
     def encode_refinement(self, encoded: EncodedVertices, changing: jraph.GraphsTuple) -> EncodedVertices:
-        """Add the features of a pass, of `build_refinement_graph`, to those of its frame."""
+        """Add the features of a refinement step to those of its frame."""
         nodes, edges = changing.nodes, changing.edges
         hidden = encoded.hidden + self.encoder.start(nodes["garment"], features.NODE_FRAME_SIZE)
-        if encoded.world_tables is not None:
+        if "world" in edges:
             rows = self.encoder.start(edges["world"], self.world_column + features.WORLD_FRAME_SIZE)
-            hidden = hidden + from_world(rows, encoded.world_tables)
+            hidden = hidden + rows * encoded.world_mask
         return encoded._replace(hidden=hidden)
 
-    def process(self, encoded: EncodedVertices, garment: Garment) -> Float[Array, "vertices outputs"]:
+    def process(self, encoded: EncodedVertices, places: Places) -> Float[Array, "vertices outputs"]:
         """Finish the encoder, run both stacks and decode."""
         vertices = self.encoder.finish(encoded.hidden)
-        processed, _ = self.layers(vertices, encoded.mesh_tables)
-        return self.decode(processed, vertices, garment)
+        processed, _ = self.layers(vertices, encoded.tables)
+        return self.decode(processed, vertices, places)

@@ -1,15 +1,19 @@
 """Pictures and video without a display or a GPU (extra `render`)."""
 
+from eslr_jax.render.annotate import add_color_bar, side_by_side, write_label
 from eslr_jax.render.colors import color_scale
 from eslr_jax.render.files import write_png, write_video
-from eslr_jax.render.pictures import contact_sheet, render_frame, render_frames, side_by_side
+from eslr_jax.render.pictures import contact_sheet, moment_text, render_frame, render_frames
 
 __all__ = [
+    "add_color_bar",
     "color_scale",
     "contact_sheet",
+    "moment_text",
     "render_frame",
     "render_frames",
     "side_by_side",
+    "write_label",
     "write_png",
     "write_video",
 ]

@@ -1,4 +1,4 @@
-"""Where the camera stands: it looks level at a box and sees all of it."""
+"""Where the camera stands: it follows a subject, looks at it from one side, and sees all of it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import dataclasses
 import math
 
 import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 
 from eslr_jax.errors import ConfigError
 
-_ANGLES = {"front": 0.0, "side": 90.0, "back": 180.0}  # degrees around +Y from +Z, where a body faces
+_ANGLES = {"front": 0.0, "side": 90.0, "back": 180.0}  # degrees around +Y from the front towards the left
 _VIEW_ANGLE = math.radians(24.0)  # of the longer picture side: a portrait lens, little perspective
 _ELEVATION = math.radians(9.0)  # the camera looks down a little, so that the ground shows
-_MARGIN = 1.12  # share of the picture left around the box
+_MARGIN = 1.12  # share of the picture left around the subject
+_CALM = 8.0  # [frames] over which the camera's place and direction are averaged
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,14 +25,14 @@ class Camera:
     origin: np.ndarray  # [3], [m]
     target: np.ndarray  # [3], [m]
     view_angle: float  # vertical [rad]
+    angle: float  # direction from the target to the camera, around +Y from +Z towards +X [rad]
 
 
 def parse_angle(camera: str | float) -> float:
     """Turn a camera's name or its angle in degrees into an angle in radians.
 
     Args:
-        camera: "front" (+Z, where a body in rest pose faces), "side" (+X, its left), "back", or degrees from
-            the front towards the side.
+        camera: "front", "side" (the subject's left), "back", or degrees from the front towards the left.
 
     Raises:
         ConfigError: If the name is unknown or the angle is not finite.
@@ -43,10 +46,61 @@ def parse_angle(camera: str | float) -> float:
     return math.radians(camera)
 
 
+def facing_angles(
+    positions: Float[np.ndarray, "frames vertices 3"], rest_positions: Float[np.ndarray, "vertices 3"]
+) -> Float[np.ndarray, " frames"]:
+    """Return where a body faces in every frame, around +Y from +Z towards +X [rad], without jumps of a turn.
+
+    It is the turn about the vertical that brings the resting body closest to the posed one.
+
+    Args:
+        positions: Body vertices [m], shape [frames, vertices, 3].
+        rest_positions: The same vertices of a body that faces +Z [m], shape [vertices, 3].
+    """
+    rest = rest_positions - rest_positions.mean(axis=0)
+    posed = positions - positions.mean(axis=1, keepdims=True)
+    sine = posed[..., 0] @ rest[:, 2] - posed[..., 2] @ rest[:, 0]
+    cosine = posed[..., 0] @ rest[:, 0] + posed[..., 2] @ rest[:, 2]
+    return np.unwrap(np.arctan2(sine, cosine))
+
+
+def follow(
+    subject: Float[np.ndarray, "frames vertices 3"],
+    angles: Float[np.ndarray, " frames"],
+    *,
+    aspect: float,
+    zoom: float = 1.0,
+    focus: Float[np.ndarray, "frames points 3"] | None = None,
+) -> tuple[list[Camera], float]:
+    """Place a camera per frame that keeps the subject in the middle at one distance.
+
+    Args:
+        subject: Vertices of what is to be seen [m], shape [frames, vertices, 3].
+        angles: Direction of the camera around +Y, from +Z towards +X [rad], shape [frames].
+        aspect: Picture width over height.
+        zoom: How many times larger than with the whole subject in the picture.
+        focus: Points whose centre is looked at [m], shape [frames, points, 3]; by default the subject's.
+
+    Returns:
+        A camera per frame, and the height of the floor: the lowest point over all frames [m].
+    """
+    floor, top = float(subject[..., 1].min()), float(subject[..., 1].max())
+    centers = subject.mean(axis=1)
+    centers[:, 1] = (floor + top) / 2
+    offsets = subject - centers[:, None]
+    radius = float(np.hypot(offsets[..., 0], offsets[..., 2]).max())
+    targets = _calm(centers if focus is None else focus.mean(axis=1))
+    cameras = [
+        place_camera(target, (top - floor) / 2, radius, angle, aspect, zoom=zoom)
+        for target, angle in zip(targets, _calm(angles), strict=True)
+    ]
+    return cameras, floor
+
+
 def place_camera(
-    center: np.ndarray, half_height: float, radius: float, angle: float, aspect: float
+    center: np.ndarray, half_height: float, radius: float, angle: float, aspect: float, *, zoom: float = 1.0
 ) -> Camera:
-    """Look at an upright cylinder so that it fits the picture, from whatever side.
+    """Return a camera that looks at an upright cylinder and sees all of it, from whatever side.
 
     Args:
         center: Centre of the cylinder [m], shape [3].
@@ -54,13 +108,18 @@ def place_camera(
         radius: Its radius [m].
         angle: Direction of the camera around +Y, from +Z towards +X [rad].
         aspect: Picture width over height.
-
-    Returns:
-        The camera.
+        zoom: How many times larger than the whole cylinder in the picture.
     """
     view_angle = 2 * math.atan(math.tan(_VIEW_ANGLE / 2) / max(aspect, 1.0))
     half_needed = max(half_height + radius * math.sin(_ELEVATION), radius / aspect, 1e-3)
     distance = _MARGIN * half_needed / math.tan(view_angle / 2)
     level = math.cos(_ELEVATION)
     direction = np.array([math.sin(angle) * level, math.sin(_ELEVATION), math.cos(angle) * level])
-    return Camera(origin=center + distance * direction, target=np.asarray(center), view_angle=view_angle)
+    narrowed = 2 * math.atan(math.tan(view_angle / 2) / zoom)
+    return Camera(center + distance * direction, np.asarray(center), narrowed, float(angle))
+
+
+def _calm(values: np.ndarray) -> np.ndarray:
+    """Return values over time without their quick changes; what changes evenly stays as it is."""
+    even = np.linspace(values[0], values[-1], len(values))
+    return even + gaussian_filter1d(values - even, _CALM, axis=0, mode="nearest")

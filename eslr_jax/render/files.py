@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
         writer = ffmpeg.write_frames(str(temporary), (width, height), fps=fps, macro_block_size=2, quality=8)
         writer.send(None)
         try:
-            for picture in _chain(first, pictures):
+            for picture in chain([first], pictures):
                 if picture.shape != first.shape:
                     raise AssetError(
                         f"frames of {path} have sizes {first.shape} and {picture.shape}; use one size"
@@ -62,14 +63,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
             writer.close()
 
 
-def _chain(first: np.ndarray, rest: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
-    """Yield the first picture and then the others."""
-    yield first
-    yield from rest
-
-
 def _checked(image: np.ndarray, path: str | Path) -> np.ndarray:
-    """The picture, or AssetError unless it is uint8 [height, width, 3]."""
+    """Return a picture; raise AssetError unless it is uint8 [height, width, 3]."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise AssetError(
             f"can't write {path}: the picture is {image.dtype} {image.shape}, not uint8 [height, width, 3]"

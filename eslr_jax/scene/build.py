@@ -1,4 +1,4 @@
-"""From a garment, a moving body and a plan to the scene that a rollout reads; pure, fit for jit, vmap and grad."""
+"""From a garment, a moving body and a plan to the scene that a rollout reads; pure, for jit, vmap and grad."""
 
 from __future__ import annotations
 

@@ -99,7 +99,8 @@ def refine(
         problem: The frame's problem.
         state: Cloth at t.
         config: Architecture with any `output` but "acceleration"; static.
-        detach: Stop gradients between steps, so that each is trained to do its best from where it begins.
+        detach: Stop gradients between steps, and those of the weights that combine directions: each step is then
+            trained to do its best from where it begins.
     """
     garment, material = problem.garment, problem.material
     inputs = graph_inputs(problem, state)
@@ -122,7 +123,9 @@ def refine(
             directions = jnp.stack([move, inputs.step, inputs.correction])
             if problem.pin_targets is not None:
                 directions = jnp.where(garment.is_pinned[:, None], 0.0, directions)
-            move = combine_directions(lambda x: potential(x, problem), point, directions)
+            move = combine_directions(
+                lambda x: potential(x, problem), point, directions, fixed_weights=detach
+            )
         position = pin(problem, inputs.guess + move)
         onward = jax.lax.stop_gradient(position) if detach else position
         return next_refinement(inputs, onward, point.gradient), (position, point)
@@ -134,7 +137,7 @@ def refine(
 def descent_step(
     problem: FrameProblem, point: Point, longest: Float[Array, ""]
 ) -> Float[Array, "vertices 3"]:
-    """Return the preconditioned step down the gradient [m], shape [vertices, 3], no vertex farther than `longest`.
+    """Return the preconditioned step down the gradient [m], shape [vertices, 3], bounded by `longest`.
 
     The stretch energy grows with the fourth power of a displacement: from a torn-up state, full steps would
     overshoot further each time. The bound is a trust region of one mesh spacing.

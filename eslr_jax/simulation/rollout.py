@@ -13,6 +13,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.solve import SOLUTION
 from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper
@@ -119,6 +120,9 @@ def scan_frames(
         state, report = stepper(frame_problem(scene, state, frame), state)
         return state, Frames(state.position, state.velocity, state.friction_load, report)
 
+    # A derivative through time keeps each frame's state and solution, and does the rest of it again.
+    policy = jax.checkpoint_policies.save_only_these_names(SOLUTION)
+    advance = jax.checkpoint(advance, prevent_cse=False, policy=policy)
     has_tracks = bool(jax.tree.leaves(inputs))
     return jax.lax.scan(advance, state, inputs, length=None if has_tracks else scene.num_frames - 1)
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Int
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
+from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper
@@ -190,6 +191,25 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
         faces=math.ceil(_HEADROOM * faces) if faces > before.faces else before.faces,
     )
     return None if capacity == before else scene.replace(self_contact=capacity)
+
+
+def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[Trajectory, Scene]:
+    """Return the last frames of a trajectory and of its scene, without those in which the garment settled."""
+    first = trajectory.num_frames - num_frames
+    if first <= 0:
+        return trajectory, scene
+    whole = trajectory.replace(status=None, first_bad_frame=None)
+    kept = jax.tree.map(lambda leaf: leaf[first:], whole)
+    bad = trajectory.first_bad_frame
+    kept = kept.replace(status=trajectory.status, first_bad_frame=jnp.where(bad >= 0, bad - first, bad))
+    body, pins = scene.body, scene.pin_targets
+    state = initial_state(kept.positions[0], kept.velocities[0])
+    return kept, scene.replace(
+        body=None if body is None else body.replace(positions=body.positions[first:]),
+        pin_targets=None if pins is None else pins[first:],
+        initial_state=state.replace(friction_load=kept.friction_loads[0]),
+        num_frames=num_frames,
+    )
 
 
 def check_scene(scene: Scene) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -45,8 +46,9 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
     """
 
     def step(problem: FrameProblem, state: ClothState) -> tuple[ClothState, FrameReport]:
-        start, status = find_start(params, problem, state, config)
         if config.iterations or iterations is not None:
+            # A minimum does not depend on where the solver began, and neither do its derivatives.
+            start, status = find_start(*jax.lax.stop_gradient((params, problem, state)), config)
             minimum = solve(
                 problem,
                 start,
@@ -55,6 +57,7 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
                 memory=config.memory,
             )
         else:
+            start, status = find_start(params, problem, state, config)
             minimum = Minimum(*start.point, iterations=jnp.int32(0))
         position = pin(problem, minimum.position)
         report = FrameReport(

@@ -14,6 +14,7 @@ from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene.plan import shared_surface
@@ -69,6 +70,8 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     """
     options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
     garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
+    if config.model.hierarchical:
+        garments = [add_coarse_edges(garment) for garment in pad_alike(garments)]
     return build_training_data(
         garments, load_body(), [load_motion(clip) for clip in split_clips(config.split)]
     )

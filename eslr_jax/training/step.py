@@ -18,7 +18,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
-from eslr_jax.graph.normalizer import Normalizer
+from eslr_jax.graph.normalizer import is_warming_up
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
 from eslr_jax.physics.hood import BodyFrames, HoodParameters, HoodProblem, collision_weight, hood_terms
 from eslr_jax.physics.membrane import principal_stretches
@@ -31,7 +31,7 @@ from eslr_jax.simulation.stepper import next_state
 from eslr_jax.training.data import TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import FPS, Slot, empty_pool, start_trajectory
-from eslr_jax.types import Garment, PhysicsConstants, Scene, SceneBody
+from eslr_jax.types import Garment, Normalizer, PhysicsConstants, Scene, SceneBody
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
@@ -141,10 +141,12 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         gradient, samples = run(state.params, data, state.step, batch)
         norm = optax.tree.norm(gradient)
         is_good = jnp.isfinite(norm) & jnp.all(jnp.isfinite(samples.metrics["loss"]))
+        # HOOD's normalisers see a hundred graphs before anything is learned on their statistics.
+        is_learning = is_good & ~is_warming_up(state.params["statistics"])
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, state.params["params"])
         trained = optax.apply_updates(state.params["params"], updates)
-        keep = partial(jax.tree.map, lambda new, old: jnp.where(is_good, new, old))
+        keep = partial(jax.tree.map, lambda new, old: jnp.where(is_learning, new, old))
         params = {**state.params, "params": keep(trained, state.params["params"])}
         for sample in range(size if samples.statistics else 0):
             params = merge_statistics(params, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023

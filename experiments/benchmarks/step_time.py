@@ -1,12 +1,11 @@
-"""Time a step of the networks: the exact path against the plain build, reduced precision, and PyTorch.
+"""Time a step of the networks: the package's build against a plain one, reduced precision, and PyTorch.
 
     python experiments/benchmarks/step_time.py --json out.json
 
-All variants of a comparison run in turns (A B A B ...) in one process and are given as ratios of medians.
-Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a
-process of its own that is bound to one core; it is left out where PyTorch is missing. `floor_share` is the
-share of the exact forward pass that its matrix products alone would take, at the rate of one large product
-measured in the same turns.
+All builds of a comparison run in turns (A B A B ...) in one process and are compared as ratios of medians.
+Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a process
+of its own on one core; without PyTorch it is left out. `floor_share` is the share of the exact forward pass that
+its matrix products would take at the rate of one large product, which is measured in the same turns.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ MODEL = "eslr-15"
 def keep_memory() -> None:
     """Make glibc keep freed memory: one arena, no mapping per allocation, nothing given back.
 
-    Otherwise every call gets its temporary buffers fresh from the kernel and spends up to a fifth of its time
-    on their page faults. Has to happen before the first array. Linux with glibc only.
+    Otherwise every call gets its temporary buffers from the kernel and spends up to a fifth of its time on page
+    faults. Call it before the first array. It needs Linux with glibc.
     """
     import ctypes
 
@@ -41,26 +40,13 @@ def keep_memory() -> None:
         mallopt(option, value)
 
 
-def timed(function, args) -> float:
-    """Return seconds of one call."""
-    import jax
-
-    start = time.perf_counter()
-    jax.block_until_ready(function(*args))
-    return time.perf_counter() - start
-
-
 def take_turns(functions: dict, turns: int) -> dict[str, float]:
-    """Return the median seconds of every function, called in turns after one warm-up."""
+    """Return the median seconds of compiled functions, called in turns after one warm-up."""
     import numpy as np
 
-    times = {name: [] for name in functions}
-    for turn in range(turns + 1):
-        for name, (function, args) in functions.items():
-            seconds = timed(function, args)
-            if turn:
-                times[name].append(seconds)
-    return {name: float(np.median(values)) for name, values in times.items()}
+    from eslr_jax.evaluation.scene_parts import time_in_turns
+
+    return {name: 1e-3 * float(np.median(times)) for name, times in time_in_turns(functions, turns).items()}
 
 
 def compile_timed(function, args) -> tuple:
@@ -199,7 +185,7 @@ def matmul_flops(config, vertices: int, edges: int) -> float:
 
 
 def measure_refinement_steps(size: str, turns: int) -> dict:
-    """Return the time of one pass of the small models, and of what a frame needs once."""
+    """Return the milliseconds of a refinement step of the small models, and of what they do once per frame."""
     import jax
     from reference_models import make_scene
 
@@ -221,7 +207,7 @@ def measure_refinement_steps(size: str, turns: int) -> dict:
 
         graph, encoded = jax.jit(frame)(params, *scene)
         functions[f"{name} frame"] = (jax.jit(frame), (params, *scene))
-        functions[f"{name} pass"] = (jax.jit(one_step), (params, graph, encoded, *scene))
+        functions[f"{name} refinement step"] = (jax.jit(one_step), (params, graph, encoded, *scene))
     return {name: round(1e3 * seconds, 3) for name, seconds in take_turns(functions, 5 * turns).items()}
 
 

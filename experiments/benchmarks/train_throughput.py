@@ -1,30 +1,30 @@
-"""What a training step costs beside the forward pass, backward pass and update of the same model alone.
+"""Compare a training step with the forward pass, backward pass and update of the same model alone.
 
     python experiments/benchmarks/train_throughput.py [--json] [--smoke]
 
-The whole step also poses the body, searches contacts, states the frame's problem, moves the trajectory on and
-keeps the metrics. The bare step has its problem given. Both are called in turns on the same frame.
+The whole step also poses the body, searches contacts, states the frame's problem, advances the trajectory and
+keeps the metrics. The bare step is given a problem of the same size. Both are called in turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from eslr_jax.evaluation.calibrate import device_name
+from eslr_jax.assets import load_body, load_motion, split_clips
+from eslr_jax.body.motion import pose_body
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.simulation.step import FrameInput, frame_problem
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
-from eslr_jax.training.pool import skin, start_trajectory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import init_train_state, make_optimizer, make_train_step
 
@@ -45,19 +45,15 @@ def main() -> None:
     config = load_recipe(RECIPE, {"split": "validation", **changes})
     data = load_training_data(config, config.vertices[0])
     state = init_train_state(config, (data,))
-    garment = data.garment(jnp.int32(0))
-    slot = jax.jit(partial(start_trajectory, data=data, garment=garment, config=config))(jax.random.key(0))
-    before, after = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
-    frame = FrameInput(data.body(before, slot.girth), data.body(after, slot.girth), skin(garment, after))
-    problem = frame_problem(
-        garment, slot.state, frame, data.surface, jnp.float32(1 / 30), PhysicsParameters()
-    )
+    poses = pose_body(load_body(), load_motion(split_clips(config.split)[0]), num_frames=2)
+    scene = prepare_scene(data.garment(jnp.int32(0)), poses, surface=data.surface)
+    cloth = scene.initial_state
+    problem = jax.jit(frame_problem)(scene, cloth, jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene)))
     optimizer = make_optimizer(config)
 
-    def bare(trained, moments):
+    def bare(trained, moments, problem):
         def loss_of(trained):
-            weights = {**state.params, "params": trained}
-            return physics_loss(weights, garment, slot.material, problem, slot.state, config)[0]
+            return physics_loss({**state.params, "params": trained}, problem, cloth, config)[0]
 
         gradient = jax.grad(loss_of)(trained)
         updates, moments = optimizer.update(gradient, moments, trained)
@@ -67,7 +63,7 @@ def main() -> None:
     times = take_turns(
         {
             "whole step": (lambda state: step.__wrapped__(state, data), (state,)),
-            "forward, backward, update": (bare, (state.params["params"], state.optimizer)),
+            "forward, backward, update": (bare, (state.params["params"], state.optimizer, problem)),
         },
         1 if arguments.smoke else 40,
     )

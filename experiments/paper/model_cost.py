@@ -2,9 +2,9 @@
 
     python experiments/paper/model_cost.py [--smoke]
 
-Latency is a frame of the T-shirt at 4k vertices, contacts included, the networks in turns. Memory is what XLA
-sets aside for the call, weights included. Loss is the Total of `native_garments.json`: full-size networks have
-none, to train them takes a GPU.
+Latency is the time of one frame of the T-shirt at 4k vertices, contact search included; the networks run in
+turns. Memory is what XLA allocates for the call, weights included. Loss is the Total of `native_garments.json`.
+Full-size networks have none, because training them takes a GPU.
 """
 
 from __future__ import annotations
@@ -13,19 +13,17 @@ import json
 
 import jax
 from native_garments import ABLATION
-from rollouts import RESULTS, arguments, write
+from rollouts import RESULTS, arguments, embedding_options, write
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
 from eslr_jax.assets.load import START_MODEL, default_model
 from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.calibrate import device_name
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.models.registry import MODELS, count_parameters, init_model
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scene
-from eslr_jax.simulation.network import network_step
-from eslr_jax.simulation.scan import frame_inputs
-from eslr_jax.simulation.step import frame_problem
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.network import predict
 
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10")
 TRAINED = (default_model(), START_MODEL, *ABLATION)
@@ -42,18 +40,14 @@ def main() -> None:
     parts, rows = {}, {}
     for name in names:
         params, config = (init_model(MODELS[name]), MODELS[name]) if name in FULL_SIZE else load_model(name)
-        embedding = {"embedding_size": config.embedding_size, "embedding_mode": config.embedding_mode}
-        scene = prepare_scene(load_garment("tshirt", vertices=size, **embedding), poses)  # type: ignore[arg-type]
+        scene = prepare_scene(load_garment("tshirt", vertices=size, **embedding_options(config)), poses)
         inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
         def forward(params, state, config=config, scene=scene, inputs=inputs):
-            problem = frame_problem(
-                scene.garment, state, inputs, scene.surface, scene.timestep, PhysicsParameters()
-            )
-            return network_step(params, scene.garment, scene.material, problem, state, config)[0]
+            return predict(params, frame_problem(scene, state, inputs), state, config).position
 
-        memory = jax.jit(forward).lower(params, scene.start).compile().memory_analysis()
-        parts[name] = (forward, (params, scene.start))
+        memory = jax.jit(forward).lower(params, scene.initial_state).compile().memory_analysis()
+        parts[name] = (forward, (params, scene.initial_state))
         rows[name] = {
             "layers": config.message_passing_steps,
             "refinement_steps": config.refinement_steps,

@@ -2,9 +2,9 @@
 
     python experiments/paper/qualitative.py [--smoke]
 
-Free rollouts on an unseen clip, the same frame of each. The optimum stands where the paper has ARCSim, a
-reference that no network takes part in. Writes qualitative.png (cloth), stretch_energy.png (energy per area on
-cloth, one scale for all), stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
+Free rollouts on an unseen clip, the same frame of each. Our optimum takes the place of the paper's reference,
+ARCSim. Writes qualitative.png (cloth), stretch_energy.png (energy per area on cloth, one scale for all),
+stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import PhysicsParameters
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
-from eslr_jax.scene import prepare_scene
-from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
@@ -98,7 +97,7 @@ def main() -> None:
         params, config, options = simulator(name)
         for garment in garments:
             scene = prepare_scene(load_garment(garment, vertices=chosen.vertices, **options), poses)
-            positions = simulate_scene(params, scene, PhysicsParameters(), config).positions
+            positions = rollout_scene(params, scene, config).positions
             results[name, garment] = np.asarray(positions), scene, np.asarray(face_energies(positions, scene))
             print(name, garment, flush=True)
 

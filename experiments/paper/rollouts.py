@@ -1,4 +1,4 @@
-"""Free rollouts measured as HOOD's and the paper's tables are: six terms and their Total, set `hood`."""
+"""Free rollouts, measured by HOOD's six terms and their Total, as in its tables and the paper's."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hood_metrics import hood_metrics
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.calibrate import SOLVER, simulator_of
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.evaluate import back_and_forth
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.physics.hood import HoodParameters, hood_metrics
-from eslr_jax.physics.problem import PhysicsParameters
-from eslr_jax.scene import prepare_scenes
-from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.physics.hood import HoodParameters
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.simulation.budget import SOLVER
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
 OPTIMUM = "optimum"
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
-_OPTIMUM_ITERATIONS = 60  # of L-BFGS: 0.05 % of the drop
+_OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.05 % of the initial gap
 
 
 def arguments(description: str | None, *, frames: int = 150) -> argparse.Namespace:
@@ -45,14 +47,22 @@ def arguments(description: str | None, *, frames: int = 150) -> argparse.Namespa
 
 
 def simulator(model: str) -> tuple[Any, SimConfig, dict[str, Any]]:
-    """Return weights, configuration and garment options of a network or the optimum; NAME+20 adds iterations."""
+    """Return weights, configuration and garment options of a network, or of the optimum.
+
+    Args:
+        model: Name of a bundled network, NAME+20 for twenty solver iterations behind it, or `OPTIMUM`.
+    """
     if model == OPTIMUM:
         return *simulator_of(SOLVER, _OPTIMUM_ITERATIONS), {}
     name, _, iterations = model.partition("+")
     params, config = simulator_of(name, int(iterations or 0))
-    assert config.model is not None
+    return params, config, embedding_options(config.model)
+
+
+def embedding_options(config: ModelConfig | None) -> dict[str, Any]:
+    """Return the options of `load_garment` that a network asks for."""
     names = ("embedding_size", "embedding_mode")
-    return params, config, {name: getattr(config.model, name) for name in names}
+    return {} if config is None else {name: getattr(config, name) for name in names}
 
 
 def table(
@@ -64,15 +74,15 @@ def table(
     frames: int = 150,
     **garment_options: Any,
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the measures of every model on every garment, means over clips.
+    """Return the measures of every model on every garment, as means over clips.
 
     Args:
-        models: As for `simulator`; `OPTIMUM` is the solver run near convergence.
+        models: Names as `simulator` takes them.
         garments: Names of bundled garments.
         clips: Names of bundled clips, played back and forth.
-        vertices: Resolution.
-        frames: Of every rollout.
-        garment_options: Passed on to `load_garment`, over the model's own.
+        vertices: Resolution of the garments.
+        frames: Length of every rollout.
+        garment_options: Options of `load_garment` in place of the model's own.
     """
     body = load_body()
     motions = [
@@ -83,13 +93,14 @@ def table(
         params, config, options = simulator(model)
         cloths = [load_garment(name, vertices=vertices, **(options | garment_options)) for name in garments]  # type: ignore[arg-type]
         # One size and one body surface for all: one compilation per model.
-        scenes = iter(prepare_scenes([cloth for cloth in cloths for _ in motions], motions * len(cloths)))
+        worn = [cloth for cloth in cloths for _ in motions]
+        scenes = iter(prepare_scenes(worn, motions * len(cloths), [COTTON] * len(worn)))
         measured[model] = {}
         for garment in garments:
             rows = []
             for poses in motions:
                 scene = next(scenes)
-                trajectory = simulate_scene(params, scene, PhysicsParameters(), config)
+                trajectory = rollout_scene(params, scene, config)
                 root = poses.joint_transforms[0, 0] @ np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
                 rows.append(measure(trajectory, scene, float(root[1])))
             measured[model][garment] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -98,28 +109,19 @@ def table(
 
 
 def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[str, float]:
-    """Return the terms [J] as means over frames, their Total, and what the Total does not see.
+    """Return the terms [J] as means over frames, their Total, and stretch and penetration beside it.
 
     Args:
         trajectory: A rollout.
-        scene: Its scene.
-        root_height: Of the root joint in the first frame [m]: potential energy counts from near it (HOOD).
+        scene: Its scene, with a body.
+        root_height: Height of the root joint in the first frame [m]; HOOD counts potential energy from near it.
     """
-    assert scene.surface is not None
-    assert scene.body_positions is not None
     origin = np.array([0.0, root_height + _ORIGIN_ABOVE_ROOT, 0.0], np.float32)
     metrics = hood_metrics(
-        trajectory.positions - origin,
-        scene.body_positions - origin,
-        scene.surface.faces,
-        scene.garment,
-        scene.material,
-        scene.timestep,
-        parameters=HoodParameters(),
-        criterion="postcvpr",
+        trajectory.positions, scene, origin=origin, parameters=HoodParameters(), criterion="postcvpr"
     )
-    terms = {name: float(np.mean(np.asarray(getattr(metrics.terms, name)))) for name in TERMS}
-    frames = measure_frames(trajectory, scene, PhysicsParameters())
+    terms = {name: float(np.mean(getattr(metrics.terms, name))) for name in TERMS}
+    frames = measure_frames(trajectory, scene)
     depth = -np.asarray(frames.distances)
     return {
         **terms,

@@ -74,6 +74,7 @@ def test_keys_tell_contents_apart():
     assert content_key(np.zeros(2), "a") == content_key(np.zeros(2), "a")
 
 
+@pytest.mark.slow
 def test_two_processes_may_make_the_same_entry(empty_cache):
     code = (
         "import numpy as np; from eslr_jax.assets.cache import cached_arrays\n"

@@ -10,6 +10,10 @@ from eslr_jax.body import lbs, retarget
 
 ROOT = Path(__file__).resolve().parents[2]
 TREE = (-1, 0, 1, 0)  # a chain of three joints and a branch
+joint_transforms = jax.jit(lbs.joint_transforms, static_argnums=3)
+skin_points = jax.jit(lbs.skin)
+rotation_matrix = jax.jit(lbs.rotation_matrix)
+turning = jax.jit(jax.jacobian(lbs.rotation_matrix))
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +52,12 @@ def test_rotation_matrix_equals_scipy(angle, rng):
     axis = rng.normal(size=3)
     vector = angle * axis / np.linalg.norm(axis)
     expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(lbs.rotation_matrix(jnp.float32(vector)), expected, atol=1e-6)
+    np.testing.assert_allclose(rotation_matrix(jnp.float32(vector)), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-20, 1e-4, 0.1])
 def test_rotation_matrix_gradient_near_zero_is_the_generator(scale):
-    jacobian = jax.jacobian(lbs.rotation_matrix)(jnp.float32([scale, 0.0, 0.0]))
+    jacobian = turning(jnp.float32([scale, 0.0, 0.0]))
     generator = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     assert np.isfinite(jacobian).all()
     np.testing.assert_allclose(jacobian[..., 0], generator, atol=1.01 * scale + 1e-6)
@@ -61,8 +65,7 @@ def test_rotation_matrix_gradient_near_zero_is_the_generator(scale):
 
 def test_rotation_matrix_gradient_is_continuous_where_the_series_ends():
     below, above = (jnp.float32([np.sqrt(lbs.SERIES_BELOW * f), 0.0, 0.0]) for f in (0.9999, 1.0001))
-    jacobian = jax.jacobian(lbs.rotation_matrix)
-    np.testing.assert_allclose(jacobian(below), jacobian(above), atol=2e-5)
+    np.testing.assert_allclose(turning(below), turning(above), atol=2e-5)
 
 
 def test_skin_reproduces_golden_poses(body, golden):
@@ -72,10 +75,10 @@ def test_skin_reproduces_golden_poses(body, golden):
     for rotations, positions, vertices in zip(
         local, golden["joint_positions"], golden["vertices"], strict=True
     ):
-        transforms = lbs.joint_transforms(jnp.float32(rotations), jnp.float32(positions[0]), joints, parents)
+        transforms = joint_transforms(jnp.float32(rotations), jnp.float32(positions[0]), joints, parents)
         posed_joints = jnp.sum(transforms[:, :, :3] * joints[:, None, :], axis=2) + transforms[:, :, 3]
         rows = golden["vertex_index"]
-        posed = lbs.skin(
+        posed = skin_points(
             jnp.asarray(body["rest_positions"][rows]),
             jnp.asarray(body["skin_weights"][rows]),
             jnp.asarray(body["skin_indices"][rows]),
@@ -88,8 +91,8 @@ def test_skin_reproduces_golden_poses(body, golden):
 def test_rest_pose_leaves_points_where_they_are(rng):
     _, _, joints = random_tree(rng)
     positions, weights, indices = random_skin(rng)
-    transforms = lbs.joint_transforms(jnp.zeros((len(TREE), 3)), joints[0], joints, TREE)
-    np.testing.assert_allclose(lbs.skin(positions, weights, indices, transforms), positions, atol=1e-6)
+    transforms = joint_transforms(jnp.zeros((len(TREE), 3)), joints[0], joints, TREE)
+    np.testing.assert_allclose(skin_points(positions, weights, indices, transforms), positions, atol=1e-6)
 
 
 def test_joint_transforms_equal_a_float64_chain(rng):
@@ -101,7 +104,7 @@ def test_joint_transforms_equal_a_float64_chain(rng):
         parent = TREE[joint]
         turned.append(turned[parent] @ matrices[joint])
         posed.append(posed[parent] + turned[parent] @ (rest[joint] - rest[parent]))
-    result = np.asarray(lbs.joint_transforms(rotations, translation, joints, TREE))
+    result = np.asarray(joint_transforms(rotations, translation, joints, TREE))
     np.testing.assert_allclose(result[:, :, :3], turned, atol=1e-6)
     np.testing.assert_allclose(result[:, :, 3] + np.einsum("jab,jb->ja", turned, rest), posed, atol=2e-6)
 
@@ -110,8 +113,8 @@ def test_skin_is_equivariant_to_translation(rng):
     rotations, translation, joints = random_tree(rng)
     skin = random_skin(rng)
     offset = jnp.float32([0.5, -0.25, 2.0])
-    here = lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))
-    there = lbs.skin(*skin, lbs.joint_transforms(rotations, translation + offset, joints, TREE))
+    here = skin_points(*skin, joint_transforms(rotations, translation, joints, TREE))
+    there = skin_points(*skin, joint_transforms(rotations, translation + offset, joints, TREE))
     np.testing.assert_allclose(there, here + offset[None, :], atol=2e-6)
 
 
@@ -122,8 +125,8 @@ def test_skin_is_equivariant_to_rotation_of_the_root(rng):
     root = (turn * Rotation.from_rotvec(np.asarray(rotations[0]))).as_rotvec()
     turned = rotations.at[0].set(jnp.float32(root))
     zero = jnp.zeros(3)
-    here = lbs.skin(*skin, lbs.joint_transforms(rotations, zero, joints, TREE))
-    there = lbs.skin(*skin, lbs.joint_transforms(turned, zero, joints, TREE))
+    here = skin_points(*skin, joint_transforms(rotations, zero, joints, TREE))
+    there = skin_points(*skin, joint_transforms(turned, zero, joints, TREE))
     np.testing.assert_allclose(there, turn.apply(np.asarray(here)), atol=3e-6)
 
 
@@ -131,8 +134,8 @@ def test_whole_turns_change_nothing(rng):
     rotations, translation, joints = random_tree(rng)
     lengths = jnp.linalg.norm(rotations, axis=1, keepdims=True)
     further = rotations * (1.0 + 2.0 * jnp.pi / lengths)
-    one = lbs.joint_transforms(rotations, translation, joints, TREE)
-    other = lbs.joint_transforms(further, translation, joints, TREE)
+    one = joint_transforms(rotations, translation, joints, TREE)
+    other = joint_transforms(further, translation, joints, TREE)
     np.testing.assert_allclose(other, one, atol=1e-5)
 
 
@@ -142,7 +145,7 @@ def test_gradients_are_finite_at_the_rest_pose(rng):
 
     @jax.jit
     def height(rotations):
-        return lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))[:, 1].sum()
+        return skin_points(*skin, joint_transforms(rotations, translation, joints, TREE))[:, 1].sum()
 
     zero = jnp.zeros((len(TREE), 3))
     gradient = np.asarray(jax.grad(height)(zero))
@@ -160,7 +163,7 @@ def test_vmap_equals_loop_under_jit(rng):
     roots = jnp.stack([translation, -translation, 0.0 * translation])
 
     def pose(rotations, translation):
-        return lbs.skin(*skin, lbs.joint_transforms(rotations, translation, joints, TREE))
+        return skin_points(*skin, joint_transforms(rotations, translation, joints, TREE))
 
     together = jax.jit(jax.vmap(pose))(frames, roots)
     apart = np.stack([pose(r, t) for r, t in zip(frames, roots, strict=True)])

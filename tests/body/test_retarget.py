@@ -45,34 +45,6 @@ def test_minimal_rotation_is_minimal(rng):
     assert angle == pytest.approx(np.arccos(cosine))
 
 
-def test_retarget_makes_limbs_point_where_the_source_points(rng):
-    rest = rng.normal(0.0, 0.5, (len(NAMES), 3))
-    directions = {"LeftArm": np.array([1.0, 0.0, 0.0]), "LeftForeArm": np.array([0.0, -1.0, 0.0])}
-    alignments = retarget.rest_alignments(NAMES, rest, directions)
-    source = Rotation.random(6, rng=rng).as_matrix().reshape(3, 2, 3, 3)
-    joints = [0, 0, 1, 1, 0]
-    turned = retarget.global_rotations(retarget.retarget(source, joints, alignments, PARENTS), PARENTS)
-    for joint, child, direction in ((1, 2, directions["LeftArm"]), (2, 3, directions["LeftForeArm"])):
-        bone = (rest[child] - rest[joint]) / np.linalg.norm(rest[child] - rest[joint])
-        np.testing.assert_allclose(turned[:, joint] @ bone, source[:, joints[joint]] @ direction, atol=1e-9)
-
-
-def test_retarget_to_the_same_rig_changes_nothing(rng):
-    rotations, _ = random_motion(rng)
-    source = retarget.global_rotations(rotations, PARENTS)
-    identity = retarget.rest_alignments(NAMES, rng.normal(size=(len(NAMES), 3)), {})
-    result = retarget.retarget(source, range(len(NAMES)), identity, PARENTS)
-    assert angles_between(result, rotations).max() < 1e-7
-
-
-def test_limb_bones_leaves_out_absent_joints():
-    assert retarget.limb_bones(NAMES) == {
-        "LeftArm": ("LeftArm", "LeftForeArm"),
-        "LeftForeArm": ("LeftForeArm", "LeftHand"),
-        "LeftHand": ("LeftForeArm", "LeftHand"),
-    }
-
-
 def test_abduct_arms_lifts_hanging_arms_outwards():
     rotations = np.zeros((2, len(NAMES), 3))
     lifted = retarget.abduct_arms(rotations, NAMES, 90.0)
@@ -142,17 +114,3 @@ def test_resample_keeps_a_single_frame(rng):
 def test_resample_refuses_nonsense(frames, fps):
     with pytest.raises(MotionError):
         retarget.resample(np.zeros((frames, 1, 3)), np.zeros((frames, 3)), fps)
-
-
-def test_start_facing_front_moves_rigidly(rng):
-    rotations, translations = random_motion(rng)
-    new_rotations, new_translations = retarget.start_facing_front(rotations, translations)
-    front = Rotation.from_rotvec(new_rotations[0, 0]).apply([0.0, 0.0, 1.0])
-    assert front[0] == pytest.approx(0.0, abs=1e-12)
-    assert front[2] > 0
-    np.testing.assert_allclose(new_translations[0, [0, 2]], 0.0, atol=1e-12)
-    np.testing.assert_allclose(new_translations[:, 1], translations[:, 1], atol=1e-12)
-    np.testing.assert_allclose(
-        np.linalg.norm(np.diff(new_translations, axis=0), axis=1),
-        np.linalg.norm(np.diff(translations, axis=0), axis=1),
-    )

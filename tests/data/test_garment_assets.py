@@ -16,7 +16,11 @@ NUM_LOOPS = {
 }  # fmt: skip
 NUM_VERTICES = {"1k": 1000, "4k": 4000, "10k": 10000}
 PINNED = {"tank", "shorts", "pants", "dress", "kneepants", "tightdress"}
-CASES = [(name, level) for name in NUM_LOOPS for level in NUM_VERTICES]
+CASES = [
+    pytest.param(name, level, marks=[pytest.mark.slow] if level != "1k" else [])
+    for name in NUM_LOOPS
+    for level in NUM_VERTICES
+]
 each_garment = pytest.mark.parametrize(("name", "level"), CASES)
 
 
@@ -155,6 +159,7 @@ def test_garment_pins_hold_the_top_of_both_sides(name, level):
     assert positions[pinned, 1].min() >= positions[~pinned, 1].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(NUM_LOOPS))
 def test_garment_levels_share_one_shape(name):
     coarse, fine = load_garment_arrays(name, "4k"), load_garment_arrays(name, "10k")

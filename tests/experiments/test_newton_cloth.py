@@ -2,10 +2,11 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hard_cases import CASES, drop_scene, run_case
+from hard_cases.build import corners_of, hanging_sheet, make_cloth, make_scene, sheet
 from newton_cloth import (
     NewtonCloth,
     Setting,
@@ -19,14 +20,11 @@ from newton_cloth import (
 )
 
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.hard_cases import run_case
-from eslr_jax.evaluation.hard_cases.body import drop_scene
-from eslr_jax.evaluation.hard_cases.build import corners_of, hanging_sheet, make_cloth, make_scene, sheet
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import contact_forces
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.problem import PhysicsParameters, contact_thickness
-from eslr_jax.simulation.scan import simulate_scene
+from eslr_jax.physics.problem import contact_thickness
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Contacts
 
 SOLVERS = [Setting("vbd", 2, 10), Setting("style3d", 2, 10), Setting("xpbd", None, 1)]
@@ -103,25 +101,21 @@ def test_quadratic_bending_is_ours_at_small_angles():
 
 def test_xpbd_needs_more_substeps_on_finer_cloth():
     counts = [
-        stable_substeps(prepare_cloth(make_cloth(sheet(n, n, (1, 1)), {}), COTTON), 1 / 30)
-        for n in (9, 17, 33)
+        stable_substeps(prepare_cloth(make_cloth(sheet(n, n, (1, 1)), {}), COTTON), 1 / 30) for n in (9, 17)
     ]
     assert counts[1] / counts[0] == pytest.approx(2, rel=0.1)
-    assert counts[2] / counts[1] == pytest.approx(2, rel=0.1)
 
 
 def test_contact_spring_pushes_as_our_cubic_does_through_the_whole_distance():
-    scene, parameters = drop_scene({}, columns=9, seconds=0.1).scene, PhysicsParameters()
-    radius = float(contact_thickness(scene.garment, parameters.collision_thickness))
-    inside = jnp.zeros_like(scene.start.position)
+    scene = drop_scene({}, columns=9, seconds=0.1).scene
+    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
+    inside = jnp.zeros_like(scene.initial_state.position)
     up = jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), inside.shape)
     near = jnp.ones(len(inside), bool)
     contacts = Contacts(inside, inside, up, up, jnp.zeros(len(inside)), near)
-    forces = contact_forces(inside, contacts, scene.garment, parameters.collision_stiffness, radius)
+    forces = contact_forces(inside, contacts, scene.garment, scene.constants.collision_stiffness, radius)
     count = np.sum(np.asarray(scene.garment.vertex_mask))
-    assert contact_stiffness(scene, parameters) * radius == pytest.approx(
-        float(forces.sum()) / count, rel=1e-4
-    )
+    assert contact_stiffness(scene) * radius == pytest.approx(float(forces.sum()) / count, rel=1e-4)
 
 
 def newton_cloth(scene, setting):
@@ -130,7 +124,7 @@ def newton_cloth(scene, setting):
 
 
 def roll(method, scene):
-    states = [scene.start]
+    states = [scene.initial_state]
     for frame in range(scene.num_frames - 1):
         states.append(method(states[-1], frame))
     return states
@@ -140,12 +134,12 @@ def roll(method, scene):
 @pytest.mark.parametrize("setting", SOLVERS, ids=lambda setting: setting.solver)
 def test_newton_falls_freely(setting):
     garment = make_cloth(sheet(5, 5, (0.2, 0.2)), {})
-    scene = make_scene(garment, np.asarray(garment.rest_positions), 11).scene
+    scene = make_scene(garment, np.asarray(garment.rest_positions), 11)
     method = newton_cloth(scene, setting)
     end = roll(method, scene)[-1]
     steps, dt = 10 * method.substeps, float(scene.timestep) / method.substeps
     fall = 9.81 * dt * dt * steps * (steps + 1) / 2
-    moved = np.asarray(end.position - scene.start.position)[np.asarray(garment.vertex_mask)]
+    moved = np.asarray(end.position - scene.initial_state.position)[np.asarray(garment.vertex_mask)]
     # Style3D takes 0.2 % off the velocity in every substep.
     np.testing.assert_allclose(-moved[:, 1], fall, rtol=0.03 if setting.solver == "style3d" else 1e-3)
     np.testing.assert_allclose(moved[:, [0, 2]], 0, atol=1e-3)
@@ -157,7 +151,7 @@ def test_newton_drapes_a_sheet_over_a_moving_ball(setting):
     scene = drop_scene({}, columns=17, seconds=0.8).scene
     end = roll(newton_cloth(scene, setting), scene)[-1]
     position = np.asarray(end.position)[np.asarray(scene.garment.vertex_mask)]
-    ball = np.asarray(scene.body_positions)[-1].mean(axis=0)
+    ball = np.asarray(scene.body.positions)[-1].mean(axis=0)
     assert np.linalg.norm(position - ball, axis=1).min() > 0.245
     assert position[:, 1].max() < 0.27
     assert position[:, 1].min() > -0.6
@@ -169,24 +163,12 @@ def test_newton_hangs_cloth_by_its_pins(setting):
     mesh = hanging_sheet(9, 9, (0.4, 0.4))
     is_pinned = corners_of(mesh[0], (-1, 1), (1, 1), axes=(0, 1))
     garment = make_cloth(mesh, {}, is_pinned=is_pinned)
-    scene = make_scene(garment, mesh[0], 31).scene
+    scene = make_scene(garment, mesh[0], 31)
     end = np.asarray(roll(newton_cloth(scene, setting), scene)[-1].position)[: len(mesh[0])]
     np.testing.assert_allclose(end[is_pinned], mesh[0][is_pinned], atol=1e-6)
-    ours = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
+    ours = rollout_scene(None, scene, SimConfig())
     sag = [x[:, 1].min() for x in (end, np.asarray(ours.positions[-1])[: len(mesh[0])])]
     assert sag[0] == pytest.approx(sag[1], abs=0.05)  # VBD is far from converged
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("setting", SOLVERS, ids=lambda setting: setting.solver)
-def test_recorded_substeps_are_the_solver_s_own(setting, monkeypatch):
-    scene = drop_scene({}, columns=9, seconds=0.5).scene
-    method = newton_cloth(scene, setting)
-    recorded = roll(method, scene)
-    monkeypatch.setattr(method._warp, "capture_launch", lambda graph: method._substep())
-    plain = roll(method, scene)
-    for one, other in zip(jax.device_get(recorded), jax.device_get(plain), strict=True):
-        np.testing.assert_array_equal(one.position, other.position)
 
 
 @pytest.mark.slow
@@ -194,16 +176,20 @@ def test_vbd_minimises_our_potential_where_strains_are_small(tshirt):
     peers = pytest.importorskip("peers")
     rest = np.asarray(tshirt.rest_positions)
     noise = 1e-4 * np.random.default_rng(0).normal(size=rest.shape)
-    scene = make_scene(tshirt, rest + noise, 4, timestep=1 / 300).scene
+    scene = make_scene(tshirt, rest + noise, 4, timestep=1 / 300)
     method = peers.Method("VBD", 1, 200, newton_cloth(scene, Setting("vbd", 1, 200)))
-    truth = simulate_scene(None, scene, PhysicsParameters(), SimConfig(simulator="physics"))
-    gap, drop = peers.teach([method], scene, truth, every=1)
-    assert (gap[0] / drop).max() < 1e-3
+    truth = rollout_scene(None, scene, SimConfig())
+    gap, initial = peers.teach([method], scene, truth, every=1)
+    assert (gap[0] / initial).max() < 1e-3
 
 
 @pytest.mark.slow
 def test_newton_runs_the_hard_cases():
     pytest.importorskip("newton")
-    rows = run_case("free_fall", newton_simulator(Setting("vbd", 2, 10)))
-    assert {row["case"] for row in rows} == {"free_fall"}
-    assert len(rows) > 1  # a scene that Newton refuses leaves one row
+    outcome = run_case(CASES["free_fall"], newton_simulator(Setting("vbd", 2, 10)))
+    assert [measure.name.split(",")[0] for measure in outcome.measures[1:]] == [
+        "displacement beyond free fall",
+        "fall of the centre against backward Euler [%]",
+    ]
+    # Two substeps fall by less than one: by (2 n + 1) / (2 n + 2) of it after n frames.
+    assert outcome.measures[2].value == pytest.approx(100 / 62, rel=0.05)

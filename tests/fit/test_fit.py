@@ -10,7 +10,6 @@ from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
-from eslr_jax.fit.placement import find_placement
 from eslr_jax.fit.postures import arm_postures, find_arms, unpose
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.topology import vertex_components
@@ -33,7 +32,6 @@ def posed(garment, posture):
 
 
 @pytest.mark.parametrize(("name", "scale", "axes", "unit"), [
-    ("tshirt_1k", 1.0, np.eye(3), 1.0),
     ("dress_1k", 100.0, TO_Z_UP, 0.01),
     ("pants_1k", 1000.0, np.eye(3), 0.001),
     ("longsleeve_1k", 1 / 0.0254, TO_Z_UP, 0.0254),
@@ -59,18 +57,6 @@ def test_garment_anywhere_is_moved_onto_the_body(body, name):
     assert fitted.metadata["fit"]["penetration"]["after"]["inside"] == 0
 
 
-@pytest.mark.parametrize("name", ["tshirt_1k", "tank_1k", "dress_1k"])
-@pytest.mark.parametrize("axes", [np.eye(3), TO_Z_UP])
-def test_inches_are_no_centimetres_on_a_head(postures, name, axes):
-    garment = bundled(name)
-    written = (garment.rest_positions - garment.rest_positions.mean(axis=0)) @ axes.T / 0.0254
-    placement = find_placement(written, garment.faces, postures)
-    assert placement.factor == 0.0254
-    assert (placement.up, placement.front) == (("y", "z") if axes[1, 1] else ("z", "-y"))
-    off = np.linalg.norm(placement.apply(written) - garment.rest_positions, axis=1)
-    assert off.mean() < 0.1  # where a wide dress sits along the body is open
-
-
 def test_what_is_given_is_not_recognised(body, shirt):
     backwards = shirt.rest_positions * [-1, 1, -1]
     fitted = fit_garment(source(backwards, shirt.faces), body, FitOptions(front="-z"))
@@ -78,7 +64,7 @@ def test_what_is_given_is_not_recognised(body, shirt):
     higher = shirt.rest_positions + np.array([0, 0.02, 0])
     kept = fit_garment(source(higher, shirt.faces), body, FitOptions(keep_place=True))
     np.testing.assert_allclose(kept.sewn_positions, higher, atol=1e-9)
-    with pytest.raises(MeshError, match="give --units, --up and --front"):
+    with pytest.raises(MeshError, match="give --up and --front"):
         fit_garment(source(higher + 3.0, shirt.faces), body, FitOptions(keep_place=True, units="m"))
     with pytest.raises(MeshError, match="same axis"):
         fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(up="z", front="-z"))
@@ -245,7 +231,7 @@ def test_fitted_garment_has_the_pins_of_file_and_options(body, shirt):
     ("vertices:a", "whole numbers"),
     ("vertices:99999", "vertices 0 to 999"),
     ("part:collar", "no such part"),
-    ("region:y=3", "no comparison"),
+    ("region:y=3", "not a comparison"),
     ("region:y>9", "holds no vertex"),
     ("loop:9", "open edges 0 to 3"),
 ])  # fmt: skip
@@ -256,7 +242,7 @@ def test_impossible_pins_are_named(shirt, pin, message):
 
 @pytest.mark.parametrize(("spoil", "message"), [
     (lambda p, f: (p * 0, f), "no face with an area is left"),
-    (lambda p, f: (p * 1e9, f), "are no garment's"),
+    (lambda p, f: (p * 1e9, f), "too large for a garment"),
     (lambda p, f: (p * 1e-9, f), "no garment's in"),
     (lambda p, f: (np.where(np.arange(len(p))[:, None] == 7, np.nan, p), f), "vertex 7 is not finite"),
     (lambda p, f: (p, f + 1), "names a vertex outside"),

@@ -38,8 +38,8 @@ def load(folder, name):
 
 @pytest.mark.parametrize("mode", ["raw", "canonical"])
 def test_stress_on_a_tube(builders, mode):
-    tube = builders.tube(64, 64)
-    assert stress(*tube, geodesic_embedding(*tube, size=8, mode=mode)) <= 0.08  # measured 0.0716
+    tube = builders.tube(32, 32)
+    assert stress(*tube, geodesic_embedding(*tube, size=8, mode=mode)) <= 0.08
 
 
 def test_flat_sheet_embeds_isometrically(builders):
@@ -58,24 +58,6 @@ def test_renumbering_vertices_permutes_rows(builders, mode):
     np.testing.assert_allclose(again, embedding[old], atol=0.02 * np.abs(embedding).max())
 
 
-@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
-def test_turning_garment_and_body_changes_nothing(builders, mode):
-    positions, faces = builders.tube(20, 15, flare=0.2, depth=0.8)
-    anchors = positions[::40][:8] * 1.05
-    cosine, sine = np.cos(0.7), np.sin(0.7)
-    yaw = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-    offset = np.array([0.3, 1.0, -0.2])
-    embedding = geodesic_embedding(positions, faces, mode=mode, anchors=anchors)
-    turned = geodesic_embedding(
-        positions @ yaw.T + offset,
-        faces,
-        mode=mode,
-        anchors=anchors @ yaw.T + offset,
-        body_axes=yaw.T,  # rows are the turned left, up and front
-    )
-    np.testing.assert_allclose(turned, embedding, atol=1e-6)
-
-
 @pytest.mark.parametrize("mode", ["canonical", "landmarks"])  # rounding alone turns the axes of `raw`
 def test_translation_changes_nothing(builders, mode):
     positions, faces = builders.tube(20, 15, depth=0.8)
@@ -89,13 +71,6 @@ def test_two_meshes_of_a_tube_agree(builders, mode):
     fine = builders.tube(48, 40, flare=0.2, depth=0.8, twist=1.0)
     coarse = builders.tube(28, 22, flare=0.2, depth=0.8)
     assert mismatch(fine, coarse, mode=mode) <= 0.08
-
-
-@pytest.mark.parametrize("name", ["tshirt", "dress"])
-@pytest.mark.parametrize("mode", ["canonical", "landmarks"])
-def test_two_meshes_of_a_garment_agree(garment_folder, name, mode):
-    fine, coarse = load(garment_folder, f"{name}_4k"), load(garment_folder, f"{name}_1k")
-    assert mismatch(fine, coarse, mode=mode) <= 0.08  # measured 0.014 and 0.033
 
 
 @pytest.mark.slow
@@ -131,21 +106,16 @@ def test_components_get_finite_coordinates(builders, mode):
     assert np.isfinite(embedding).all()
 
 
-def test_anchor_far_from_the_garment_is_a_column_of_zeros(builders):
-    positions, faces = builders.tube()
-    anchors = np.concatenate([positions[:7], [[0.0, 2.0, 0.0]]])
-    embedding = geodesic_embedding(positions, faces, mode="landmarks", anchors=anchors)
-    assert (embedding[:, 7] == 0).all()
-    assert (embedding[:, :7] > 0).all()
-    assert (np.argmax(embedding[:, :7], axis=0) == np.arange(7)).all()
+def test_landmark_coordinates_fall_with_the_distance_to_a_corner(builders):
+    positions, faces = builders.sheet(6, 8)
+    nearest_corner = geodesic_embedding(positions, faces, mode="landmarks")[:, 0]
+    distances = np.linalg.norm(positions - positions.min(axis=0), axis=1)
+    np.testing.assert_allclose(nearest_corner, 0.4 * np.exp(-distances / 0.4), rtol=0.03)  # Dijkstra's error
 
 
-def test_wrong_options_are_named(builders):
-    tube = builders.tube()
+def test_unknown_mode_is_named(builders):
     with pytest.raises(ConfigError, match="'polar' is unknown; use one of raw, canonical, landmarks"):
-        geodesic_embedding(*tube, mode="polar")
-    with pytest.raises(ConfigError, match="3 anchors for an embedding of size 8"):
-        geodesic_embedding(*tube, mode="landmarks", anchors=np.zeros((3, 3)))
+        geodesic_embedding(*builders.tube(), mode="polar")
 
 
 @pytest.mark.slow

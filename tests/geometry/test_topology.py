@@ -104,6 +104,22 @@ def test_vertex_areas_share_face_areas(mesh):
     np.testing.assert_allclose(shared, expected, rtol=1e-12)
 
 
+def test_vertex_normals_of_an_octahedron_point_along_its_corners(builders):
+    positions, faces = builders.octahedron()
+    lone = np.concatenate([positions, [[3.0, 0.0, 0.0]]])
+    normals = topology.vertex_normals(lone, faces)
+    np.testing.assert_allclose(normals[:6], positions / 0.3, atol=1e-12)
+    np.testing.assert_array_equal(normals[6], 0)
+
+
+def test_undirected_edges_count_faces_of_a_broken_mesh():
+    edges, edge_of, counts = topology.undirected_edges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+    shared = edges.tolist().index([0, 1])
+    assert counts[shared] == 3
+    assert np.flatnonzero(edge_of == shared).tolist() == [0, 3, 6]
+    assert np.delete(counts, shared).tolist() == [1] * 6
+
+
 def test_boundary_loops_are_ordered_cycles(builders):
     _, faces = builders.tube(9, 4)
     loops = topology.boundary_loops(faces)

@@ -66,9 +66,9 @@ BROKEN = {
         np.concatenate([SHEET_FACES, SHEET_FACES + 6]),
         r"2 separate components \(sizes 6, 6; vertex \d+ is not connected",
     ),
-    "centimetres": (SHEET * 100, SHEET_FACES, "looks like centimetres: scale by 0.01"),
-    "millimetres": (SHEET * 1000, SHEET_FACES, "looks like millimetres: scale by 0.001"),
-    "inches": (SHEET * 39.37 * 1.5, SHEET_FACES, "looks like inches: scale by 0.0254"),
+    "centimetres": (SHEET * 100, SHEET_FACES, "in cm: scale by 0.01"),
+    "millimetres": (SHEET * 1000, SHEET_FACES, "in mm: scale by 0.001"),
+    "inches": (SHEET * 39.37 * 1.5, SHEET_FACES, "in in: scale by 0.0254"),
     "kilometres": (SHEET / 1000, SHEET_FACES, "scale by about 1000"),
     "point": (SHEET * 0, SHEET_FACES, "positions must be in metres"),
 }
@@ -108,17 +108,8 @@ def test_open_sheet_has_no_inside(builders):
     validate_orientation(positions, faces[:, ::-1])
 
 
-def test_orientation_against_a_body(builders):
-    body = builders.tube(radius=0.12)
-    for positions, faces in (builders.tube(), builders.tube(16, 4)):
-        validate_orientation(positions, faces, *body)
-        with pytest.raises(MeshError, match="into the body"):
-            validate_orientation(positions, faces[:, ::-1], *body)
-
-
-@pytest.mark.parametrize("level", ["1k", "4k"])
-def test_bundled_garments_are_sound(garment_folder, level):
-    for path in sorted(garment_folder.glob(f"*_{level}.npz")):
+def test_bundled_garments_are_sound(garment_folder):
+    for path in sorted(garment_folder.glob("*_1k.npz")):
         with np.load(path) as arrays:
             positions, faces = arrays["rest_positions"], arrays["faces"]
         validate_mesh(positions, faces, name=path.stem)

@@ -1,4 +1,4 @@
-"""Cumulative statistics against NumPy over everything seen."""
+"""Running statistics against NumPy over everything seen."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ import pytest
 
 from eslr_jax.graph.normalizer import (
     MAX_UPDATES,
+    WARMUP_UPDATES,
     init_normalizer,
     inverse,
+    is_warming_up,
     measure,
     merge,
     normalize,
     standard_deviation,
 )
 
+add = jax.jit(lambda seen, rows: merge(seen, measure(rows)))
 
-def batches(seed=0, sizes=(7, 1, 40, 3)):
-    generator = np.random.default_rng(seed)
+
+def batches(sizes=(7, 1, 40, 3)):
+    generator = np.random.default_rng(0)
     scale, offset = np.array([1e-3, 1.0, 50.0]), np.array([5.0, 0.0, -1e3])
     return [generator.standard_normal((size, 3)) * scale + offset for size in sizes]
 
@@ -27,7 +31,7 @@ def batches(seed=0, sizes=(7, 1, 40, 3)):
 def accumulate(rows, dtype=jnp.float32):
     normalizer = init_normalizer(3, dtype)
     for batch in rows:
-        normalizer = merge(normalizer, measure(jnp.asarray(batch, dtype)))
+        normalizer = add(normalizer, jnp.asarray(batch, dtype))
     return normalizer
 
 
@@ -36,6 +40,7 @@ def test_statistics_match_numpy():
     everything = np.concatenate(rows)
     normalizer = accumulate(rows)
     assert normalizer.count == len(everything)
+    assert normalizer.num_updates == len(rows)
     np.testing.assert_allclose(normalizer.mean, everything.mean(axis=0), rtol=1e-6, atol=0.1)
     # float32 rounds the first column, 5 +- 1e-3, to about 5e-7
     np.testing.assert_allclose(standard_deviation(normalizer), everything.std(axis=0), rtol=1e-3)
@@ -43,7 +48,7 @@ def test_statistics_match_numpy():
 
 @pytest.mark.numerics
 def test_statistics_match_numpy_in_float64():
-    rows = batches()
+    rows = batches((20, 20, 20))
     everything = np.concatenate(rows)
     with jax.enable_x64(True):
         normalizer = accumulate(rows, jnp.float64)
@@ -54,17 +59,14 @@ def test_statistics_match_numpy_in_float64():
 def test_masked_rows_do_not_count_even_when_nan():
     rows = np.concatenate(batches())
     spoiled = np.concatenate([np.full((2, 3), np.nan), rows])
-    masked = merge(
-        init_normalizer(3), measure(jnp.asarray(spoiled, jnp.float32), jnp.arange(len(spoiled)) >= 2)
-    )
-    plain = merge(init_normalizer(3), measure(jnp.asarray(rows, jnp.float32)))
-    for first, second in zip(jax.tree.leaves(masked), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(first, second, rtol=1e-5)
+    masked = measure(jnp.asarray(spoiled, jnp.float32), jnp.arange(len(spoiled)) >= 2)
+    plain = measure(jnp.asarray(rows, jnp.float32))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), masked, plain)
 
 
 def test_inverse_undoes_normalize():
     rows = jnp.asarray(np.concatenate(batches()), jnp.float32)
-    normalizer = accumulate(batches())
+    normalizer = measure(rows)
     np.testing.assert_allclose(inverse(normalizer, normalize(normalizer, rows)), rows, rtol=1e-5, atol=1e-5)
 
 
@@ -74,18 +76,16 @@ def test_a_new_normalizer_changes_nothing():
 
 
 def test_a_constant_feature_normalizes_to_zero():
-    normalizer = init_normalizer(1)
-    for _ in range(3):
-        normalizer = merge(normalizer, measure(jnp.full((11, 1), 1 / 30)))
-    np.testing.assert_array_equal(normalize(normalizer, jnp.full((2, 1), 1 / 30)), jnp.zeros((2, 1)))
+    rows = jnp.full((11, 3), 1 / 30)
+    normalizer = accumulate([rows, rows])
+    np.testing.assert_array_equal(normalize(normalizer, rows), jnp.zeros_like(rows))
 
 
 def test_many_updates_keep_their_precision():
     """A sum of squares in float32 would have lost the variance of 1 +- 1e-3 after a few thousand rows."""
-    step = jax.jit(lambda state, rows: (merge(state, measure(rows)), None))
     generator = np.random.default_rng(0)
     rows = jnp.asarray(1 + 1e-3 * generator.standard_normal((400, 5000, 1)), jnp.float32)
-    normalizer, _ = jax.lax.scan(step, init_normalizer(1), rows)
+    normalizer, _ = jax.lax.scan(lambda seen, rows: (add(seen, rows), None), init_normalizer(1), rows)
     expected = np.asarray(rows, np.float64).std()
     np.testing.assert_allclose(standard_deviation(normalizer)[0], expected, rtol=1e-3)
 
@@ -94,3 +94,13 @@ def test_statistics_freeze_after_the_last_update_and_ignore_empty_batches():
     full = init_normalizer(3).replace(num_updates=jnp.int32(MAX_UPDATES))
     assert merge(full, measure(jnp.ones((4, 3)))).count == 0
     assert merge(init_normalizer(3), measure(jnp.ones((4, 3)), jnp.zeros(4, bool))).num_updates == 0
+
+
+def test_warming_up_ends_with_the_hundredth_graph_even_without_a_body():
+    graph = measure(jnp.ones((4, 3)))
+    statistics = {"garment": init_normalizer(3), "world": init_normalizer(3)}
+    statistics["garment"] = statistics["garment"].replace(num_updates=jnp.int32(WARMUP_UPDATES - 1))
+    assert is_warming_up(statistics)
+    statistics["garment"] = merge(statistics["garment"], graph)
+    assert not is_warming_up(statistics)
+    assert not is_warming_up({})

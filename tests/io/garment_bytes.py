@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, read_garment_source, write_garment_npz
-from eslr_jax.io.trajectory import read_trajectory, write_trajectory
+from eslr_jax.io.trajectory import TrajectoryFile, read_trajectory, write_trajectory
 
 POSITIONS = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.25], [0, 0.5, 0.125], [0.25, 0.75, 0]])
 FACES = np.array([[0, 1, 2], [2, 3, 0], [3, 2, 4]])
@@ -54,7 +54,7 @@ def whole_file(kind: str, folder: Path) -> bytes:
         )
     elif kind == "trajectory.npz":
         moving = np.stack([POSITIONS, POSITIONS])
-        write_trajectory(path, positions=moving, velocities=moving, faces=FACES, timestep=0.1)
+        write_trajectory(path, TrajectoryFile(moving, moving, FACES, 0.1))
     return path.read_bytes()
 
 

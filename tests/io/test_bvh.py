@@ -97,6 +97,15 @@ def test_broken_files_are_named_in_one_line(tmp_path, kind):
     refuses(read_bvh, path, word)
 
 
+@pytest.mark.parametrize("claimed", [1, 3])
+def test_a_frame_count_that_is_off_by_one_is_a_warning(tmp_path, claimed):
+    path = tmp_path / "clip.bvh"
+    path.write_text(SMALL.replace("Frames: 2", f"Frames: {claimed}"))
+    with pytest.warns(UserWarning, match=rf"clip.bvh says {claimed} frames and has 2"):
+        motion = read_bvh(path)
+    assert len(motion.positions) == 2
+
+
 def test_missing_file_and_folder(tmp_path):
     refuses(read_bvh, tmp_path / "nothing.bvh", "doesn't exist")
     (tmp_path / "folder.bvh").mkdir()

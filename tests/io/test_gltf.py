@@ -1,5 +1,6 @@
 """An animated GLB, played back by an evaluator of our own, shows the positions that were written."""
 
+import dataclasses
 import os
 
 import numpy as np
@@ -9,9 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import MeshError, MotionError
-from eslr_jax.io.gltf import AnimatedMesh, write_animated_glb
-from eslr_jax.io.gltf_builder import vertex_normals
-from eslr_jax.io.gltf_skin import SkinnedMesh
+from eslr_jax.io.animated import AnimatedMesh, principal_shapes, vertex_normals
+from eslr_jax.io.gltf import TOLERANCE as TARGET_TOLERANCE
+from eslr_jax.io.gltf import write_animated_glb
+from eslr_jax.io.skin import Skin
 
 TIMESTEP = 1 / 30
 TOLERANCE = 1e-6  # [m]: float32 positions within two metres of the origin, skinned through a few joints
@@ -108,23 +110,31 @@ def make_cloth(num_frames=5, seed=0):
     return AnimatedMesh("cloth", positions.astype(np.float32), np.asarray(sphere.faces))
 
 
-def make_body(num_frames=5, num_influences=6):
+def make_body(num_frames=5, num_influences=6, turn=0.2):
     """A sphere on three joints in a chain, with random poses."""
     sphere = trimesh.creation.icosphere(subdivisions=2)
     rng = np.random.default_rng(1)
     weights = rng.dirichlet(np.ones(num_influences), size=len(sphere.vertices))
     indices = rng.permuted(np.tile(np.arange(8), (len(sphere.vertices), 1)), axis=1)[:, :num_influences]
     # Small turns between frames: a quaternion's linear blend and slerp agree at key frames only.
-    turns = np.cumsum(0.2 * rng.normal(size=(num_frames, 8, 3)), axis=0)
+    turns = np.cumsum(turn * rng.normal(size=(num_frames, 8, 3)), axis=0)
     rotations = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(num_frames, 8, 3, 3)
     transforms = np.concatenate([rotations, 0.2 * rng.normal(size=(num_frames, 8, 3, 1))], axis=-1)
-    return SkinnedMesh(sphere.vertices, np.asarray(sphere.faces), weights, indices, transforms)
+    joints = [f"joint {joint}" for joint in range(8)]
+    skin = Skin(weights, indices, transforms, np.zeros((8, 3)), [-1] * 8, joints)
+    return with_skin(skin, sphere.vertices, np.asarray(sphere.faces))
 
 
-def pose(body, frame):
-    matrices = np.asarray(body.joint_transforms)[frame][body.skin_indices]
-    moved = np.einsum("vkab,vb->vka", matrices[..., :3], body.rest_positions) + matrices[..., 3]
-    return np.einsum("vk,vka->va", body.skin_weights, moved)
+def with_skin(skin, rest, faces):
+    """A mesh that moves as its joints say."""
+    matrices = skin.joint_transforms[:, skin.skin_indices]
+    moved = np.einsum("tvkab,vb->tvka", matrices[..., :3], rest) + matrices[..., 3]
+    positions = np.einsum("vk,tvka->tva", skin.skin_weights, moved)
+    return AnimatedMesh("body", positions, faces, rest_positions=rest, skin=skin)
+
+
+def change_skin(mesh, **change):
+    return dataclasses.replace(mesh, skin=dataclasses.replace(mesh.skin, **change))
 
 
 def test_glb_plays_a_free_mesh_exactly_and_blends_linearly(tmp_path):
@@ -145,14 +155,60 @@ def test_glb_plays_a_skinned_body(tmp_path, num_influences, has_hierarchy):
     body = make_body(num_influences=num_influences)
     if has_hierarchy:
         joints = np.random.default_rng(2).normal(size=(8, 3))
-        body = SkinnedMesh(
-            **{**vars(body), "joint_rest_positions": joints, "parents": [-1, 0, 1, 2, 0, 4, 5, -1]}
-        )
-    write_animated_glb(tmp_path / "a.glb", [make_cloth()], TIMESTEP, skinned_body=body)
+        body = change_skin(body, joint_rest_positions=joints, parents=[-1, 0, 1, 2, 0, 4, 5, -1])
+    write_animated_glb(tmp_path / "a.glb", [make_cloth(), body], TIMESTEP)
     player = Player(tmp_path / "a.glb")
     for frame in range(5):
         shown = player.positions("body", frame * TIMESTEP)
-        np.testing.assert_allclose(shown, pose(body, frame), atol=2 * TOLERANCE)
+        np.testing.assert_allclose(shown, body.positions[frame], atol=2 * TOLERANCE)
+    assert not player.document.meshes[1].primitives[0].targets
+
+
+def test_glb_adds_what_the_joints_can_t_do_as_few_morph_targets(tmp_path):
+    """Pose blend shapes bend 30 frames of a body; two shapes hold them."""
+    body = make_body(num_frames=30, turn=0.05)
+    rng = np.random.default_rng(4)
+    shapes = 0.05 * rng.normal(size=(2, *body.rest_positions.shape))
+    offsets = np.einsum("ts,sva->tva", rng.normal(size=(30, 2)), shapes)
+    matrices = body.skin.joint_transforms[:, body.skin.skin_indices, :, :3]
+    moved = np.einsum("vk,tvkab,tvb->tva", body.skin.skin_weights, matrices, offsets)
+    body = dataclasses.replace(body, positions=body.positions + moved)
+    write_animated_glb(tmp_path / "a.glb", [body], TIMESTEP)
+    player = Player(tmp_path / "a.glb")
+    assert len(player.document.meshes[0].primitives[0].targets) == 2
+    for frame in range(30):
+        shown = player.positions("body", frame * TIMESTEP)
+        assert np.linalg.norm(shown - body.positions[frame], axis=1).max() < TARGET_TOLERANCE
+
+
+def smooth_motion(num_frames, num_vertices):
+    """Vertices on slow paths, as cloth's are: sums of few waves, with a trembling that nobody sees."""
+    rng = np.random.default_rng(5)
+    times = np.linspace(0, 4 * np.pi, num_frames)[:, None]
+    waves = np.cos(times * rng.uniform(0, 3, 12) + rng.uniform(0, 6, 12))
+    positions = np.einsum("tw,wva->tva", waves, 0.1 * rng.normal(size=(12, num_vertices, 3)))
+    return positions + 1e-6 * rng.normal(size=positions.shape)
+
+
+def test_principal_shapes_are_few_and_keep_the_tolerance():
+    offsets = smooth_motion(200, 50)
+    basis, shapes = principal_shapes(offsets, 1e-4)
+    assert len(shapes) == basis.shape[1] == 12
+    shown = np.einsum("ts,sva->tva", basis, shapes)
+    assert np.linalg.norm(shown - offsets, axis=2).max() < 1e-4
+    still, none = principal_shapes(np.zeros((5, 4, 3)), 1e-4)
+    assert still.shape == (5, 0)
+    assert none.shape == (0, 4, 3)
+
+
+@pytest.mark.slow
+def test_glb_of_a_long_clip_stays_small(tmp_path):
+    grid = np.arange(32 * 32).reshape(32, 32)
+    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    positions = smooth_motion(1127, 32 * 32).astype(np.float32)
+    write_animated_glb(tmp_path / "a.glb", [AnimatedMesh("cloth", positions, faces)], TIMESTEP)
+    assert (tmp_path / "a.glb").stat().st_size < 5e6
 
 
 def test_glb_quaternions_never_take_the_long_way_round(tmp_path):
@@ -160,12 +216,8 @@ def test_glb_quaternions_never_take_the_long_way_round(tmp_path):
     turns = np.linspace(0, 4 * np.pi, 60)[:, None] * np.array([0.0, 1.0, 0.0])
     transforms = np.zeros((60, 8, 3, 4))
     transforms[..., :3] = Rotation.from_rotvec(turns).as_matrix()[:, None]
-    write_animated_glb(
-        tmp_path / "a.glb",
-        [],
-        TIMESTEP,
-        skinned_body=SkinnedMesh(**{**vars(body), "joint_transforms": transforms}),
-    )
+    skin = dataclasses.replace(body.skin, joint_transforms=transforms)
+    write_animated_glb(tmp_path / "a.glb", [with_skin(skin, body.rest_positions, body.faces)], TIMESTEP)
     player = Player(tmp_path / "a.glb")
     channel = next(c for c in player.document.animations[0].channels if c.target.path == "rotation")
     values = player.read(player.document.animations[0].samplers[channel.sampler].output)
@@ -181,22 +233,15 @@ def test_glb_opens_in_trimesh_with_frame_zero(tmp_path):
 
 
 def test_glb_of_a_single_frame_has_no_animation(tmp_path):
-    write_animated_glb(
-        tmp_path / "a.glb",
-        [make_cloth(num_frames=1)],
-        TIMESTEP,
-        skinned_body=make_body(num_frames=1),
-        has_normals=False,
-    )
+    body = make_body(num_frames=1)
+    write_animated_glb(tmp_path / "a.glb", [make_cloth(num_frames=1), body], TIMESTEP)
     player = Player(tmp_path / "a.glb")
     assert not player.document.animations
-    np.testing.assert_allclose(
-        player.positions("body", 0.0), pose(make_body(num_frames=1), 0), atol=TOLERANCE
-    )
+    np.testing.assert_allclose(player.positions("body", 0.0), body.positions[0], atol=TOLERANCE)
 
 
 def test_glb_accessors_carry_the_bounds_and_alignment_that_gltf_demands(tmp_path):
-    write_animated_glb(tmp_path / "a.glb", [make_cloth()], TIMESTEP, skinned_body=make_body())
+    write_animated_glb(tmp_path / "a.glb", [make_cloth(), make_body()], TIMESTEP)
     player = Player(tmp_path / "a.glb")
     document = player.document
     assert all(view.byteOffset % 4 == 0 for view in document.bufferViews)
@@ -215,35 +260,44 @@ def test_vertex_normals_of_a_sphere_are_its_directions():
     np.testing.assert_array_equal(lonely, np.tile([0.0, 1.0, 0.0], (4, 1)))
 
 
-def with_change(mesh, **change):
-    return type(mesh)(**{**vars(mesh), **change})
-
-
 @pytest.mark.parametrize(
     ("cloth", "body", "timestep", "error"),
     [
         (make_cloth(num_frames=4), make_body(), TIMESTEP, MotionError),
-        (make_cloth(num_frames=0), None, TIMESTEP, MotionError),
+        (make_cloth(num_frames=0), None, TIMESTEP, MeshError),
         (make_cloth(), None, 0.0, MotionError),
-        (with_change(make_cloth(), faces=np.array([[0, 1, 9999]])), None, TIMESTEP, MeshError),
-        (with_change(make_cloth(), faces=np.zeros((0, 3), int)), None, TIMESTEP, MeshError),
-        (with_change(make_cloth(), positions=np.full((5, 162, 3), np.nan)), None, TIMESTEP, MeshError),
-        (with_change(make_cloth(), positions=np.zeros((5, 3))), None, TIMESTEP, MeshError),
+        (dataclasses.replace(make_cloth(), faces=np.array([[0, 1, 9999]])), None, TIMESTEP, MeshError),
+        (dataclasses.replace(make_cloth(), faces=np.zeros((0, 3), int)), None, TIMESTEP, MeshError),
+        (
+            dataclasses.replace(make_cloth(), positions=np.full((5, 162, 3), np.nan)),
+            None,
+            TIMESTEP,
+            MeshError,
+        ),
+        (dataclasses.replace(make_cloth(), positions=np.zeros((5, 3))), None, TIMESTEP, MeshError),
         (
             make_cloth(),
-            with_change(make_body(), joint_transforms=np.ones((5, 8, 3, 4))),
+            change_skin(make_body(), joint_transforms=np.ones((5, 8, 3, 4))),
             TIMESTEP,
             MotionError,
         ),
-        (make_cloth(), with_change(make_body(), parents=[-1]), TIMESTEP, MotionError),
-        (make_cloth(), with_change(make_body(), joint_names=["root"]), TIMESTEP, MotionError),
-        (make_cloth(), with_change(make_body(), skin_weights=np.ones((162, 6))), TIMESTEP, MeshError),
-        (make_cloth(), with_change(make_body(), skin_indices=np.full((162, 6), 8)), TIMESTEP, MeshError),
-        (make_cloth(), with_change(make_body(), skin_indices=np.zeros((162, 2), int)), TIMESTEP, MeshError),
+        (
+            make_cloth(),
+            change_skin(make_body(), joint_transforms=np.ones((4, 8, 3, 4))),
+            TIMESTEP,
+            MotionError,
+        ),
+        (make_cloth(), dataclasses.replace(make_body(), rest_positions=None), TIMESTEP, MeshError),
+        (dataclasses.replace(make_cloth(), velocities=np.ones((5, 3, 3))), None, TIMESTEP, MeshError),
+        (make_cloth(), change_skin(make_body(), parents=[-1]), TIMESTEP, MotionError),
+        (make_cloth(), change_skin(make_body(), joint_names=["root"]), TIMESTEP, MotionError),
+        (make_cloth(), change_skin(make_body(), skin_weights=np.ones((162, 6))), TIMESTEP, MeshError),
+        (make_cloth(), change_skin(make_body(), skin_indices=np.full((162, 6), 8)), TIMESTEP, MeshError),
+        (make_cloth(), change_skin(make_body(), skin_indices=np.zeros((162, 2), int)), TIMESTEP, MeshError),
     ],
 )
 def test_glb_names_what_is_wrong_and_writes_nothing(tmp_path, cloth, body, timestep, error):
     with pytest.raises(error) as caught:
-        write_animated_glb(tmp_path / "a.glb", [cloth], timestep, skinned_body=body)
+        write_animated_glb(tmp_path / "a.glb", [cloth, *([body] if body else [])], timestep)
     assert "\n" not in str(caught.value)
     assert not os.listdir(tmp_path)

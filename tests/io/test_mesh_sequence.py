@@ -7,7 +7,8 @@ from broken import refuses
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.sequence import pose_sequence
-from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.body.units import UnitsWarning
+from eslr_jax.errors import MotionError
 from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, obj_text, read_mesh_sequence
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
@@ -69,19 +70,24 @@ def test_frames_between_frames_lie_on_straight_lines():
         pose_sequence(MeshSequence("body", MOVING, FACES, 15.0), num_frames=30)
 
 
-def test_other_units_are_refused():
-    with pytest.raises(AssetError, match="metres"):
-        pose_sequence(MeshSequence("body", 100 * MOVING, FACES, 30.0))
+def test_other_units_are_recognised_or_named():
+    sequence = MeshSequence("body", 100 * MOVING, FACES, 30.0)
+    _, expected = pose_sequence(MeshSequence("body", MOVING, FACES, 30.0))
+    with pytest.warns(UnitsWarning, match="in cm"):
+        _, guessed = pose_sequence(sequence)
+    _, named = pose_sequence(sequence, units="cm")
+    for found in (guessed, named):
+        np.testing.assert_allclose(found.positions, expected.positions, atol=1e-6)
 
 
 BROKEN = {
     "no faces": ({"faces": None}, "lacks faces"),
     "no positions": ({"positions": None}, "positions"),
     "one frame without the axis": ({"positions": MOVING[0]}, "frames, vertices, 3"),
-    "a face beyond": ({"faces": FACES + 10_000}, "names vertex"),
+    "a face beyond": ({"faces": FACES + 10_000}, "vertices"),
     "not finite": ({"positions": np.full_like(MOVING, np.nan)}, "frame 0"),
     "no rate": ({"fps": np.array(0.0)}, "frames per second"),
-    "a rate of words": ({"fps": np.array("fast")}, "frame rate"),
+    "a rate of words": ({"fps": np.array("fast")}, "one number"),
     "faces of floats": ({"faces": FACES.astype(float)}, "faces"),
 }
 

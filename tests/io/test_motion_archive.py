@@ -18,8 +18,8 @@ CLIP = {
 BROKEN_MOTIONS = {
     "no clip": ({"walk/rotations": None}, "no motion"),
     "no names": ({"joint_names": None}, "no motion"),
-    "no rate": ({"walk/fps": None}, "lacks fps"),
-    "another number of joints": ({"walk/rotations": np.zeros((4, 5, 3))}, "2 joints"),
+    "no rate": ({"walk/fps": None}, "lacks walk/fps"),
+    "another number of joints": ({"walk/rotations": np.zeros((4, 5, 3))}, "[frames, 2, 3]"),
     "frames that differ": ({"walk/translations": np.zeros((3, 3))}, "translations"),
     "names that are numbers": ({"joint_names": np.arange(2)}, "names"),
     "text for numbers": ({"walk/translations": np.array([["a"] * 3] * 4)}, "translations"),

@@ -5,6 +5,7 @@ import sys
 import types
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import scipy.sparse
@@ -12,9 +13,10 @@ from broken import refuses
 from formats import SMPL_NAMES, SMPL_PARENTS, joint_regressor, smpl_model, write_amass, write_hood, write_vto
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.motion import Motion, pose_body
+from eslr_jax.body.motion import Motion, pose_body, shape_body
 from eslr_jax.body.retarget import local_rotations
 from eslr_jax.body.rig import make_body, make_motion
+from eslr_jax.body.units import UnitsWarning
 from eslr_jax.errors import AssetError
 from eslr_jax.io.smpl import read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.types import Body
@@ -83,14 +85,7 @@ def test_a_smpl_body_moves_as_its_equations_say(tmp_path, model, kind):
     shape = rng.normal(size=10)
     rest = model["J_regressor"] @ (model["v_template"] + model["shapedirs"] @ shape)
     motion = Motion("a", rotations, rest[0] + root, 30.0, SMPL_NAMES)
-    # Longer legs carry the root higher; that is taken back, the equations know nothing of it.
-    mean = model["J_regressor"] @ model["v_template"]
-
-    def leg(joints):
-        return np.linalg.norm(joints[4] - joints[1]) + np.linalg.norm(joints[7] - joints[4])
-
-    motion = Motion("a", rotations, (rest[0] + root) * leg(mean) / leg(rest), 30.0, SMPL_NAMES)
-    poses = pose_body(body, motion, arm_abduction=0.0, shape=shape)
+    poses = pose_body(shape_body(body, shape), motion, arm_abduction=0.0)
     for frame in range(2):
         expected = smpl_vertices(model, rotations[frame], root[frame], shape)
         np.testing.assert_allclose(poses.positions[frame], expected, atol=2e-5)  # [m], float32 and 207 blends
@@ -187,9 +182,15 @@ def test_broken_models_are_named_in_one_line(tmp_path, model, kind):
 
 
 def test_centimetres_are_recognised(tmp_path, model):
-    path = tmp_path / "model.npz"
-    np.savez(path, **(model | {"v_template": model["v_template"] * 100}))
-    refuses(lambda file: make_body(read_smpl_body(file)), path, "centimetres")
+    in_metres, in_centimetres = tmp_path / "m.npz", tmp_path / "cm.npz"
+    np.savez(in_metres, **model)
+    lengths = {key: 100 * model[key] for key in ("v_template", "shapedirs", "posedirs")}
+    np.savez(in_centimetres, **(model | lengths))
+    with pytest.warns(UnitsWarning, match="in cm"):
+        found = make_body(read_smpl_body(in_centimetres))
+    expected = make_body(read_smpl_body(in_metres))
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
 def test_truncated_and_foreign_models_are_refused(tmp_path, model):

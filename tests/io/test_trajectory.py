@@ -1,74 +1,154 @@
 """Trajectory files come back as they were written, and broken ones are named."""
 
 import contextlib
+import dataclasses
+import json
 import os
 
 import numpy as np
 import pytest
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.trajectory import read_trajectory, write_trajectory
+from eslr_jax.io.run import read_run
+from eslr_jax.io.skin import Skin
+from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.types import Material
+
+RNG = np.random.default_rng(0)
+FRAMES = 3
 
 
-def make_arguments(num_frames=3):
-    rng = np.random.default_rng(0)
-    return {
-        "positions": rng.normal(size=(num_frames, 5, 3)).astype(np.float32),
-        "velocities": rng.normal(size=(num_frames, 5, 3)).astype(np.float32),
-        "faces": np.array([[0, 1, 2], [2, 3, 4]]),
-        "body_positions": rng.normal(size=(num_frames, 4, 3)).astype(np.float32),
-        "body_faces": np.array([[0, 1, 2], [0, 2, 3]]),
-        "timestep": 1 / 30,
-        "metadata": {"garment": "tshirt", "versions": {"jax": "0.10"}, "pins": [1, 2]},
+def floats(*shape):
+    return RNG.normal(size=shape).astype(np.float32)
+
+
+BODY = BodyTrack(
+    positions=floats(FRAMES, 4, 3),
+    faces=np.array([[0, 1, 2], [0, 2, 3]]),
+    rest_positions=floats(4, 3),
+    contact_faces=np.array([[0, 1, 2]]),
+    contact_boundary=np.array([0, 2]),
+    skin=Skin(
+        np.full((4, 2), np.float32(0.5)), np.tile([0, 1], (4, 1)), floats(FRAMES, 2, 3, 4), floats(2, 3),
+        (-1, 0), ("hips", "spine"),
+    ),
+)  # fmt: skip
+WHOLE = TrajectoryFile(
+    positions=floats(FRAMES, 5, 3),
+    velocities=floats(FRAMES, 5, 3),
+    faces=np.array([[0, 1, 2], [2, 3, 4]]),
+    timestep=1 / 30,
+    metadata={"garment": "tshirt", "versions": {"jax": "0.10"}, "pins": [1, 2]},
+    body=BODY,
+    friction_loads=np.abs(floats(FRAMES, 5)),
+    material=Material(
+        np.abs(floats(5)), np.float32(23600), np.abs(floats(2)), np.float32(1e-5), np.float32(1e-3)
+    ),
+)
+
+
+def assert_equal(found, expected):
+    """Compare two values, field by field where they have fields."""
+    if dataclasses.is_dataclass(expected):
+        for field in dataclasses.fields(expected):
+            assert_equal(getattr(found, field.name), getattr(expected, field.name))
+    elif isinstance(expected, np.ndarray | np.generic):
+        np.testing.assert_array_equal(found, expected)
+    else:
+        assert found == expected
+
+
+@pytest.mark.parametrize(
+    "trajectory",
+    [
+        WHOLE,
+        dataclasses.replace(WHOLE, body=None, friction_loads=None, material=None, metadata={}),
+        dataclasses.replace(WHOLE, body=dataclasses.replace(BODY, contact_faces=np.empty((0, 3), int))),
+    ],
+    ids=["whole", "bare", "beyond reach"],
+)
+def test_trajectory_round_trip_is_exact(tmp_path, trajectory):
+    write_trajectory(tmp_path / "run.npz", trajectory)
+    found = read_trajectory(tmp_path / "run.npz")
+    assert_equal(found, trajectory)
+    assert found.num_frames == FRAMES
+
+
+@pytest.mark.parametrize("has_contacts", [False, True])
+def test_trajectory_of_the_first_format_is_converted(tmp_path, has_contacts):
+    arrays = {
+        "format": np.array("eslr-trajectory-1"),
+        "positions": WHOLE.positions,
+        "velocities": WHOLE.velocities,
+        "faces": WHOLE.faces,
+        "timestep": np.array(WHOLE.timestep),
+        "metadata": np.array(json.dumps({"garment": "tshirt", "total": 1.5})),
+        "body_positions": BODY.positions,
+        "body_faces": BODY.faces,
     }
+    if has_contacts:
+        arrays |= {"body_rest_positions": BODY.rest_positions, "contact_faces": BODY.contact_faces}
+    np.savez(tmp_path / "run.npz", **arrays)
+    found = read_trajectory(tmp_path / "run.npz")
+    np.testing.assert_array_equal(found.positions, WHOLE.positions)
+    assert found.metadata["garment"] == "tshirt"
+    assert found.friction_loads is None
+    assert found.material is None
+    rest, reached = (
+        (BODY.rest_positions, BODY.contact_faces) if has_contacts else (BODY.positions[0], BODY.faces)
+    )
+    np.testing.assert_array_equal(found.body.rest_positions, rest)
+    np.testing.assert_array_equal(found.body.contact_faces, reached)
+    assert found.body.contact_boundary.shape == (0,)
 
 
-def test_trajectory_round_trip_is_exact(tmp_path):
-    arguments = make_arguments()
-    write_trajectory(tmp_path / "run.npz", **arguments)
-    result = read_trajectory(tmp_path / "run.npz")
-    for name in ("positions", "velocities", "faces", "body_positions", "body_faces"):
-        np.testing.assert_array_equal(getattr(result, name), arguments[name])
-    assert result.timestep == arguments["timestep"]
-    assert result.metadata == arguments["metadata"]
-    assert result.num_frames == 3
+def test_run_has_its_report_from_the_json_alone(tmp_path):
+    write_trajectory(tmp_path / "trajectory.npz", WHOLE)
+    assert read_run(tmp_path).report == {}
+    (tmp_path / "report.json").write_text('{"total": 2.0}')
+    run = read_run(tmp_path)
+    assert run.report == {"total": 2.0}
+    assert_equal(run.trajectory, WHOLE)
+    (tmp_path / "report.json").write_text("{")
+    with pytest.raises(AssetError, match=r"report.json is damaged"):
+        read_run(tmp_path)
 
 
-def test_trajectory_without_a_body(tmp_path):
-    arguments = make_arguments() | {"body_positions": None, "body_faces": None, "metadata": None}
-    write_trajectory(tmp_path / "run.npz", **arguments)
-    result = read_trajectory(tmp_path / "run.npz")
-    assert result.body_positions is None
-    assert result.body_faces is None
-    assert result.metadata == {}
+def change_body(**change):
+    return {"body": dataclasses.replace(BODY, **change)}
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"velocities": np.zeros((3, 4, 3))}, "velocities"),
-        ({"faces": np.array([[0, 1, 5]])}, "name vertex 5"),
-        ({"faces": np.array([[0, 1, -1]])}, "vertex"),
+        ({"faces": np.array([[0, 1, 5]])}, "names 5 of 5 vertices"),
+        ({"faces": np.array([[0, 1, -1]])}, "names -1"),
         ({"positions": np.zeros((5, 3))}, "frames, vertices, 3"),
-        ({"positions": np.zeros((0, 5, 3)), "velocities": np.zeros((0, 5, 3))}, "frames, vertices, 3"),
-        ({"body_faces": None}, "both or neither"),
-        ({"body_positions": np.zeros((2, 4, 3))}, "2 body frames"),
+        ({"positions": np.zeros((0, 5, 3)), "velocities": np.zeros((0, 5, 3)), "body": None,
+          "friction_loads": None}, "0 frames"),
+        (change_body(positions=np.zeros((2, 4, 3))), "body_positions"),
+        (change_body(contact_faces=np.array([[0, 1, 4]])), "names 4 of 4 body_vertices"),
+        (change_body(contact_boundary=np.array([9])), "contact_boundary names 9"),
+        (change_body(skin=dataclasses.replace(BODY.skin, parents=(-1,))), "body_parents"),
+        ({"friction_loads": np.zeros((3, 4))}, "friction_loads"),
+        ({"material": WHOLE.material.replace(density=np.float32(-1))}, "material_density"),
         ({"timestep": 0.0}, "timestep"),
         ({"timestep": np.nan}, "timestep"),
         ({"metadata": {"a": object()}}, "JSON"),
         ({"metadata": {"a": np.nan}}, "JSON"),
     ],
-)
+)  # fmt: skip
 def test_write_trajectory_names_what_is_wrong_and_writes_nothing(tmp_path, change, message):
     with pytest.raises(AssetError, match=message):
-        write_trajectory(tmp_path / "run.npz", **(make_arguments() | change))
+        write_trajectory(tmp_path / "run.npz", dataclasses.replace(WHOLE, **change))
     assert not os.listdir(tmp_path)
 
 
 def test_read_trajectory_names_a_missing_or_foreign_file(tmp_path):
     with pytest.raises(AssetError, match="doesn't exist"):
         read_trajectory(tmp_path / "none.npz")
-    with pytest.raises(AssetError, match="can't be read"):
+    with pytest.raises(AssetError, match="is a folder"):
         read_trajectory(tmp_path)
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(AssetError, match="not an npz archive"):
@@ -78,27 +158,37 @@ def test_read_trajectory_names_a_missing_or_foreign_file(tmp_path):
         read_trajectory(tmp_path / "other.npz")
 
 
+@pytest.mark.parametrize("name", ["body_rest_positions", "body_parents", "material_thickness"])
+def test_read_trajectory_refuses_half_a_part(tmp_path, name):
+    write_trajectory(tmp_path / "run.npz", WHOLE)
+    with np.load(tmp_path / "run.npz") as archive:
+        arrays = {key: value for key, value in archive.items() if key != name}
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(AssetError, match=f"lacks {name}"):
+        read_trajectory(tmp_path / "run.npz")
+
+
 def test_read_trajectory_runs_no_pickle(tmp_path):
-    write_trajectory(tmp_path / "run.npz", **make_arguments())
+    write_trajectory(tmp_path / "run.npz", WHOLE)
     with np.load(tmp_path / "run.npz") as archive:
         arrays = dict(archive)
     arrays["metadata"] = np.array([object()], dtype=object)
     np.savez(tmp_path / "run.npz", **arrays)
-    with pytest.raises(AssetError, match="damaged"):
+    with pytest.raises(AssetError, match="can't be read as an npz archive"):
         read_trajectory(tmp_path / "run.npz")
 
 
 @pytest.mark.filterwarnings("ignore")  # a damaged header may look like one from Python 2
 def test_read_trajectory_survives_truncation_and_flipped_bytes(tmp_path):
     source = tmp_path / "run.npz"
-    write_trajectory(source, **make_arguments())
+    write_trajectory(source, WHOLE)
     content, damaged = source.read_bytes(), tmp_path / "damaged.npz"
     rng = np.random.default_rng(1)
-    for cut in range(0, len(content), 97):
+    for cut in range(0, len(content), 397):
         damaged.write_bytes(content[:cut])
         with pytest.raises(AssetError):
             read_trajectory(damaged)
-    for _ in range(300):
+    for _ in range(60):
         mutated = bytearray(content)
         for position in rng.integers(len(content), size=rng.integers(1, 6)):
             mutated[position] = rng.integers(256)

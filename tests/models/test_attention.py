@@ -1,12 +1,12 @@
-"""Random features against exact attention."""
+"""Random features against exact attention, in NumPy."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from reference_models import exact_attention
 
 from eslr_jax.models.attention import (
-    exact_attention,
     linear_attention,
     orthogonal_projection,
     relu_features,
@@ -22,28 +22,17 @@ def draw(scale, seed=0):
     return q, k, generator.standard_normal((ROWS, WIDTH))
 
 
-def to_jax(*arrays):
-    return [jnp.asarray(array, jnp.float32) for array in arrays]
-
-
 def attend(q, k, v, num_features, seed=0, mask=None):
-    projection = jnp.asarray(orthogonal_projection(num_features, SIZE, seed), jnp.float32)
-    q, k, v = to_jax(q, k, v)
-    return linear_attention(*softmax_features(q, k, projection), v, mask)
+    projection = orthogonal_projection(num_features, SIZE, seed)
+    q, k, v, projection = (jnp.asarray(array, jnp.float32) for array in (q, k, v, projection))
+    return np.asarray(linear_attention(*softmax_features(q, k, projection), v, mask))
 
 
-def error(num_features, scale=0.3):
-    q, k, v = draw(scale)
-    exact = exact_attention(*to_jax(q, k, v))
-    runs = [attend(q, k, v, num_features, seed) - exact for seed in range(5)]
+def error(num_features):
+    q, k, v = draw(0.3)
+    exact = exact_attention(q, k, v)
+    runs = [attend(q, k, v, num_features, seed) - exact for seed in range(3)]
     return np.mean([np.linalg.norm(run) for run in runs]) / np.linalg.norm(exact)
-
-
-def test_exact_attention_matches_numpy():
-    q, k, v = draw(1.0)
-    scores = np.exp(q @ k.T / np.sqrt(SIZE))
-    expected = scores / scores.sum(axis=1, keepdims=True) @ v
-    np.testing.assert_allclose(exact_attention(*to_jax(q, k, v)), expected, atol=1e-5)
 
 
 def test_error_falls_with_features():
@@ -58,14 +47,15 @@ def test_linear_attention_matches_its_kernel_written_as_a_matrix():
     q_features, k_features = (np.maximum(x @ projection.T, 0) + 1e-3 for x in (q, k))
     kernel = q_features @ k_features.T
     expected = kernel / kernel.sum(axis=1, keepdims=True) @ v
-    features = relu_features(*to_jax(q, k, projection))
-    np.testing.assert_allclose(linear_attention(*features, *to_jax(v)), expected, atol=1e-5)
+    q, k, v, projection = (jnp.asarray(array, jnp.float32) for array in (q, k, v, projection))
+    actual = linear_attention(*relu_features(q, k, projection), v)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
 def test_weights_do_not_collapse_to_the_mean():
     """A largest exponent per key, or a large epsilon, would give every key about the same weight."""
     q, k, v = draw(0.3)
-    exact = exact_attention(*to_jax(q, k, v))
+    exact = exact_attention(q, k, v)
     spread = np.linalg.norm(exact - v.mean(axis=0, keepdims=True))
     assert np.linalg.norm(attend(q, k, v, 512) - exact) < 0.5 * spread
 
@@ -75,14 +65,12 @@ def test_huge_queries_and_keys_stay_finite():
     assert np.isfinite(attend(q, k, v, 64)).all()
 
 
-def test_masked_rows_are_not_attended_to():
+def test_masked_rows_change_nothing():
     q, k, v = draw(0.5)
     mask = jnp.arange(ROWS) < 150
     spoiled = np.where(np.arange(ROWS)[:, None] < 150, v, 1e6)
-    masked = attend(q, k, spoiled, 64, mask=mask)[:150]
-    exact = exact_attention(*to_jax(q, k, spoiled), mask)[:150]
-    assert np.abs(masked).max() < 10
-    np.testing.assert_allclose(exact, exact_attention(*to_jax(q[:150], k[:150], v[:150])), atol=1e-5)
+    first, second = (attend(q, k, rows, 64, mask=mask)[:150] for rows in (v, spoiled))
+    np.testing.assert_allclose(first, second, atol=1e-6)
 
 
 def test_directions_are_orthogonal_seeded_and_as_long_as_gaussian_vectors():

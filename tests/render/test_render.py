@@ -8,8 +8,16 @@ import pytest
 import trimesh
 
 from eslr_jax.errors import AssetError, ConfigError, MeshError, MissingExtraError, NonFiniteError
-from eslr_jax.render import contact_sheet, render_frame, render_frames, write_png, write_video
-from eslr_jax.render.camera import parse_angle, place_camera
+from eslr_jax.render import (
+    add_color_bar,
+    color_scale,
+    contact_sheet,
+    render_frame,
+    render_frames,
+    write_png,
+    write_video,
+)
+from eslr_jax.render.camera import facing_angles, follow, parse_angle, place_camera
 from eslr_jax.render.denoise import smooth_grain
 
 SMALL = {"size": (48, 64), "samples": 4}
@@ -33,11 +41,15 @@ def first_frame(scene):
     return {name: value[0] if name.endswith("positions") else value for name, value in scene.items()}
 
 
-def blue_columns(picture):
-    """Mean column of the pixels where the blue cloth is, relative to the picture's width."""
+def is_blue(picture):
+    """Tell the pixels where the blue cloth is."""
     pixels = picture.astype(int)
-    is_blue = pixels[..., 2] - pixels[..., 0] > 25
-    return np.nonzero(is_blue)[1].mean() / picture.shape[1]
+    return pixels[..., 2] - pixels[..., 0] > 25
+
+
+def blue_columns(picture):
+    """Return the mean column of the blue cloth, relative to the picture's width."""
+    return np.nonzero(is_blue(picture))[1].mean() / picture.shape[1]
 
 
 def test_render_frame_shows_the_cloth_on_the_right_side_of_the_body(scene):
@@ -73,6 +85,61 @@ def test_render_frames_follow_the_body(scene):
     assert np.abs(first.astype(int) - last).mean() < 3
 
 
+def test_the_front_turns_with_the_body(scene):
+    """Cloth at the body's left is on the right of every picture, wherever the body faces."""
+    pytest.importorskip("mitsuba")
+    quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # +Z becomes +X
+    rest = scene["body_positions"][0] * [1.0, 1.3, 0.4]  # wider than deep, as a person
+    cloth = scene["garment_positions"][0]
+    moved = scene | {
+        "body_positions": np.repeat((rest @ quarter.T)[None], 3, axis=0),
+        "garment_positions": np.repeat((cloth @ quarter.T)[None], 3, axis=0),
+    }
+    (picture,) = render_frames(**moved, rest_positions=rest, frame_indices=[1], **SMALL)
+    assert blue_columns(picture) > 0.6
+    (fixed,) = render_frames(**moved, frame_indices=[1], **SMALL)
+    assert not is_blue(fixed).any()  # the left is behind the body
+
+
+def test_facing_angles_tell_a_turn_without_jumps():
+    rest = np.random.default_rng(0).normal(size=(50, 3)) * [0.3, 0.9, 0.15]
+    turns = np.linspace(0.0, 7.0, 40)
+    cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    posed = np.stack(
+        [
+            rest[:, 0] * cosine + rest[:, 2] * sine + 2.0,
+            np.broadcast_to(rest[:, 1], (40, 50)),
+            rest[:, 2] * cosine - rest[:, 0] * sine,
+        ],
+        axis=-1,
+    )
+    np.testing.assert_allclose(facing_angles(posed, rest), turns, atol=1e-9)
+
+
+def test_zoom_enlarges_what_it_looks_at(scene):
+    aspect, angles = 0.75, np.zeros(3)
+    whole, _ = follow(scene["body_positions"], angles, aspect=aspect)
+    close, _ = follow(
+        scene["body_positions"], angles, aspect=aspect, zoom=3.0, focus=scene["garment_positions"]
+    )
+    ratio = np.tan(whole[1].view_angle / 2) / np.tan(close[1].view_angle / 2)
+    assert ratio == pytest.approx(3.0)
+    np.testing.assert_allclose(close[1].target, scene["garment_positions"][1].mean(axis=0), atol=1e-6)
+
+
+def test_a_color_bar_spans_the_scale_under_the_picture():
+    pytest.importorskip("PIL")
+    picture = np.zeros((60, 200, 3), np.uint8)
+    found = add_color_bar(picture, 0.0, 2.0, "stretch")
+    np.testing.assert_array_equal(found[:60], picture)
+    ends = np.round(255 * color_scale(np.array([0.0, 1.0]), 0.0, 1.0))
+    rows = (found[60:] == ends[0]).all(axis=2).any(axis=1)
+    bar = found[60:][np.argmax(rows)]
+    is_ramp = ~(bar == 255).all(axis=1)
+    np.testing.assert_array_equal(bar[is_ramp][[0, -1]], ends)
+    assert is_ramp.sum() > 180
+
+
 def test_contact_sheet_tiles_frames_and_reports_progress(scene):
     pytest.importorskip("mitsuba")
     done = []
@@ -91,6 +158,7 @@ def test_contact_sheet_tiles_frames_and_reports_progress(scene):
         ({"camera": float("nan")}, ConfigError),
         ({"size": (0, 10)}, ConfigError),
         ({"samples": 0}, ConfigError),
+        ({"zoom": 0.0}, ConfigError),
         ({"garment_positions": np.full((162, 3), np.nan)}, NonFiniteError),
         ({"garment_faces": np.array([[0, 1, 999]])}, MeshError),
         ({"garment_faces": np.zeros((0, 3), int)}, MeshError),
@@ -184,3 +252,12 @@ def test_write_video_refuses_no_frames_and_mixed_sizes(tmp_path, frames):
     with pytest.raises(AssetError):
         write_video(tmp_path / "a.mp4", frames, fps=10)
     assert not os.listdir(tmp_path)
+
+
+def test_color_scale_ends_and_order():
+    colors = color_scale(np.array([-9.0, 0.0, 0.5, 1.0, 9.0, np.nan]), 0.0, 1.0)
+    np.testing.assert_array_equal(colors[0], colors[1])
+    np.testing.assert_array_equal(colors[3], colors[4])
+    np.testing.assert_array_equal(colors[5], colors[1])
+    lightness = color_scale(np.linspace(0, 1, 30), 0.0, 1.0) @ [0.3, 0.6, 0.1]
+    assert np.all(np.diff(lightness) > 0)

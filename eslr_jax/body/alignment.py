@@ -1,0 +1,133 @@
+"""How the rest pose of one rig stands to that of another (host)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body.joints import HAND, Part, find_parts, torso_axes
+from eslr_jax.body.retarget import minimal_rotation
+from eslr_jax.errors import MotionError
+from eslr_jax.io.skeleton import Skeleton
+
+SAME_REST = 1e-3  # [m] by which the rest joints of one rig differ from file to file
+ORDINARY_TILT = np.deg2rad(35.0)  # rest poses that lean less than this are taken to stand alike
+MAX_LEG_TURN = np.deg2rad(75.0)  # between the legs of two rest poses that both stand
+_LIMBS = {"upper_leg": "lower_leg", "lower_leg": "foot", "upper_arm": "forearm", "forearm": "hand"}
+
+Parts = Mapping[Part, list[int]]  # joints of each part of a rig
+
+
+def match_parts(
+    target: Skeleton, source: Skeleton, followed: list[int]
+) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
+    """Return the joints of each part that both rigs have: those of the body, and those of the source.
+
+    Args:
+        target: Joints of the body.
+        source: Joints of the motion's file.
+        followed: Joint of the source that each joint of the body follows; -1 for none.
+    """
+    ours: dict[Part, list[int]] = {}
+    theirs: dict[Part, list[int]] = {}
+    known, others = find_parts(target), find_parts(source)
+    part_of = {joint: part for part, joints in known.items() for joint in joints}
+    part_of_other = {joint: part for part, joints in others.items() for joint in joints}
+    for joint, other in enumerate(followed):
+        part = part_of.get(joint) or part_of_other.get(other)
+        if other >= 0 and part is not None:
+            ours.setdefault(part, []).append(joint)
+            theirs.setdefault(part, []).append(other)
+    if followed[0] < 0:
+        theirs["", "hips"] = others["", "hips"]
+    else:
+        theirs["", "hips"] = [followed[0]]
+    ours["", "hips"] = [0]
+    return ours, theirs
+
+
+def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float | None:
+    """Return how many times larger a rig is than the same rig in other units; None if it is another rig.
+
+    Args:
+        target: Joints of the body at rest [m].
+        source: Joints of the motion's file at rest, in its unit.
+        followed: Joint of the source that each joint of the body follows; -1 for none.
+    """
+    names = source.joint_names
+    if any(
+        other < 0 or names[other] != name for name, other in zip(target.joint_names, followed, strict=True)
+    ):
+        return None
+    theirs = source.rest_positions[followed] - source.rest_positions[followed[0]]
+    ours = target.rest_positions - target.rest_positions[0]
+    scale = float((ours * theirs).sum() / max((theirs**2).sum(), 1e-30))
+    for factor in (1.0, scale):
+        if np.abs(factor * theirs - ours).max() < SAME_REST:
+            return factor
+    return None
+
+
+def align_rests(
+    target: Skeleton,
+    source: Skeleton,
+    ours: Parts,
+    theirs: Parts,
+    name: str,
+) -> NDArray:
+    """Return the rotation from the body's rest pose to the source's for each joint, shape [joints, 3, 3].
+
+    Args:
+        target: Joints of the body at rest.
+        source: Joints of the motion's file at rest.
+        ours: Joints of the body by part; see `match_parts`.
+        theirs: Joints of the source by part.
+        name: What messages call the motion.
+
+    Raises:
+        MotionError: The source's rest pose does not stand.
+    """
+    upright = _torso_turn(target, ours, source, theirs)
+    result = np.tile(upright, (len(target), 1, 1))
+    for side in ("left", "right"):
+        for chain, beyond in _LIMBS.items():
+            parts = (side, chain), (side, beyond)
+            if not all(part in ours and part in theirs for part in parts):
+                continue
+            bone = _bone(target, ours, *parts)
+            other = _bone(source, theirs, *parts)
+            if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
+                continue
+            turn = minimal_rotation(upright @ bone, other)
+            if beyond in ("lower_leg", "foot") and np.arccos((np.trace(turn) - 1) / 2) > MAX_LEG_TURN:
+                raise MotionError(
+                    f"motion {name}: its rest pose does not stand ({side} {chain} points elsewhere); "
+                    "export it with a T-pose at rest"
+                )
+            chains = (chain, *HAND) if chain == "forearm" else (chain,)
+            for part in chains:
+                result[ours.get((side, part), [])] = turn @ upright
+    return result
+
+
+def _bone(skeleton: Skeleton, parts: Parts, start: Part, end: Part) -> NDArray:
+    """Return the vector from one part's first joint to another's, at rest."""
+    return skeleton.rest_positions[parts[end][0]] - skeleton.rest_positions[parts[start][0]]
+
+
+def _torso_turn(target: Skeleton, ours: Parts, source: Skeleton, theirs: Parts) -> NDArray:
+    """Return the rotation from the body's rest torso to the source's, shape [3, 3].
+
+    It is a quarter turn if one comes near: two rest poses that stand alike still lean by some degrees.
+    """
+    one, other = torso_axes(target, ours), torso_axes(source, theirs)
+    if one is None or other is None:
+        return np.eye(3)
+    turn = other @ one.T
+    quarters = Rotation.create_group("O").as_matrix()
+    angles = np.arccos(np.clip((np.einsum("nab,ab->n", quarters, turn) - 1) / 2, -1, 1))
+    is_near = angles.min() < ORDINARY_TILT
+    return np.round(quarters[angles.argmin()]) if is_near else turn

@@ -1,0 +1,193 @@
+"""Motions in time: cut, repeated, settled first, and slow enough to follow (host)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.body.motion import Motion
+from eslr_jax.body.retarget import blend_rotations, count_resampled
+from eslr_jax.errors import MotionError
+from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.io.skeleton import SkeletonMotion
+from eslr_jax.types import BodyMotion
+
+_START_SECONDS = 1.0  # in which a pose that does not belong to the motion is looked for
+_JUMP = 0.08  # of the skeleton's size: least step of a joint that counts as a jump
+_FAR_MORE = 3.0  # times any other step
+_STEPS_AFTER = 5  # of a motion, by which a jump is judged
+_BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
+
+
+def num_simulated_frames(motion: Motion, fps: float = 30.0) -> int:
+    """Return how many frames of a motion are simulated, which is at another rate than the file's."""
+    return count_resampled(len(motion.rotations), motion.fps, fps)
+
+
+def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
+    """Return a motion without a T-pose that stands before it, and a line that says so.
+
+    Many files begin with one or a few frames of the rest pose. Simulated, that is a jump. Frames are skipped
+    if the step that follows them is far longer than every other step.
+
+    Args:
+        source: The motion of a file.
+
+    Returns:
+        The motion, and what was skipped; the same motion and "" if nothing was.
+    """
+    size = float(np.ptp(source.skeleton.rest_positions, axis=0).max()) or 1.0
+    steps = np.linalg.norm(np.diff(source.positions, axis=0), axis=-1).max(axis=1) / size
+    window = steps[: max(round(_START_SECONDS * source.fps), 1)]
+    last = int(window.argmax()) if len(window) else 0
+    others = np.delete(steps, last) if len(window) else steps
+    if len(steps) - last <= _STEPS_AFTER or steps[last] < max(_JUMP, _FAR_MORE * others.max()):
+        return source, ""
+    kept = dataclasses.replace(
+        source, rotations=source.rotations[last + 1 :], positions=source.positions[last + 1 :]
+    )
+    frames = "frame" if last == 0 else f"{last + 1} frames"
+    text = (
+        f"motion {source.name}: skipped its first {frames}, a pose from which it jumps by "
+        f"{100 * steps[last]:.0f} % of the body's height"
+    )
+    return kept, text
+
+
+def cut_start(motion: Motion, seconds: float) -> Motion:
+    """Return a motion from a time on.
+
+    Args:
+        motion: A motion.
+        seconds: Time of its new first frame [s].
+
+    Raises:
+        MotionError: Fewer than two frames are left.
+    """
+    first = round(seconds * motion.fps) if math.isfinite(seconds) else -1
+    length = (len(motion.rotations) - 1) / motion.fps
+    if not 0 <= first <= len(motion.rotations) - 2:
+        raise MotionError(f"motion {motion.name} can't start at {seconds:g} s: it is {length:.2f} s long")
+    return dataclasses.replace(
+        motion, rotations=motion.rotations[first:], translations=motion.translations[first:]
+    )
+
+
+def loop_motion(motion: Motion, seconds: float) -> Motion:
+    """Return a motion that repeats until it is this long.
+
+    Each repetition starts where the last one ended, facing the same way, and the end passes smoothly into the
+    beginning.
+
+    Args:
+        motion: A motion.
+        seconds: Length wanted [s].
+
+    Raises:
+        MotionError: The length is not positive, or the motion is too short to repeat.
+    """
+    frames = len(motion.rotations)
+    if not (math.isfinite(seconds) and seconds > 0) or frames < 4:
+        raise MotionError(f"motion {motion.name} of {frames} frames can't be repeated for {seconds:g} s")
+    overlap = max(min(round(_BLEND_SECONDS * motion.fps), frames // 3), 1)
+    rotations, translations = np.array(motion.rotations, float), np.array(motion.translations, float)
+    head, root = rotations.copy(), translations.copy()
+    wanted = math.ceil(seconds * motion.fps) + 1
+    share = np.arange(1, overlap + 1) / (overlap + 1)
+    weight = share**2 * (3.0 - 2.0 * share)
+    while len(rotations) < wanted:
+        seam = len(rotations) - overlap
+        turn = _level_turn(rotations[seam, 0], motion.rotations[0, 0])
+        head[:, 0] = (turn * Rotation.from_rotvec(motion.rotations[:, 0])).as_rotvec()
+        root = turn.apply(motion.translations)
+        root = root + (translations[seam] - root[0]) * [1.0, 0.0, 1.0]
+        joined = blend_rotations(rotations[seam:], head[:overlap], weight)
+        path = translations[seam:] + weight[:, None] * (root[:overlap] - translations[seam:])
+        rotations = np.concatenate([rotations[:seam], joined, head[overlap:]])
+        translations = np.concatenate([translations[:seam], path, root[overlap:]])
+    return dataclasses.replace(motion, rotations=rotations[:wanted], translations=translations[:wanted])
+
+
+def _level_turn(end: NDArray, start: NDArray) -> Rotation:
+    """Return the turn about the vertical that brings one axis-angle rotation closest to another, `end`."""
+    matrix = (Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()).as_matrix()
+    return Rotation.from_euler("y", np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2]))
+
+
+def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
+    """Return a moving body with frames before its first, in which a garment comes to rest on it.
+
+    The body holds its first pose. It glides over the floor at the speed of the motion's first step, so that
+    cloth which has settled is as fast as the body when the motion begins.
+
+    Args:
+        poses: The body in motion.
+        num_frames: Number of frames to put before it; drop as many from the result.
+
+    Raises:
+        MotionError: The number is negative.
+    """
+    if num_frames < 0:
+        raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
+    step = (
+        (poses.positions[1] - poses.positions[0]).mean(axis=0) if len(poses.positions) > 1 else jnp.zeros(3)
+    )
+    shifts = jnp.arange(-num_frames, 0)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
+    held = jnp.repeat(poses.joint_transforms[:1], num_frames, axis=0)
+    return poses.replace(
+        positions=jnp.concatenate([poses.positions[:1] + shifts[:, None], poses.positions]),
+        joint_transforms=jnp.concatenate([held.at[..., 3].add(shifts[:, None]), poses.joint_transforms]),
+    )
+
+
+def find_fast_frame(
+    poses: BodyMotion, limit: float, *, vertices: NDArray | None = None
+) -> tuple[int, float] | None:
+    """Return the first frame in which a body comes towards cloth by more than a limit, and by how much [m].
+
+    Args:
+        poses: The body in motion.
+        limit: Largest step along the outward normal between two frames [m].
+        vertices: Body vertices that cloth can reach; None for all that are an obstacle.
+
+    Returns:
+        The frame that the step leads to and the step [m], or None if all frames keep the limit.
+    """
+    positions, faces = np.asarray(poses.positions), np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
+    if vertices is not None:
+        faces = faces[np.isin(faces, vertices).all(axis=1)]
+    corners = np.unique(faces)
+    for frame in range(1, len(positions)):
+        moved = positions[frame] - positions[frame - 1]
+        if not len(corners) or np.linalg.norm(moved[corners], axis=1).max() <= limit:
+            continue  # most frames; normals are needed for the others only
+        normals = face_cross_products(positions[frame - 1], faces)
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        step = float(np.einsum("fka,fa->fk", moved[faces], normals).max())
+        if step > limit:
+            return frame, step
+    return None
+
+
+def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
+    """Raise unless contacts can follow the body in every frame; see `find_fast_frame`.
+
+    Raises:
+        MotionError: A step is too long; the line names the frame, the speed, and what to do.
+    """
+    found = find_fast_frame(poses, limit, vertices=vertices)
+    if found is None:
+        return
+    frame, step = found
+    timestep = float(poses.timestep)
+    raise MotionError(
+        f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "
+        f"{step / timestep:.1f} m/s), and contacts follow {limit:g} m: "
+        + (f"frames 0 to {frame - 1} are fine, --frames {frame} keeps them; " if frame > 1 else "")
+        + "start later, or repair or slow down the motion"
+    )

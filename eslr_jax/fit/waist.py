@@ -1,0 +1,77 @@
+"""Waistbands: the boundary loops that hold up a garment which does not hang from the shoulders."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from eslr_jax.fit.postures import shoulder_height
+from eslr_jax.geometry.topology import boundary_loops, vertex_components
+from eslr_jax.types import Body
+
+WAISTBAND = 0.03  # [m] width of the band below the loop that is held, as an elastic waistband
+_CROTCH = 0.45  # of the body's height: a loop below it goes around legs
+_PART_SHARE = 0.02  # of the vertices; a smaller part is a button or a label
+
+
+@dataclasses.dataclass(frozen=True)
+class Waist:
+    """What holds a garment up."""
+
+    is_held: Bool[np.ndarray, " vertices"]  # vertices of waistbands
+    reason: str  # why they are held, or why nothing is
+    is_falling: bool  # a part hangs neither from the shoulders nor from a waistband
+
+
+def find_waist(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], body: Body
+) -> Waist:
+    """Find the waistbands of the parts of a garment that do not reach above the shoulder joints.
+
+    A waistband is a part's highest boundary loop around the trunk, and the cloth up to 3 cm from it.
+
+    Args:
+        positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        body: The body in its rest pose.
+    """
+    shoulders = shoulder_height(body)
+    count, component = vertex_components(faces, len(positions))
+    loops = [loop for loop in boundary_loops(faces) if _is_around_trunk(positions[loop], body)]
+    is_held, falling, heights = np.zeros(len(positions), bool), False, []
+    for part in range(count):
+        own = np.flatnonzero(component == part)
+        if positions[own, 1].max() > shoulders or len(own) < _PART_SHARE * len(positions):
+            continue
+        around = [loop for loop in loops if component[loop[0]] == part]
+        if not around:
+            falling = True
+            continue
+        loop = max(around, key=lambda ring: positions[ring, 1].mean())
+        gaps, _ = KDTree(positions[loop]).query(positions[own])
+        is_held[own[gaps <= WAISTBAND]] = True
+        heights.append(float(positions[loop, 1].mean()) - float(np.asarray(body.rest_positions)[:, 1].min()))
+    if heights:
+        places = " and ".join(f"{height:.2f} m" for height in heights)
+        reason = f"waistband at {places} above the floor, since no cloth reaches above the shoulder joints"
+    elif falling:
+        reason = "no cloth reaches above the shoulder joints, and no open edge goes around the trunk"
+    else:
+        reason = "it hangs from the shoulders"
+    return Waist(is_held, reason, falling)
+
+
+def _is_around_trunk(ring: np.ndarray, body: Body) -> bool:
+    """Tell whether a closed curve winds around the middle of the body above the crotch."""
+    rest = np.asarray(body.rest_positions, np.float64)
+    height, low = ring[:, 1].mean(), rest[:, 1].min()
+    if height < low + _CROTCH * np.ptp(rest[:, 1]):
+        return False
+    near = rest[(np.abs(rest[:, 1] - height) < 0.03) & (np.abs(rest[:, 0]) < 0.1 * np.ptp(rest[:, 1]))]
+    center = near[:, [0, 2]].mean(axis=0) if len(near) else np.zeros(2)
+    angle = np.arctan2(*(ring[:, [0, 2]] - center).T)
+    turns = np.diff(np.append(angle, angle[0]))
+    return abs(np.sum((turns + np.pi) % (2 * np.pi) - np.pi)) > np.pi

@@ -1,0 +1,139 @@
+"""Run the fifteen hard cases with a simulator and keep the figures, with device and versions.
+
+    python experiments/hard_cases physics
+    python experiments/hard_cases network --model eslr-small
+    python experiments/hard_cases corrected --model smooth-small --sheet
+    python experiments/hard_cases vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
+    python experiments/hard_cases blender             # Blender's cloth, see `blender_cloth.py`
+    python experiments/hard_cases --smoke --out DIR   # one case
+
+Writes `hard_cases_<simulator>.json` after every case (`hard_cases_<simulator>_<model>.json` for another network
+than the default one) and, with `--sheet`, a picture of all that ran beside it. A case of an earlier file stays
+until it is run again. `python -m hard_cases` does the same from within `experiments/`.
+
+Needs the IPC Toolkit (extra `dev`); `--sheet` needs the extra `render`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+EXPERIMENTS = Path(__file__).resolve().parents[1]
+PEERS = {
+    "vbd": (5, 20),
+    "style3d": (2, 20),
+    "xpbd": (None, 1),
+}  # substeps, iterations: the best of peers.json
+BLENDER = (45, 2)  # steps per frame, rounds of collision per step: likewise
+ITERATIONS = {"physics": 200, "corrected": 20, "network": 0}  # of the solver, per frame
+DEFAULT_MODEL = "eslr-small"
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Return what the command line asks for."""
+    parser = argparse.ArgumentParser(
+        prog="hard_cases", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    choices = [*ITERATIONS, *PEERS, "blender"]
+    parser.add_argument("simulator", nargs="?", default="corrected", choices=choices)
+    parser.add_argument("--model", default=DEFAULT_MODEL)
+    parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
+    parser.add_argument("--case", nargs="*", default=[])
+    parser.add_argument("--sheet", action="store_true")
+    parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
+    parser.add_argument("--smoke", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.smoke:
+        arguments.model, arguments.case = "smooth-small", ["pull"]
+    if arguments.iterations is None:
+        arguments.iterations = ITERATIONS.get(arguments.simulator)
+    return arguments
+
+
+def find_simulator(arguments: argparse.Namespace):
+    """Return the simulator that was asked for.
+
+    Raises:
+        EslrError: It is not installed, or the network is unknown.
+    """
+    from eslr_jax.assets import load_model
+    from eslr_jax.errors import ConfigError
+    from hard_cases import network_simulator, solver_simulator
+
+    name = arguments.simulator
+    if name == "physics":
+        return solver_simulator(arguments.iterations)
+    if name in ITERATIONS:
+        return network_simulator(arguments.model, *load_model(arguments.model), arguments.iterations)
+    if arguments.iterations is not None:
+        raise ConfigError(f"--iterations is for this package's simulators; {name} has its own effort")
+    if name == "blender":
+        from blender_cloth import blender_simulator
+
+        return blender_simulator(BLENDER)
+    from newton_cloth import Setting, newton_simulator
+
+    return newton_simulator(Setting(name, *PEERS[name]))
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Run cases one after the other and keep what comes of them.
+
+    Raises:
+        EslrError: Something is not installed, or a name is unknown.
+    """
+    from eslr_jax.extras import require
+
+    require("ipctk", extra="dev", purpose="the referee of the hard cases")
+    if arguments.sheet:
+        for module in ("mitsuba", "PIL"):
+            require(module, extra="render", purpose="--sheet")
+
+    from eslr_jax.io.atomic import atomic_write
+    from eslr_jax.render import write_png
+    from hard_cases import CASES, find_case, run_case
+    from hard_cases.report import draw_sheet, merge_summaries, summarize
+
+    cases = [find_case(name) for name in arguments.case or CASES]
+    simulator = find_simulator(arguments)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
+    path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
+    outcomes = []
+    for case in cases:
+        began = time.perf_counter()
+        outcome = run_case(case, simulator)
+        outcomes.append(outcome)
+        result = summarize(simulator.name, outcome)
+        if path.exists():
+            result = merge_summaries(json.loads(path.read_text()), result)
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(result, indent=1) + "\n")
+        verdict = "passed" if outcome.is_passed else "FAILED"
+        print(f"{case.name}: {verdict} in {time.perf_counter() - began:.0f} s", flush=True)
+        for row in outcome.rows():
+            if not row["passed"]:
+                print(f"    {row['measure']}: {row['value']} > {row['bar']}", flush=True)
+    if arguments.sheet and (sheet := draw_sheet(outcomes)) is not None:
+        write_png(path.with_suffix(".png"), sheet)
+
+
+def main() -> None:
+    """Run the command line; an error on purpose is one line and exit code 2."""
+    from eslr_jax.errors import EslrError
+
+    arguments = parse_arguments()
+    try:
+        run(arguments)
+    except EslrError as error:
+        print(f"hard_cases: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    sys.path[0] = str(EXPERIMENTS)  # Python puts this folder there, but its modules belong to a package
+    main()

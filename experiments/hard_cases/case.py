@@ -1,0 +1,158 @@
+"""A hard case, the simulators that run it, and what comes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from eslr_jax.errors import EslrError, Status
+from eslr_jax.types import Scene, Trajectory
+from hard_cases.colliders import Collider
+
+Colliders = Callable[[int], Sequence[Collider]]
+"""From a frame to the solids that the body stands for."""
+
+
+def no_colliders(frame: int) -> Sequence[Collider]:
+    """Return the solids of a scene that has none."""
+    return ()
+
+
+@dataclasses.dataclass(frozen=True)
+class CaseScene:
+    """A scene of a case, with its body in closed form."""
+
+    scene: Scene
+    colliders: Colliders = no_colliders
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulator:
+    """Anything that simulates a scene; it may refuse by raising an `EslrError`."""
+
+    name: str
+    simulate: Callable[[Scene], Trajectory]
+    garment_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of `prepare_garment`
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A scene that was simulated."""
+
+    scene: Scene
+    colliders: Colliders
+    trajectory: Trajectory
+
+    @cached_property
+    def positions(self) -> Float[np.ndarray, "frames vertices 3"]:
+        """Positions of the vertices that are no padding, float64 [m], shape [frames, vertices, 3]."""
+        is_real = np.asarray(self.scene.garment.vertex_mask)
+        return np.asarray(self.trajectory.positions, np.float64)[:, is_real]
+
+    @cached_property
+    def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Faces that are no padding, shape [faces, 3]."""
+        return np.asarray(self.scene.garment.faces)[np.asarray(self.scene.garment.rest_areas) > 0]
+
+    @property
+    def timestep(self) -> float:
+        """Seconds between frames."""
+        return float(self.scene.timestep)
+
+    @property
+    def status(self) -> Status:
+        """What the simulator itself found wrong."""
+        return Status(int(self.trajectory.status))
+
+    @cached_property
+    def is_finite(self) -> np.ndarray:
+        """Which frames hold neither NaN nor infinity, shape [frames]."""
+        return np.isfinite(self.positions).all(axis=(1, 2))
+
+
+class Measure(NamedTuple):
+    """One figure and its bar."""
+
+    name: str  # with the unit
+    value: float
+    bar: float | None  # the value passes at or below it; None is for information alone
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether the value is a number at or below the bar."""
+        return self.bar is None or bool(np.isfinite(self.value) and self.value <= self.bar)
+
+
+Scenes = dict[str, CaseScene | EslrError]  # an error: the scene itself was refused
+Runs = dict[str, Run]
+
+
+@dataclasses.dataclass(frozen=True)
+class HardCase:
+    """One situation that breaks simulators."""
+
+    name: str
+    reason: str  # why it is hard, in a line
+    build: Callable[[Mapping[str, Any]], Scenes]  # from options of `prepare_garment`
+    measure: Callable[[Runs], list[Measure]]
+    picture: str  # the scene to show
+    may_refuse: bool = False  # a named error is an answer
+    limit: str = ""  # what the solver itself can't do here, with figures
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a simulator made of a case."""
+
+    case: HardCase
+    measures: list[Measure]
+    runs: Runs
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether every measure is within its bar."""
+        return all(measure.is_passed for measure in self.measures)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return plain values, one row per measure: case, passed, measure, value and bar."""
+        return [
+            {
+                "case": self.case.name,
+                "passed": measure.is_passed,
+                "measure": measure.name,
+                "value": float(measure.value) if np.isfinite(measure.value) else None,
+                "bar": measure.bar,
+            }
+            for measure in self.measures
+        ]
+
+
+def run_case(case: HardCase, simulator: Simulator) -> Outcome:
+    """Simulate all scenes of a case and measure them.
+
+    Nothing else is measured where a frame is not finite, or where a simulator says that it failed.
+    """
+    runs: Runs = {}
+    refusals: dict[str, EslrError] = {}
+    for label, built in case.build(simulator.garment_options).items():
+        try:
+            if isinstance(built, EslrError):
+                raise built
+            runs[label] = Run(built.scene, built.colliders, simulator.simulate(built.scene))
+        except EslrError as error:
+            refusals[label] = error
+    measures = [Measure("frames not finite", sum(int(np.sum(~run.is_finite)) for run in runs.values()), 0)]
+    failed = [f"{label}: {run.status.name}" for label, run in runs.items() if run.status != Status.OK]
+    if failed:
+        measures.append(Measure(f"scenes that failed ({', '.join(failed)})", len(failed), 0))
+    if refusals and not case.may_refuse:
+        measures.append(Measure(f"scenes refused ({', '.join(refusals)})", len(refusals), 0))
+    if all(measure.is_passed for measure in measures):
+        measures += [Measure(f"{label}: refused, {error}"[:100], 0, 0) for label, error in refusals.items()]
+        measures += case.measure(runs)
+    return Outcome(case, measures, runs)

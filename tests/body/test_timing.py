@@ -1,0 +1,131 @@
+"""Motions that are cut, repeated, settled and checked for speed."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eslr_jax.assets import load_motion
+from eslr_jax.body.motion import Motion, pose_body, still_motion
+from eslr_jax.body.rig import skeleton_motion
+from eslr_jax.body.timing import (
+    check_speed,
+    cut_start,
+    find_fast_frame,
+    loop_motion,
+    num_simulated_frames,
+    skip_start_pose,
+    with_settling,
+)
+from eslr_jax.errors import MotionError
+
+
+@pytest.fixture(scope="module")
+def walking(body):
+    return skeleton_motion(load_motion("cmu_016_32"), body)
+
+
+def with_rest_pose_first(source, frames, offset=(0.0, 0.0, 0.0)):
+    rest = np.tile(source.skeleton.rest_positions + offset, (frames, 1, 1))
+    turned = np.tile(np.eye(3), (frames, len(source.skeleton), 1, 1))
+    return dataclasses.replace(
+        source,
+        positions=np.concatenate([rest, source.positions]),
+        rotations=np.concatenate([turned, source.rotations]),
+    )
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_a_rest_pose_before_a_motion_is_skipped_and_named(walking, frames):
+    kept, text = skip_start_pose(with_rest_pose_first(walking, frames, offset=(1.5, 0.0, 0.0)))
+    np.testing.assert_array_equal(kept.positions, walking.positions)
+    np.testing.assert_array_equal(kept.rotations, walking.rotations)
+    assert "skipped its first " + ("frame," if frames == 1 else "3 frames,") in text
+
+
+def test_a_motion_without_a_rest_pose_is_kept(walking, body):
+    for source in (walking, skeleton_motion(load_motion("jump", body=body), body)):
+        kept, text = skip_start_pose(source)
+        assert kept is source
+        assert text == ""
+
+
+def test_a_jump_in_a_motion_that_jumps_again_is_kept(walking):
+    source = with_rest_pose_first(walking, 1, offset=(1.5, 0.0, 0.0))
+    positions = source.positions.copy()
+    positions[60:] += [1.0, 0.0, 0.0]
+    source = dataclasses.replace(source, positions=positions)
+    assert skip_start_pose(source)[0] is source
+
+
+def test_a_cut_motion_starts_where_it_was_at_that_time(body):
+    motion = load_motion("cmu_016_32")
+    cut = cut_start(motion, 0.5)
+    first = round(0.5 * motion.fps)
+    np.testing.assert_array_equal(cut.translations, motion.translations[first:])
+    np.testing.assert_array_equal(cut.rotations, motion.rotations[first:])
+    for seconds in (-1.0, 1e3, np.nan):
+        with pytest.raises(MotionError, match="s long"):
+            cut_start(motion, seconds)
+
+
+def test_a_repeated_walk_goes_on_without_a_jump(body):
+    motion = load_motion("cmu_016_32")
+    length = (len(motion.rotations) - 1) / motion.fps
+    looped = loop_motion(motion, 3 * length)
+    assert len(looped.rotations) == round(3 * length * motion.fps) + 1
+    once, thrice = (skeleton_motion(each, body).positions for each in (motion, looped))
+    steps, longest = (
+        np.linalg.norm(np.diff(positions, axis=0), axis=-1).max() for positions in (thrice, once)
+    )
+    assert steps < 1.5 * longest
+    np.testing.assert_array_equal(looped.rotations[:30], motion.rotations[:30])
+    walked = np.linalg.norm(np.ptp(motion.translations[:, [0, 2]], axis=0))
+    assert np.linalg.norm(np.ptp(looped.translations[:, [0, 2]], axis=0)) > 2.3 * walked
+    with pytest.raises(MotionError, match="can't be repeated"):
+        loop_motion(motion, 0.0)
+
+
+def test_simulated_frames_are_counted_at_the_rate_of_the_simulation(body):
+    motion = still_motion(body, 158, fps=33.3)
+    count = num_simulated_frames(motion)
+    assert count == 142
+    assert len(pose_body(body, motion, arm_abduction=0.0).positions) == count
+
+
+def test_settling_holds_the_first_pose_at_the_speed_of_the_first_step(walk):
+    settled = with_settling(walk, 5)
+    assert len(settled.positions) == len(walk.positions) + 5
+    np.testing.assert_array_equal(settled.positions[5:], walk.positions)
+    shape = settled.positions - settled.positions.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(shape[:5], np.broadcast_to(shape[5], shape[:5].shape), atol=1e-6)
+    centers = np.asarray(settled.positions.mean(axis=1))
+    steps = np.diff(centers[:7], axis=0)
+    np.testing.assert_allclose(steps[:, [0, 2]], np.broadcast_to(steps[-1, [0, 2]], (6, 2)), atol=1e-6)
+    np.testing.assert_allclose(centers[:6, 1], centers[5, 1], atol=1e-6)  # on the floor
+    np.testing.assert_allclose(
+        settled.joint_transforms[0, :, :, 3] - walk.joint_transforms[0, :, :, 3],
+        np.broadcast_to(centers[0] - centers[5], (walk.joint_transforms.shape[1], 3)),
+        atol=1e-6,
+    )
+    with pytest.raises(MotionError, match="settle"):
+        with_settling(walk, -1)
+
+
+def test_a_body_that_is_too_fast_is_named_with_its_frame(walk):
+    assert find_fast_frame(walk, 0.3) is None
+    check_speed(walk, 0.3)
+    positions = jnp.asarray(walk.positions).at[4:].add(jnp.array([0.0, 0.0, 0.5])[None, None])
+    fast = walk.replace(positions=positions)
+    frame, step = find_fast_frame(fast, 0.3)
+    assert frame == 4
+    assert step == pytest.approx(0.5, abs=0.05)
+    with pytest.raises(MotionError, match=r"to frame 4 .* m/s.*frames 0 to 3 are fine, --frames 4"):
+        check_speed(fast, 0.3)
+    assert find_fast_frame(fast, 0.3, vertices=np.zeros(0, int)) is None
+
+
+def test_a_motion_of_nothing_is_refused():
+    with pytest.raises(MotionError, match="no frames"):
+        Motion("empty", np.zeros((0, 1, 3)), np.zeros((0, 3)), 30.0, ("root",))

@@ -1,0 +1,67 @@
+"""The smallest garment on the smallest moving body: a square of cloth over a ball that drifts."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.types import BodyMotion, Garment
+
+RADIUS = 0.1  # [m]
+TIMESTEP = 1 / 30  # [s]
+
+
+def ball(rings: int = 7, around: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """A closed ball around the origin, facing out."""
+    polar = np.linspace(0, np.pi, rings + 2)[1:-1]
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    ring = np.stack(np.broadcast_arrays(
+        np.sin(polar)[:, None] * np.sin(angle), np.cos(polar)[:, None], np.sin(polar)[:, None] * np.cos(angle)
+    ), axis=-1).reshape(-1, 3)  # fmt: skip
+    positions = np.concatenate([ring, [[0, 1, 0]], [[0, -1, 0]]]) * RADIUS
+    index = np.arange(rings * around).reshape(rings, around)
+    after = np.roll(index, -1, axis=1)
+    a, b, c, d = index[:-1].ravel(), index[1:].ravel(), after[1:].ravel(), after[:-1].ravel()
+    top, bottom = len(positions) - 2, len(positions) - 1
+    faces = [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
+    faces.append(np.stack([np.full(around, top), index[0], after[0]], 1))
+    faces.append(np.stack([np.full(around, bottom), after[-1], index[-1]], 1))
+    return positions, np.concatenate(faces)
+
+
+def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = None) -> Garment:
+    """A level square of side x side vertices just above the ball, carried by both joints."""
+    x, z = np.meshgrid(
+        np.linspace(-0.5, 0.5, side) * size, np.linspace(-0.5, 0.5, side) * size, indexing="ij"
+    )
+    positions = np.stack([x, np.full_like(x, RADIUS + 0.004), z], axis=-1).reshape(-1, 3)
+    index = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    share = (x.ravel() / size + 0.5)[:, None]
+    return prepare_garment(
+        positions,
+        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
+        skin_weights=np.concatenate([share, 1 - share], axis=1),
+        skin_indices=np.broadcast_to([0, 1], (side * side, 2)),
+        is_pinned=is_pinned,
+    )
+
+
+def drifting_ball(num_frames: int = 6, *, speed: float = 0.3) -> BodyMotion:
+    """A ball that drifts along x at `speed` [m/s] and rises a little; its two joints move with it."""
+    positions, faces = ball()
+    time = np.arange(num_frames) * TIMESTEP
+    shift = np.stack([speed * time, 0.2 * speed * time, np.zeros(num_frames)], axis=1)
+    transforms = np.broadcast_to(np.eye(3, 4), (num_frames, 2, 3, 4)).copy()
+    transforms[..., 3] = shift[:, None]
+    return BodyMotion(
+        positions=jnp.asarray(positions + shift[:, None], jnp.float32),
+        joint_transforms=jnp.asarray(transforms, jnp.float32),
+        faces=jnp.asarray(faces, jnp.int32),
+        is_obstacle=jnp.ones(len(faces), bool),
+        timestep=jnp.float32(TIMESTEP),
+        rest_positions=jnp.asarray(positions, jnp.float32),
+        surface=prepare_surface(positions, faces),
+    )

@@ -1,0 +1,103 @@
+"""HOOD's measures of a whole trajectory, against its losses frame by frame."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hood_metrics import hood_metrics
+
+from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.physics.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_depths, hood_terms
+from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import initial_state
+from eslr_jax.types import PhysicsConstants, Scene, SceneBody
+
+TIMESTEP = 1 / 30
+FRAMES = 4
+
+
+def sheet(count, spacing):
+    """Return a flat square sheet that faces up."""
+    x, z = np.meshgrid(np.arange(count) * spacing, np.arange(count) * spacing)
+    index = np.arange(count * count).reshape(count, count)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    positions = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    return positions, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+
+
+@pytest.fixture(scope="module")
+def worn():
+    """A crumpled sheet that slides over a floor which moves too: its positions and its scene."""
+    random = np.random.default_rng(0)
+    rest, faces = sheet(5, 0.05)
+    ones = np.ones((len(rest), 1))
+    garment = prepare_garment(rest, faces, skin_weights=ones, skin_indices=np.zeros_like(ones, int))
+    floor, floor_faces = sheet(7, 0.06)
+    surface = prepare_surface(floor, floor_faces)
+    floor = floor[np.asarray(surface.vertex_ids)] - [0.05, 0.0005, 0.05]
+    steps = np.arange(FRAMES)[:, None, None]
+    body = jnp.asarray(floor + steps * [0.002, 0.0, 0.001], jnp.float32)
+    bumps = 1e-3 * random.standard_normal((FRAMES, len(rest), 3))
+    positions = np.asarray(garment.rest_positions)[None].repeat(FRAMES, axis=0)
+    positions[:, : len(rest)] += bumps + steps * [0.004, 0.0, 0.0]
+    positions = jnp.asarray(positions, jnp.float32)
+    scene = Scene(
+        garment=jax.tree.map(jnp.asarray, garment),
+        material=COTTON,
+        constants=PhysicsConstants(),
+        timestep=jnp.float32(TIMESTEP),
+        initial_state=initial_state(positions[0], jnp.zeros_like(positions[0])),
+        body=SceneBody(surface, body),
+        pin_targets=None,
+        num_frames=FRAMES,
+    )
+    return positions, scene
+
+
+@pytest.mark.slow
+def test_metrics_of_a_trajectory_are_those_of_its_frames(worn):
+    positions, scene = worn
+    body, faces = scene.body.positions, scene.body.surface.faces
+    found = jax.jit(hood_metrics)(positions, scene)
+    is_real = np.asarray(scene.garment.vertex_mask)
+
+    @jax.jit
+    def of_frame(position, current, previous, bodies):
+        problem = HoodProblem(
+            current, previous, bodies, scene.garment, scene.material, TIMESTEP, METRIC_PARAMETERS
+        )
+
+        def terms(x):
+            return hood_terms(x, problem, criterion="metric")
+
+        depth = hood_depths(position, position, bodies.next, bodies.next, faces, 1e-3)
+        return terms(position), jax.grad(lambda x: sum(terms(x)))(position), depth
+
+    for k in range(FRAMES - 2):
+        bodies = BodyFrames(*body[k : k + 3], faces)
+        terms, gradient, depth = of_frame(positions[k + 2], positions[k + 1], positions[k], bodies)
+        for name, value in terms._asdict().items():
+            np.testing.assert_allclose(getattr(found.terms, name)[k], value, rtol=1e-4, err_msg=name)
+        norm = np.linalg.norm(np.asarray(gradient)[is_real], axis=1).mean()
+        np.testing.assert_allclose(found.gradient_norm[k], norm, rtol=1e-4)
+        share = (np.asarray(depth)[is_real] > 0).mean()
+        assert 0.1 < share < 0.9, "the frame is to have vertices on both sides"
+        np.testing.assert_allclose(found.penetrating_share[k], share, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_heights_count_from_the_origin(worn):
+    positions, scene = worn
+    lower = np.array([0.0, -0.5, 0.0], np.float32)
+    found, shifted = (jax.jit(hood_metrics)(positions, scene, origin=origin) for origin in (0 * lower, lower))
+    weight = 9.81 * float(jnp.sum(vertex_masses(scene.garment, scene.material)))
+    np.testing.assert_allclose(shifted.terms.gravity - found.terms.gravity, 0.5 * weight, rtol=1e-4)
+    np.testing.assert_allclose(shifted.terms.stretch, found.terms.stretch, rtol=1e-2)
+
+
+def test_a_scene_without_a_body_is_refused(worn):
+    positions, scene = worn
+    with pytest.raises(ValueError, match="body"):
+        hood_metrics(positions, scene.replace(body=None))

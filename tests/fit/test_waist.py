@@ -1,0 +1,105 @@
+"""Garments that do not hang from the shoulders are held at the waist, and nothing else is."""
+
+import numpy as np
+import pytest
+from garment_files import bundled, source
+from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress
+
+from eslr_jax.errors import ConfigError
+from eslr_jax.fit.fit import fit_garment
+from eslr_jax.fit.options import FitOptions
+from eslr_jax.fit.report import describe_cost, describe_fit
+from eslr_jax.fit.waist import WAISTBAND, find_waist
+
+
+def standing(shape, body):
+    positions, faces = shape()
+    return positions + np.array([0.0, float(np.asarray(body.rest_positions)[:, 1].min()), 0.0]), faces
+
+
+def joined(*shapes):
+    """Return several shapes as one mesh."""
+    counts = np.cumsum([0, *(len(positions) for positions, _ in shapes)])
+    faces = [faces + start for (_, faces), start in zip(shapes, counts[:-1], strict=True)]
+    return np.concatenate([positions for positions, _ in shapes]), np.concatenate(faces)
+
+
+@pytest.mark.parametrize("shape", [skirt, shorts, trousers, tube_dress])
+def test_waistband_is_the_top_of_what_has_no_shoulders(body, shape):
+    positions, faces = standing(shape, body)
+    waist = find_waist(positions, faces, body)
+    below = positions[:, 1].max() - positions[:, 1]
+    assert waist.is_held[below < 0.9 * WAISTBAND].all()
+    assert below[waist.is_held].max() <= WAISTBAND
+    assert not waist.is_falling
+    assert "waistband" in waist.reason
+
+
+@pytest.mark.parametrize("shape", [poncho, cape])
+def test_what_lies_on_the_shoulders_is_not_held(body, shape):
+    waist = find_waist(*standing(shape, body), body)
+    assert not waist.is_held.any()
+    assert waist.reason == "it hangs from the shoulders"
+
+
+@pytest.mark.parametrize("name", ["shorts", "pants", "kneepants"])
+def test_waistband_is_that_of_the_bundled_garments(body, name):
+    garment = bundled(f"{name}_1k")
+    held = find_waist(garment.rest_positions, garment.faces, body).is_held
+    assert np.mean(garment.is_pinned[held]) == 1.0
+    assert held.sum() > 0.6 * garment.is_pinned.sum()
+
+
+@pytest.mark.parametrize("name", ["tshirt", "tank", "longsleeve", "dress", "shortsleeve", "tightdress"])
+def test_bundled_garments_with_shoulders_are_not_held(body, name):
+    garment = bundled(f"{name}_1k")
+    assert not find_waist(garment.rest_positions, garment.faces, body).is_held.any()
+
+
+def test_parts_are_judged_one_by_one(body):
+    shirt = bundled("tshirt_1k")
+    positions, faces = joined((shirt.rest_positions, shirt.faces), standing(shorts, body))
+    held = find_waist(positions, faces, body).is_held
+    assert not held[: len(shirt.rest_positions)].any()
+    assert held[len(shirt.rest_positions) :].sum() == find_waist(*standing(shorts, body), body).is_held.sum()
+
+
+def test_leg_warmers_fall_and_the_report_says_so(body):
+    legs = [rings([(0.5, 0.09, 0.09, 0.02), (0.2, 0.09, 0.09, 0.0)], around=24, rows=16) for _ in range(2)]
+    for (positions, _), side in zip(legs, (0.175, -0.175), strict=True):
+        positions[:, 0] += side
+    options = FitOptions(units="m", up="y", front="z", arms="rest")
+    fitted = fit_garment(source(*joined(*legs)), body, options)
+    assert not fitted.is_pinned.any()
+    assert any("nothing holds the garment up" in text for text in fitted.metadata["fit"]["warnings"])
+
+
+def test_pins_replace_the_waistband(body):
+    fast = {"units": "m", "up": "y", "front": "z", "arms": "rest"}
+    shape = source(*shorts())
+
+    def fit(*pins):
+        return fit_garment(shape, body, FitOptions(pin=pins, **fast))
+
+    default = fit()
+    assert default.metadata["fit"]["pinned"] == default.is_pinned.sum() > 50
+    text = describe_fit(default.metadata["fit"])
+    assert "feet at the origin" in text
+    assert "pinned: 100 vertices (waistband at 1.10 m above the floor" in text
+    free = fit("none")
+    assert not free.is_pinned.any()
+    assert "warning: nothing holds the garment up" in describe_fit(free.metadata["fit"])
+    loop = fit("loop:top")
+    assert loop.is_pinned.sum() == 50
+    both = fit("waist", "vertices:0")
+    assert both.is_pinned.sum() == default.is_pinned.sum() + 1
+    with pytest.raises(ConfigError, match="'none' holds nothing"):
+        fit("none", "waist")
+    shirt = bundled("tshirt_1k")
+    with pytest.raises(ConfigError, match="'waist' holds no vertex: it hangs from the shoulders"):
+        fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(pin=("waist",), arms="rest"))
+
+
+def test_cost_is_told_for_large_meshes_only():
+    assert describe_cost(10_000) is None
+    assert describe_cost(251_000).startswith("251,000 vertices are many: fitting takes about 75 s")

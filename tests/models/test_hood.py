@@ -1,0 +1,96 @@
+"""The hierarchical network against NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_models import make_scene, plain_hood, quick_jit, to_float64
+
+from eslr_jax.config import ModelConfig, from_dict
+from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.coarse import add_coarse_edges
+from eslr_jax.graph.build import build_graph
+from eslr_jax.models import registry
+from eslr_jax.models.registry import MODELS, apply_model, count_parameters, init_model
+from eslr_jax.types import tree_cast
+
+SMALL = dataclasses.replace(MODELS["hood"], message_passing_steps=5, latent_size=8, remat="none")
+
+
+def weights():
+    params, generator = init_model(SMALL), np.random.default_rng(1)
+    scrambled = jax.tree.map(
+        lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), params["params"]
+    )
+    return {**params, "params": scrambled}
+
+
+@quick_jit
+def run(params, garment, material, inputs):
+    graph = build_graph(garment, material, inputs, SMALL)
+    measured = registry.measure_statistics(SMALL, params, graph, garment, inputs.velocity)
+    params = registry.merge_statistics(params, measured)
+    return params, graph, apply_model(SMALL, params, graph, garment)
+
+
+def coarse_scene(**options):
+    garment, material, inputs = make_scene(8, 6, **options)
+    return add_coarse_edges(garment), material, inputs
+
+
+def test_parameter_count_is_that_of_the_published_network():
+    assert count_parameters(jax.eval_shape(lambda: init_model(MODELS["hood"]))) == 5_146_852
+
+
+@pytest.mark.parametrize("body", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_network_matches_numpy(body):
+    params, graph, actual = run(weights(), *coarse_scene(body=body))
+    expected = plain_hood(*(to_float64(tree) for tree in (params, graph)), 1)
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_padding_does_not_change_the_answer():
+    expected = run(weights(), *coarse_scene())[2]
+    actual = run(weights(), *coarse_scene(pad=True))[2]
+    np.testing.assert_allclose(actual[: len(expected)], expected, atol=2e-6 * np.abs(expected).max())
+
+
+@pytest.mark.numerics
+@pytest.mark.slow
+def test_gradient_matches_finite_differences():
+    with jax.enable_x64(True):
+        scene = tree_cast(coarse_scene(), jnp.float64)
+        params, graph, answer = run(tree_cast(weights(), jnp.float64), *scene)
+        generator = np.random.default_rng(0)
+        direction = generator.standard_normal(answer.shape)
+        rows = graph.nodes["garment"]
+        move = generator.standard_normal((len(rows), 3)) * 0.01
+
+        def total(velocity):
+            nodes = {**graph.nodes, "garment": rows.at[:, :3].set(velocity)}
+            answer = apply_model(SMALL, params, graph._replace(nodes=nodes), scene[0])
+            return jnp.sum(direction * answer)
+
+        velocity, step, value = rows[:, :3], 1e-6, quick_jit(total)
+        slope = jnp.sum(quick_jit(jax.grad(total))(velocity) * move)
+        expected = (value(velocity + step * move) - value(velocity - step * move)) / (2 * step)
+        np.testing.assert_allclose(slope, expected, rtol=1e-5)
+
+
+def test_a_garment_without_coarse_levels_is_refused():
+    with pytest.raises(ConfigError, match="add_coarse_edges"):
+        jax.eval_shape(run, init_model(SMALL), *make_scene(8, 6))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"hierarchical": True}, {"hierarchical": True, "smoothing_steps": 0, "message_passing_steps": 7}],
+)
+def test_impossible_hierarchies_are_refused(values):
+    with pytest.raises(ConfigError, match="hierarchical"):
+        from_dict(ModelConfig, values)

@@ -1,0 +1,96 @@
+"""Several garments in one batch, on one device and on four."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes, shared_surface
+from eslr_jax.simulation.batch import rollout_scenes, simulate_batch, stack_scenes
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import raise_for_status
+
+QUICK = SimConfig(iterations=5)
+FABRICS = [COTTON, COTTON.replace(density=np.float32(0.4)), COTTON]
+
+
+@pytest.fixture(scope="module")
+def garments():
+    return [square(8), square(7), square(8)]
+
+
+@pytest.fixture(scope="module")
+def poses():
+    return drifting_ball(4)
+
+
+@pytest.fixture(scope="module")
+def batch(garments, poses):
+    return simulate_batch(None, garments, [poses] * 3, config=QUICK, material=FABRICS)
+
+
+def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses):
+    surface = shared_surface(garments, poses)
+    np.testing.assert_array_equal(batch[0].positions, batch[2].positions)
+    for trajectory, garment, fabric in list(zip(batch, garments, FABRICS, strict=True))[:2]:
+        raise_for_status(trajectory)
+        scene = prepare_scene(garment, poses, material=fabric, surface=surface)
+        alone = rollout_scene(None, scene, QUICK)
+        assert trajectory.positions.shape == alone.positions.shape
+        np.testing.assert_allclose(trajectory.positions, alone.positions, atol=1e-5)
+        np.testing.assert_allclose(trajectory.friction_loads, alone.friction_loads, atol=1e-5)
+
+
+def test_another_motion_compiles_nothing_anew(batch, garments, poses):
+    before = rollout_scenes._cache_size()
+    moved = poses.replace(positions=poses.positions + 0.01)
+    again = simulate_batch(None, garments, [moved] * 3, config=QUICK, material=FABRICS)
+    assert rollout_scenes._cache_size() == before
+    assert not np.array_equal(again[1].positions, batch[1].positions)
+
+
+def test_counts_must_match(garments, poses):
+    with pytest.raises(ConfigError, match="3 garments, 1 motions and 3 fabrics"):
+        simulate_batch(None, garments, [poses])
+    with pytest.raises(ConfigError, match="3 garments, 3 motions and 2 fabrics"):
+        simulate_batch(None, garments, [poses] * 3, material=FABRICS[:2])
+
+
+def test_unlike_scenes_are_not_stacked(garments, poses):
+    scene = prepare_scene(garments[0], poses)
+    bare = prepare_scene(garments[0], poses, options=SceneOptions(has_body=False))
+    with pytest.raises(ValueError, match="differ in what they model"):
+        stack_scenes([scene, bare])
+
+
+@pytest.mark.slow
+def test_batch_size_does_not_change_the_trajectories(garments, poses):
+    scenes = stack_scenes(prepare_scenes([garments[0]] * 2, [poses] * 2, FABRICS[:2]))
+    one_by_one, together = (rollout_scenes(None, scenes, QUICK, batch_size=size) for size in (1, 2))
+    np.testing.assert_allclose(one_by_one.positions, together.positions, atol=1e-5)
+
+
+FOUR_DEVICES = """
+import jax, numpy as np
+from draped_ball import drifting_ball, square
+from eslr_jax import SimConfig, simulate_batch
+assert len(jax.devices()) == 4
+poses, garments, config = drifting_ball(4), [square()] * 5, SimConfig(iterations=5)
+spread = simulate_batch(None, garments, [poses] * 5, config=config, devices=jax.devices())
+alone = simulate_batch(None, garments[:1], [poses], config=config)[0]
+for trajectory in spread:
+    np.testing.assert_allclose(trajectory.positions, alone.positions, atol=1e-5)
+"""
+
+
+@pytest.mark.slow
+def test_scenes_spread_over_four_devices_equal_one(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
+    tests = Path(__file__).parents[1]
+    subprocess.run([sys.executable, "-c", FOUR_DEVICES], check=True, timeout=600, cwd=tests)

@@ -1,0 +1,58 @@
+"""The network's prediction as a start for the solver."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import Status
+from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.potential import potential
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import make_stepper
+
+CONFIG = MODELS["smooth-small"]
+
+
+@pytest.fixture(scope="module")
+def step_of():
+    """The first frame of a sheet in free fall, by weights and by how much the sheet is stretched."""
+    scene = prepare_scene(
+        square(6), drifting_ball(3), options=SceneOptions(has_body=False, start_at_rest=True)
+    )
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+
+    @jax.jit
+    def step(params, stretch):
+        state = scene.initial_state.replace(position=scene.initial_state.position * stretch)
+        problem = frame_problem(scene, state, inputs)
+        guess = initial_guess(problem).position
+        after, _ = make_stepper(params, SimConfig(model=CONFIG, iterations=0))(problem, state)
+        return guess, after, jnp.stack([potential(x, problem) for x in (guess, after.position)])
+
+    return step
+
+
+def change_weights(change):
+    params = init_model(CONFIG)
+    return {**params, "params": jax.tree.map(change, params["params"])}
+
+
+def test_a_prediction_that_climbs_is_not_taken(step_of):
+    """In free fall the guess is the optimum: whatever a network adds raises the potential."""
+    guess, after, _ = step_of(change_weights(lambda leaf: leaf + 0.5), 1.0)
+    np.testing.assert_array_equal(after.position, guess)
+    guess, after, energies = step_of(init_model(CONFIG), 1.1)  # a new one is plain preconditioned descent
+    assert energies[1] < energies[0]
+    assert np.abs(after.position - guess).max() > 1e-4
+    assert int(after.status) == Status.OK
+
+
+def test_a_prediction_that_is_not_a_number_is_told(step_of):
+    _, after, _ = step_of(change_weights(lambda leaf: leaf * jnp.nan), 1.1)
+    assert np.isfinite(after.position).all(), "the solver has its own start"
+    assert Status.NON_FINITE in Status(int(after.status))

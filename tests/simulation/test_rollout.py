@@ -1,0 +1,193 @@
+"""The pure door: jitted, mapped, differentiated, and equal to itself however it is called."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import TIMESTEP, drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
+from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
+from eslr_jax.simulation.rollout import rollout, rollout_scene
+from eslr_jax.simulation.simulate import raise_for_status
+
+SOLVER = SimConfig(iterations=15)
+SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
+NETWORK = SimConfig(model=SMALL, iterations=0)
+FABRICS = [COTTON, COTTON.replace(density=np.float32(0.4)), COTTON.replace(lame_mu=np.float32(6e4))]
+
+
+def stack(trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+@pytest.fixture(scope="module")
+def cloth():
+    return square()
+
+
+@pytest.fixture(scope="module")
+def poses():
+    return drifting_ball(4)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return init_model(SMALL)
+
+
+@pytest.fixture(scope="module")
+def solved(cloth, poses):
+    return rollout(None, cloth, poses, config=SOLVER)
+
+
+@pytest.fixture(scope="module")
+def learned(cloth, poses, params):
+    return rollout(params, cloth, poses, config=NETWORK)
+
+
+def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
+    assert int(solved.status) == Status.OK
+    positions = np.asarray(solved.positions)
+    assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.03, "corners fall"
+    middle = positions[-1].reshape(8, 8, 3)[3:5, 3:5].reshape(-1, 3)
+    assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
+
+
+def test_jit_equals_the_plain_call(cloth, poses, params, solved, learned):
+    jitted = jax.jit(rollout, static_argnames="config")
+    for weights, config, plain in ((None, SOLVER, solved), (params, NETWORK, learned)):
+        found = jitted(weights, cloth, poses, config=config)
+        np.testing.assert_allclose(found.positions, plain.positions, atol=1e-5)
+
+
+def test_vmap_over_fabrics_equals_one_by_one(cloth, poses):
+    run = partial(rollout, None, cloth, poses, config=SOLVER)
+    together = jax.vmap(lambda material: run(material=material).positions)(stack(FABRICS))
+    for row, material in enumerate(FABRICS):
+        np.testing.assert_allclose(together[row], run(material=material).positions, atol=1e-5)
+    assert float(jnp.abs(together[0] - together[1]).max()) > 1e-3
+
+
+def test_vmap_over_motions_equals_one_by_one(cloth):
+    motions = [drifting_ball(4, speed=speed) for speed in (0.2, 0.6)]
+    together = jax.vmap(lambda poses: rollout(None, cloth, poses, config=SOLVER).positions)(stack(motions))
+    for row, poses in enumerate(motions):
+        np.testing.assert_allclose(
+            together[row], rollout(None, cloth, poses, config=SOLVER).positions, atol=1e-5
+        )
+
+
+def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, params, learned):
+    wider = cloth.replace(rest_positions=cloth.rest_positions * jnp.array([[1.1, 1.0, 1.1]], jnp.float32))
+    other = {**params, "params": jax.tree.map(lambda leaf: 0.5 * leaf, params["params"])}
+    run = partial(rollout, config=NETWORK)
+    together = jax.vmap(lambda weights, garment: run(weights, garment, poses).positions)(
+        stack([params, other]), stack([cloth, wider])
+    )
+    np.testing.assert_allclose(together[0], learned.positions, atol=1e-5)
+    np.testing.assert_allclose(together[1], run(other, wider, poses).positions, atol=1e-5)
+
+
+def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
+    plan = plan_scene(cloth, poses)
+    assert not plan.has_pins
+    assert plan.surface.faces.shape[0] < poses.surface.faces.shape[0]
+    planned = rollout(None, cloth, poses, config=SOLVER, plan=plan)
+    np.testing.assert_allclose(planned.positions, solved.positions, atol=1e-4)
+
+
+def test_pins_follow_the_body(poses):
+    pinned = square(is_pinned=np.array([0, 7]))
+    trajectory = rollout(None, pinned, poses, config=SOLVER)
+    corner = np.asarray(pinned.rest_positions)[0] + np.asarray(poses.joint_transforms)[:, 0, :, 3]
+    np.testing.assert_allclose(trajectory.positions[:, 0], corner, atol=1e-6)
+
+
+def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
+    options = SceneOptions(has_body=False, start_at_rest=True)
+    scene = prepare_scene(cloth, poses, options=options)
+    assert scene.body is None
+    trajectory = rollout_scene(None, scene, SOLVER)
+    frames = np.arange(4)
+    # Backward Euler: velocity after n steps is -g n dt, so the fall is g dt^2 n (n + 1) / 2.
+    fall = 9.81 * TIMESTEP**2 * frames * (frames + 1) / 2
+    height = np.asarray(trajectory.positions)[..., 1].mean(axis=1)
+    np.testing.assert_allclose(height[0] - height, fall, rtol=2e-3, atol=1e-5)
+
+
+def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved):
+    from eslr_jax.evaluation.gap import find_friction_loads, reached_potentials, trajectory_states
+
+    scene = prepare_scene(cloth, poses).replace(pin_targets=None)
+    trajectory = rollout_scene(None, scene, SOLVER)
+    states, inputs = trajectory_states(trajectory, scene)
+    found = reached_potentials(trajectory.positions[1:], states, inputs, scene)
+    np.testing.assert_allclose(sum(trajectory.terms)[1:], found, rtol=1e-4)
+    loads = find_friction_loads(trajectory.positions, trajectory.velocities, scene)
+    np.testing.assert_allclose(loads, trajectory.friction_loads, rtol=1e-3, atol=1e-6)
+    assert float(trajectory.friction_loads[-1].sum()) > 0.3 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"
+
+
+def test_non_finite_positions_raise_with_the_frame(cloth, poses):
+    broken = poses.replace(positions=poses.positions.at[3].set(jnp.nan))
+    trajectory = rollout(None, cloth, broken, config=SOLVER)
+    with pytest.raises(NonFiniteError, match="frame 3"):
+        raise_for_status(trajectory)
+
+
+def test_network_without_weights_is_refused(cloth, poses):
+    with pytest.raises(ConfigError, match="load_model"):
+        rollout(None, cloth, poses, config=NETWORK)
+
+
+def test_weights_of_another_architecture_are_refused(cloth, poses, params):
+    wider = dataclasses.replace(NETWORK, model=dataclasses.replace(SMALL, latent_size=48))
+    with pytest.raises(CheckpointError, match="another architecture"):
+        rollout(params, cloth, poses, config=wider)
+
+
+def test_single_frame_is_refused(cloth, poses):
+    with pytest.raises(MotionError, match="two frames"):
+        prepare_scene(cloth, drifting_ball(1))
+
+
+def test_other_values_compile_nothing_anew(cloth, poses):
+    scene = prepare_scene(cloth, poses)
+    rollout_scene(None, scene, SOLVER)
+    before = rollout_scene._cache_size()
+    faster = scene.replace(
+        initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
+        constants=scene.constants.replace(gravity=jnp.float32(3.0)),
+        material=FABRICS[1],
+    )
+    rollout_scene(None, faster, SOLVER)
+    assert rollout_scene._cache_size() == before
+
+
+def test_gradient_through_five_frames_of_the_network(cloth):
+    """Along the gradient, against central differences."""
+    poses = drifting_ball(6)
+    single = SimConfig(model=dataclasses.replace(SMALL, output="correction"), iterations=0)
+    weights = init_model(single.model)
+
+    def height(trained):
+        trajectory = rollout({**weights, "params": trained}, cloth, poses, config=single)
+        return jnp.mean(trajectory.positions[-1, :, 1])
+
+    run = jax.jit(jax.value_and_grad(height))
+    _, gradient = run(weights["params"])
+    length = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+    ahead = jax.tree.map(lambda leaf: leaf / length, gradient)
+    step = 1e-3
+    ends = [
+        float(run(jax.tree.map(lambda w, d, s=sign * step: w + s * d, weights["params"], ahead))[0])
+        for sign in (1, -1)
+    ]
+    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(length), rel=0.05)

@@ -1,0 +1,148 @@
+"""The host's door: checks, chunks, pace, buffers, errors."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
+from eslr_jax.evaluation.gap import GapOptions, measure_gap
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import enlarge_buffers, raise_for_status, simulate, try_simulate
+from eslr_jax.types import PairCapacity, PhysicsConstants
+
+SOLVER = SimConfig(iterations=12)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return prepare_scene(square(), drifting_ball(14))
+
+
+@pytest.fixture(scope="module")
+def whole(scene):
+    return rollout_scene(None, scene, SOLVER)
+
+
+def test_chunks_equal_one_scan(scene, whole):
+    told = []
+    trajectory, timing, _ = simulate(
+        None, scene, config=SOLVER, on_frames=lambda *counts: told.append(counts)
+    )
+    np.testing.assert_allclose(trajectory.positions, whole.positions, atol=1e-5)
+    np.testing.assert_allclose(sum(trajectory.terms), sum(whole.terms), atol=1e-6)
+    assert told == [(10, 13), (13, 13)]
+    assert timing.frame_ms < 1e3
+
+
+def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
+    simulate(None, scene, config=SOLVER)
+    again = simulate(None, first_frames(scene, 12), config=SOLVER)
+    assert again.timing.compile_s < 0.05
+    assert again.trajectory.num_frames == 12
+
+
+def test_a_pace_sets_the_iterations_of_the_next_chunk(scene):
+    asked = []
+
+    def pace(iterations, took_ms):
+        asked.append(iterations)
+        return iterations + 5
+
+    paced = simulate(None, scene, config=SimConfig(iterations=10), pace=pace).trajectory
+    assert asked == [10, 15]
+    np.testing.assert_array_equal(paced.iterations, [0] + [10] * 10 + [15] * 3)
+
+
+@pytest.mark.slow
+def test_tolerance_stops_early_and_is_kept(scene):
+    loose = simulate(None, scene, config=SimConfig(iterations=300, tolerance=0.01)).trajectory
+    assert int(loose.iterations[1:].max()) < 150
+    gap = measure_gap(None, loose, scene, None, GapOptions(iterations=()))
+    assert float(gap.share(gap.reached).max()) <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"material": COTTON.replace(density=-0.2)}, "material density = -0.2; give a value from"),
+        ({"material": COTTON.replace(density=0.0)}, "material density = 0; give a value from"),
+        ({"material": COTTON.replace(thickness=0.0)}, "material thickness = 0; give a value from"),
+        ({"material": COTTON.replace(lame_mu=1e12)}, r"material lame_mu = 1e\+12; give a value from"),
+        ({"material": COTTON.replace(density=np.ones(7))}, r"one per vertex \(64\)"),
+        ({"timestep": jnp.float32(0.0)}, "timestep = 0; give a value from"),
+        ({"constants": PhysicsConstants(friction_coefficient=-1.0)}, "friction_coefficient = -1"),
+    ],
+)
+def test_unphysical_scenes_are_refused_by_name(scene, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        simulate(None, scene.replace(**changes))
+
+
+def crossing_sheets():
+    """Two squares a few millimetres apart: every vertex has pairs."""
+    lower, upper = square(), square()
+    from eslr_jax.geometry.prepare import prepare_garment
+
+    rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
+    faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])
+    ones = np.ones((128, 1))
+    garment = prepare_garment(
+        rest, faces, skin_weights=ones, skin_indices=0 * ones.astype(int), allow_components=True
+    )
+    scene = prepare_scene(
+        garment, drifting_ball(3), options=SceneOptions(self_contact=True, start_at_rest=True)
+    )
+    close = rest.copy()
+    close[64:, 1] -= 0.016
+    return scene.replace(
+        initial_state=initial_state(jnp.asarray(close, jnp.float32), jnp.zeros((128, 3), jnp.float32))
+    )
+
+
+@pytest.mark.slow
+def test_self_contact_that_overflows_gets_the_buffers_it_needs():
+    scene = crossing_sheets()
+    few = scene.replace(self_contact=PairCapacity(pairs=20, faces=scene.self_contact.faces))
+    short = rollout_scene(None, few, SOLVER)
+    assert Status.SELF_CONTACT_OVERFLOW in Status(int(short.status))
+    with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ pairs and \d+ faces or more"):
+        raise_for_status(short)
+    assert enlarge_buffers(few, short).self_contact.pairs > 20
+    found = simulate(None, few, config=SOLVER)
+    assert found.scene.self_contact.pairs > 20
+    expected = rollout_scene(None, scene, SOLVER)
+    np.testing.assert_allclose(found.trajectory.positions, expected.positions, atol=1e-5)
+    assert enlarge_buffers(scene, expected) is None
+
+
+def test_buffers_grow_to_what_the_fullest_frame_asked_for_and_a_quarter_more(scene, whole):
+    tight = scene.replace(self_contact=PairCapacity(pairs=20, faces=96))
+    demand = jnp.array([[0, 0]] * 5 + [[40, 12]] + [[10, 3]] * 8)
+    full = whole.replace(pair_demand=demand, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
+    assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=50, faces=96)
+    assert enlarge_buffers(tight, full.replace(status=jnp.int32(Status.OK))) is None
+    with pytest.raises(CapacityError, match="40 pairs and 12 faces or more"):
+        raise_for_status(full)
+
+
+def test_a_body_too_fast_to_follow_is_told(scene):
+    body = scene.body
+    jumped = body.replace(positions=body.positions.at[5:].add(jnp.array([0.0, 0.35, 0.0])))
+    fast = scene.replace(body=jumped)
+    ended = try_simulate(None, fast, config=SOLVER).trajectory
+    assert int(ended.first_bad_frame) == 5
+    assert ended.num_frames == 11, "it ends with the chunk of the first bad frame"
+    with pytest.raises(MotionError, match="frame 5: the body moved farther"):
+        simulate(None, fast, config=SOLVER)
+
+
+def test_a_negative_number_of_iterations_is_refused():
+    with pytest.raises(ValueError, match="iterations must not be negative"):
+        dataclasses.replace(SOLVER, iterations=-1)
