@@ -65,6 +65,11 @@ def sub3(a: Vector3, b: Vector3) -> Vector3:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
+def take3(a: Vector3, rows: Int[Array, ...]) -> Vector3:
+    """Return the chosen rows of vectors given by components."""
+    return a[0][rows], a[1][rows], a[2][rows]
+
+
 def components(x: Float[Array, "rows 3"]) -> Vector3:
     """Split vectors into component arrays."""
     return x[:, 0], x[:, 1], x[:, 2]

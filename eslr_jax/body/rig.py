@@ -59,12 +59,13 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
         return floats(scale * values)
 
     shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
-    has_shapes = shapes is not None and joint_shapes is not None
+    if shapes is None or joint_shapes is None:
+        shapes, joint_shapes = np.zeros((len(mesh.positions), 3, 0)), np.zeros((len(order), 3, 0))
     return Body(
         rest_positions=lengths(mesh.positions[vertices]),
-        shape_directions=lengths(shapes[vertices] if has_shapes else np.zeros((len(vertices), 3, 0))),
+        shape_directions=lengths(shapes[vertices]),
         joint_rest_positions=lengths(skeleton.rest_positions),
-        joint_shape_directions=lengths(joint_shapes[order] if has_shapes else np.zeros((len(order), 3, 0))),
+        joint_shape_directions=lengths(joint_shapes[order]),
         skin_weights=floats(weights / weights.sum(1, keepdims=True)),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),

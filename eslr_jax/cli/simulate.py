@@ -326,7 +326,7 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
                 on_picture=advance,
             )
     except MissingExtraError as error:
-        stderr.print(f"no pictures: {error}", markup=False, highlight=False)
+        stderr.print(f"no pictures: {error}", markup=False, highlight=False, soft_wrap=True)
         return
     write_png(out / "sheet.png", sheet)
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, vertex_normals
+from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, take3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _NEAREST_PATCHES = 4  # patches whose vertices are tried
@@ -53,8 +53,7 @@ def _nearest_on_faces(
 ) -> SurfacePoint:
     """Return the nearest point on the faces around one surface vertex per query point."""
     candidates = surface.vertex_faces[vertex]
-    corners = [tuple(c[surface.faces[:, k]] for c in body) for k in range(3)]
-    triangles = [tuple(c[candidates] for c in corner) for corner in corners]
+    triangles = [take3(take3(body, surface.faces[:, k]), candidates) for k in range(3)]
     expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
     squared, u, v = point_triangle(expanded, triangles[0], triangles[1], triangles[2])
     best = jnp.min(squared, axis=1)
@@ -80,10 +79,10 @@ def _nearest_vertex(
         surface: Search tables.
         is_excluded: Given candidate positions and their vertex numbers, which ones do not count.
     """
-    centers = tuple(c[surface.patch_centers] for c in body)
+    centers = take3(body, surface.patch_centers)
     squared = _squared_distances(point, centers)
     if is_excluded is not None:
-        rows = tuple(c[None] for c in centers)
+        rows = (centers[0][None], centers[1][None], centers[2][None])
         squared = jnp.where(is_excluded(rows, surface.patch_centers[None]), jnp.inf, squared)
     members = []
     for _ in range(min(_NEAREST_PATCHES, squared.shape[1])):
@@ -91,7 +90,7 @@ def _nearest_vertex(
         members.append(surface.patch_vertices[patch])
         squared = jnp.where(jnp.arange(squared.shape[1])[None] == patch[:, None], jnp.inf, squared)
     candidates = jnp.concatenate(members, axis=1)
-    positions = tuple(c[candidates] for c in body)
+    positions = take3(body, candidates)
     squared = sum((c - p[:, None]) ** 2 for c, p in zip(positions, point, strict=True))
     if is_excluded is not None:
         squared = jnp.where(is_excluded(positions, candidates), jnp.inf, squared)
@@ -202,7 +201,7 @@ def find_both_sides(
     normal = components(normals)
 
     def is_excluded(candidates: Vector3, ids: Int[Array, ...]) -> Bool[Array, "vertices _"]:
-        turned = sum(n[ids] * f[:, None] for n, f in zip(normal, facing, strict=True))
+        turned = jnp.asarray(sum(n[ids] * f[:, None] for n, f in zip(normal, facing, strict=True)))
         ahead = sum((c - p[:, None]) * f[:, None] for c, p, f in zip(candidates, point, facing, strict=True))
         return (turned > _OPPOSED) | (ahead < 0)
 

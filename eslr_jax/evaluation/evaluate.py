@@ -193,6 +193,8 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}
     depth = -np.asarray(measures.distances)[:, is_real]
+    if scene.body is None:
+        raise ValueError("penetration and friction are measured against a body; give a scene with one")
     body = np.asarray(scene.body.positions)
     jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
     return {

@@ -5,13 +5,15 @@ Every function returns one small dense block per face, hinge or vertex; `newton`
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.contact.self_contact import FacePairs
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.problem import BodyContact, FrameProblem
 from eslr_jax.types import Contacts, Garment, Material
 
 
@@ -126,8 +128,8 @@ def vertex_blocks(
     if problem.body is None:
         return blocks
     for contacts in (problem.body.nearest, problem.body.opposing):
-        blocks = blocks + _collision_blocks(position, contacts, problem)
-    return blocks + _friction_blocks(position, problem)
+        blocks = blocks + _collision_blocks(position, contacts, problem.body.thickness, problem)
+    return blocks + _friction_blocks(position, problem.body, problem)
 
 
 def float64_masses(problem: FrameProblem) -> Float[np.ndarray, " vertices"]:
@@ -137,20 +139,22 @@ def float64_masses(problem: FrameProblem) -> Float[np.ndarray, " vertices"]:
 
 
 def _collision_blocks(
-    position: np.ndarray, contacts: Contacts, problem: FrameProblem
+    position: np.ndarray, contacts: Contacts, thickness: Any, problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return 6 k a depth n n^T per vertex."""
     normal = np.asarray(contacts.next_normals, np.float64)
     height = np.sum((position - contacts.next_points) * normal, axis=1)
-    depth = np.where(contacts.is_near, np.maximum(float(problem.body.thickness) - height, 0.0), 0.0)
+    depth = np.where(contacts.is_near, np.maximum(float(thickness) - height, 0.0), 0.0)
     areas = np.asarray(problem.garment.vertex_areas)
     stiffness = 6.0 * float(problem.constants.collision_stiffness) * areas * depth
     return stiffness[:, None, None] * normal[:, :, None] * normal[:, None, :]
 
 
-def _friction_blocks(position: np.ndarray, problem: FrameProblem) -> Float[np.ndarray, "vertices 3 3"]:
+def _friction_blocks(
+    position: np.ndarray, body: BodyContact, problem: FrameProblem
+) -> Float[np.ndarray, "vertices 3 3"]:
     """Return mu N (I - n n^T - u u^T / l^2) / l per vertex, with l = sqrt(|u|^2 + s^2)."""
-    contacts, constants = problem.body.nearest, problem.constants
+    contacts, constants = body.nearest, problem.constants
     normal = np.asarray(contacts.next_normals, np.float64)
     motion = (position - problem.position) - (contacts.next_points - contacts.points)
     tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
@@ -160,7 +164,7 @@ def _friction_blocks(position: np.ndarray, problem: FrameProblem) -> Float[np.nd
     # Unit normals are so up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
     outer = [vector[:, :, None] * vector[:, None, :] for vector in (normal, direction)]
     curvature = np.eye(3) - outer[0] - outer[1]
-    load = float(constants.friction_coefficient) * np.asarray(problem.body.friction_load, np.float64)
+    load = float(constants.friction_coefficient) * np.asarray(body.friction_load, np.float64)
     return (load / length)[:, None, None] * curvature
 
 
@@ -178,7 +182,7 @@ def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem)
         return np.zeros((0, 9, 9))
     constants, tips = problem.constants, problem.body.tips
     stiffness, thickness = float(constants.collision_stiffness), float(constants.collision_thickness)
-    return pair_blocks(position, tips.pairs, stiffness, thickness, tips.next_body)
+    return pair_blocks(position, tips.pairs, stiffness, thickness, np.asarray(tips.next_body))
 
 
 def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:

@@ -111,7 +111,7 @@ def _solve_jvp(settings: tuple[float, int], primals: tuple, tangents: tuple) -> 
     move = -_solve_hessian_linear(problem, position, force_change)
     value_change = value_change + jnp.sum(minimum.gradient * move)
     fixed = np.zeros((), jax.dtypes.float0)
-    return minimum, Minimum(move, value_change, jnp.zeros_like(minimum.gradient), fixed)
+    return minimum, Minimum(move, value_change, jnp.zeros_like(minimum.gradient), fixed)  # type: ignore[arg-type]
 
 
 def _solve_hessian_linear(

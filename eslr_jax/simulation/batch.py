@@ -74,7 +74,9 @@ def simulate_batch(
     done: dict[int, Trajectory] = {}
     for group in _group_alike(garments, poses):
         scenes = prepare_scenes(
-            *([parts[i] for i in group] for parts in (garments, poses, materials)),
+            [garments[i] for i in group],
+            [poses[i] for i in group],
+            [materials[i] for i in group],
             constants=constants,
             options=options,
         )

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
-from eslr_jax.graph.inputs import GraphInputs, next_refinement
+from eslr_jax.graph.inputs import GraphInputs, next_refinement, required
 from eslr_jax.models.registry import apply_model, apply_refinement, encode_frame, scale_output
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import InitialGuess, initial_guess
@@ -111,10 +111,10 @@ def refine(
         guess=guess.position, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
     )
     encoded = encode_frame(config, params, graph, garment)
-    longest = graph.globals["edge_length"]
+    longest: Array = graph.globals["edge_length"]  # type: ignore[index, assignment]: jraph's trees
 
     def one_step(carry: GraphInputs, _):
-        point = evaluate(carry.guess, problem)
+        point = evaluate(required(carry, "guess"), problem)
         inputs = carry.replace(gradient=point.gradient, step=descent_step(problem, point, longest))
         changing = build_refinement_graph(garment, material, inputs, graph)
         output = apply_refinement(config, params, encoded, changing, garment)
@@ -164,4 +164,5 @@ def correct(
     correction = scale_output(config, params, output[:, :3])
     if config.output == "correction":
         return correction
-    return correction + (1.0 + output[:, 3:4]) * inputs.step + output[:, 4:5] * inputs.correction
+    step, last = required(inputs, "step"), required(inputs, "correction")
+    return correction + (1.0 + output[:, 3:4]) * step + output[:, 4:5] * last

@@ -52,10 +52,9 @@ def train(
     """
     mesh = make_mesh(config)
     checkpoints = _open_run(config, ensure_output_dir(out), resume)
-    if datasets is None:
-        datasets = tuple(load_training_data(config, vertices) for vertices in config.vertices)
+    datasets = datasets or tuple(load_training_data(config, vertices) for vertices in config.vertices)
     state = init_train_state(config, datasets)
-    datasets, state = replicate(datasets, mesh), replicate(state, mesh)
+    datasets, state = tuple(replicate(data, mesh) for data in datasets), replicate(state, mesh)
     if initial_params is not None:
         given = replicate(jax.tree.map(jax.numpy.array, initial_params), mesh)
         state = state.replace(params={**state.params, **given})
