@@ -61,8 +61,8 @@ def test_assets_lists_every_kind():
         (("--budget", "20ms", "--model", "eslr-small"), ("leave out", "--model")),
         (("--tolerance", "1%", "--iterations", "5"), ("leave out", "--iterations")),
         (("--budget", "20ms", "--tolerance", "1%"), ("either",)),
-        (("--iterations", "5"), ("--simulator physics", "--corrector-steps")),
-        (("--simulator", "physics", "--corrector-steps", "5"), ("--iterations",)),
+        (("--simulator", "physics", "--model", "eslr-small"), ("leave out --model",)),
+        (("--garment", "tshirt", "--garment", "dress"), ("--garment is given twice",)),
         (("--frames", "100000", "--simulator", "physics"), ("fewer than",)),
     ],
 )
@@ -76,9 +76,7 @@ def test_unwritable_output_is_refused(tmp_path):
     refused(eslr("simulate", "--out", tmp_path / "file"), "is a file")
 
 
-
 @pytest.mark.slow
-
 def test_broken_mesh_is_refused(tmp_path):
     def simulate(path):
         return eslr("simulate", "--garment", path, "--simulator", "physics", "--out", tmp_path / "out")

@@ -131,21 +131,21 @@ def test_every_field_has_a_legend(view):
 def test_names_are_above_the_heads_and_the_page_follows(view):
     from eslr_jax.viewer import show
 
-    top = view.runs[0].trajectory.body_positions[0][:, 1].max()
+    top = view.runs[0].trajectory.body.positions[0][:, 1].max()
     assert scene_of(view)["/runs/0/name"].position[1] == pytest.approx(top + 0.2, abs=1e-5)
     moved = view.runs[0].trajectory
     moved.positions[2] += [0.0, 0.0, 2.0]
-    moved.body_positions[2] += [0.0, 0.0, 2.0]
+    moved.body.positions[2] += [0.0, 0.0, 2.0]
     try:
         for follows, place in ((True, 0.0), (False, 2.0)):
             view.controls["follow"].value = follows
             view.controls["frame"].value = 2
             show(view)
             body = scene_of(view)["/runs/0/body"].vertices
-            assert body[:, 2].mean() - moved.body_positions[0][:, 2].mean() == pytest.approx(place, abs=1e-4)
+            assert body[:, 2].mean() - moved.body.positions[0][:, 2].mean() == pytest.approx(place, abs=1e-4)
     finally:
         moved.positions[2] -= [0.0, 0.0, 2.0]
-        moved.body_positions[2] -= [0.0, 0.0, 2.0]
+        moved.body.positions[2] -= [0.0, 0.0, 2.0]
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or os.environ.get("CHROMIUM")

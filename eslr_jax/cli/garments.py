@@ -94,6 +94,6 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
                 for positions in (stored.sewn_positions, stored.rest_positions)
             ]
     except MissingExtraError as error:
-        stderr.print(f"no picture: {error}", markup=False, highlight=False)
+        stderr.print(f"no picture: {error}", markup=False, highlight=False, soft_wrap=True)
         return
     write_png(path, side_by_side(pictures, ("before", "after")))

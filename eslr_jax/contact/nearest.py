@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.numerics import Vector3, components, dot3, safe_normalize, sub3, take3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
+_ROWS = 1024  # query points that are searched for together
 _NEAREST_PATCHES = 4  # patches whose vertices are tried
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
 _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
@@ -44,8 +45,30 @@ def nearest_point(
         surface: Search tables.
     """
     body = components(positions)
-    point = components(query)
-    return _nearest_on_faces(point, body, surface, _nearest_vertex(point, body, surface))
+
+    def search(query: Float[Array, "rows 3"]) -> SurfacePoint:
+        point = components(query)
+        return _nearest_on_faces(point, body, surface, _nearest_vertex(point, body, surface))
+
+    return _by_rows(search, query)
+
+
+def _by_rows(search: Callable[..., SurfacePoint], *rows: Float[Array, "vertices 3"]) -> SurfacePoint:
+    """Search for a thousand points at a time: the tables of their candidates then stay in the cache.
+
+    Args:
+        search: From rows of every array to their surface points.
+        rows: Arrays with one row per query point.
+    """
+    count = rows[0].shape[0]
+    num_parts = -(-count // _ROWS)
+    if num_parts == 1:
+        return search(*rows)
+    size = -(-count // num_parts)
+    padding = ((0, num_parts * size - count), (0, 0))
+    parts = [jnp.pad(array, padding, mode="edge").reshape(num_parts, size, 3) for array in rows]
+    found = jax.lax.map(lambda part: search(*part), tuple(parts))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1)[:count], found)
 
 
 def _nearest_on_faces(
@@ -197,16 +220,22 @@ def find_both_sides(
     normals = vertex_normals(body, surface.faces, surface.face_incidence)
     nearest = nearest_point(position, body, surface)
     contacts = _contacts_at(nearest, position, body, next_body, normals, surface)
-    point, body_points, facing = components(position), components(body), components(contacts.normals)
-    normal = components(normals)
+    body_points, normal = components(body), components(normals)
 
-    def is_excluded(candidates: Vector3, ids: Int[Array, ...]) -> Bool[Array, "vertices _"]:
-        turned = jnp.asarray(sum(n[ids] * f[:, None] for n, f in zip(normal, facing, strict=True)))
-        ahead = sum((c - p[:, None]) * f[:, None] for c, p, f in zip(candidates, point, facing, strict=True))
-        return (turned > _OPPOSED) | (ahead < 0)
+    def search(position: Float[Array, "rows 3"], facing: Float[Array, "rows 3"]) -> SurfacePoint:
+        point, here = components(position), components(facing)
 
-    vertex = _nearest_vertex(point, body_points, surface, is_excluded)
-    opposite = _nearest_on_faces(point, body_points, surface, vertex)
+        def is_excluded(candidates: Vector3, ids: Int[Array, ...]) -> Bool[Array, "rows _"]:
+            turned = jnp.asarray(sum(n[ids] * f[:, None] for n, f in zip(normal, here, strict=True)))
+            ahead = sum(
+                (c - p[:, None]) * f[:, None] for c, p, f in zip(candidates, point, here, strict=True)
+            )
+            return (turned > _OPPOSED) | (ahead < 0)
+
+        vertex = _nearest_vertex(point, body_points, surface, is_excluded)
+        return _nearest_on_faces(point, body_points, surface, vertex)
+
+    opposite = _by_rows(search, position, contacts.normals)
     opposing = _contacts_at(opposite, position, body, next_body, normals, surface)
     is_facing = jnp.sum(opposing.normals * contacts.normals, axis=-1) < _OPPOSED
     is_outside = opposing.distances > -_TOUCHING

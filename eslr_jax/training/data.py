@@ -69,9 +69,10 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         AssetError: A garment does not exist.
     """
     options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
-    garments = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
+    unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
+    garments = pad_alike(unpadded)
     if config.model.hierarchical:
-        garments = [add_coarse_edges(garment) for garment in pad_alike(garments)]
+        garments = [add_coarse_edges(garment) for garment in garments]
     return build_training_data(
         garments, load_body(), [load_motion(clip) for clip in split_clips(config.split)]
     )
@@ -81,14 +82,14 @@ def build_training_data(garments: list[Garment], body: Body, motions: list[Motio
     """Return what training samples from.
 
     Args:
-        garments: Unpadded garments of like sizes.
+        garments: Garments padded to equal sizes.
         body: The body that wears them.
         motions: Its clips.
 
     Raises:
         ConfigError: The garments are not near the body.
     """
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pad_alike(garments))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *garments)
     surface = shared_surface(garments, body)
     if surface is None:
         raise ConfigError("none of the garments is near the body; train on garments that are worn")

@@ -6,19 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from eslr_jax.evaluation.hard_cases.build import join_meshes, make_cloth, sheet
-from eslr_jax.simulate.step import FrameInput, frame_problem, solve
+from draped_ball import drifting_ball, square
 from example_runs import write_run
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.fields import _prepared, _scene, energy_shares, gap_shares, run_field
+from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.io.run import read_run
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.potential import PotentialTerms, potential, potential_terms
-from eslr_jax.physics.problem import PhysicsParameters, start_guess
-from eslr_jax.scene import initial_state
+from eslr_jax.physics.potential import evaluate, potential, potential_terms
+from eslr_jax.physics.problem import pushed_out_guess
+from eslr_jax.physics.solve import Start, solve
+from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.rollout import rollout_scene
 
 
 @pytest.fixture(scope="module")
@@ -38,76 +41,64 @@ def test_stretch_of_uniform_stretch(runs):
 
 
 @pytest.fixture(scope="module")
-def last_problem(runs):
-    """The last frame of a run as its simulation stated it, with garment and fabric."""
-    garment, material = _prepared(runs[0])
-    scene = _scene(runs[0], garment, material, has_contact=True)
-    parameters = PhysicsParameters()
-    state, inputs = jax.tree.map(
-        lambda leaf: leaf[-1], trajectory_states(runs[0].trajectory, scene, parameters)
-    )
-    config = SimConfig(simulator="physics", self_contact=True)
-    problem = frame_problem(garment, state, inputs, scene.surface, scene.timestep, parameters, config)
-    return problem, garment, material
+def problem():
+    """The last frame of a square that falls over a ball."""
+    scene = prepare_scene(square(), drifting_ball(4))
+    states, inputs = trajectory_states(rollout_scene(None, scene, SimConfig(iterations=15)), scene)
+    state, inputs = jax.tree.map(lambda leaf: leaf[-1], (states, inputs))
+    return frame_problem(scene, state, inputs)
+
+
+@pytest.mark.parametrize("term", ["stretch", "bending", "inertia", "gravity", "collision", "friction"])
+def test_energy_shares_add_up_to_the_energy(problem, term):
+    position = problem.inertial_guess
+    whole = float(getattr(potential_terms(position, problem), term))
+    shares = np.asarray(energy_shares(term, position, problem))
+    assert shares.sum() == pytest.approx(whole, rel=1e-3)
+    assert abs(whole) > 1e-9
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("term", PotentialTerms._fields)
-def test_energy_shares_add_up_to_the_energy(runs, last_problem, term):
-    problem, garment, material = last_problem
-    answer = jnp.asarray(runs[0].trajectory.positions[-1])
-    whole = float(getattr(potential_terms(answer, problem, garment, material), term))
-    shares = run_field(runs[0], f"{term}-energy").values[-1] * np.asarray(garment.vertex_areas)
-    assert shares.sum() == pytest.approx(whole, rel=1e-3, abs=1e-6)
-    assert whole != 0 or term == "repulsion"  # no two layers meet
-
-
-@pytest.mark.slow
-def test_gap_shares_add_up_to_the_optimality_gap(runs, last_problem):
-    problem, garment, material = last_problem
-    answer = start_guess(problem, garment)
-    minimum = solve(problem, garment, material, answer, iterations=500, memory=8, tolerance=1e-3)
-    gap = float(potential(answer, problem, garment, material) - minimum.value)
-    shares = np.asarray(gap_shares(answer, problem, garment, material))
-    assert gap > 1e-3
+def test_gap_shares_add_up_to_the_optimality_gap(problem):
+    position = pushed_out_guess(problem)
+    start = Start(evaluate(position, problem), potential(position, problem))
+    minimum = solve(problem, start, iterations=500, tolerance=1e-3)
+    gap = float(potential(position, problem) - minimum.value)
+    shares = np.asarray(gap_shares(position, problem))
     assert shares.sum() == pytest.approx(gap, rel=0.01)  # contacts have kinks
     assert -shares[shares < 0].sum() < 0.5 * gap
-    at_optimum = gap_shares(minimum.position, problem, garment, material)
+    at_optimum = gap_shares(minimum.position, problem)
     assert abs(float(at_optimum.sum())) < 0.01 * gap
 
 
 @pytest.mark.slow
 def test_repulsion_counts_where_layers_meet():
-    """Two sheets 1 mm apart: the pairs' energy goes to both layers."""
-    lower = sheet(6, 6, (0.1, 0.1))
-    upper = lower[0] + np.array([0.003, 1e-3, 0.002]), lower[1]
-    garment = make_cloth(join_meshes(lower, upper), {}, allow_components=True)
-    still = jnp.asarray(garment.rest_positions)
-    state = initial_state(still, jnp.zeros_like(still))
-    problem = frame_problem(
-        garment,
-        state,
-        FrameInput(None, None, None),
-        None,
-        jnp.float32(1 / 30),
-        PhysicsParameters(),
-        SimConfig(simulator="physics", self_contact=True),
+    """Two squares 1 mm apart: the pairs' energy goes to both layers."""
+    lower = square(6, 0.1)
+    upper = np.add(lower.rest_positions, [0.003, 1e-3, 0.002])
+    ones = np.ones((72, 1))
+    garment = prepare_garment(
+        np.concatenate([lower.rest_positions, upper]),
+        np.concatenate([lower.faces, np.add(lower.faces, 36)]),
+        skin_weights=ones,
+        skin_indices=np.zeros((72, 1), int),
+        allow_components=True,
     )
-    whole = float(potential_terms(still, problem, garment, COTTON).repulsion)
-    shares = np.asarray(energy_shares("repulsion", still, problem, garment, COTTON))
-    assert whole > 0
+    options = SceneOptions(has_body=False, start_at_rest=True, self_contact=True)
+    scene = prepare_scene(garment, drifting_ball(2), options=options)
+    still = jnp.asarray(garment.rest_positions)
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    problem = frame_problem(scene, initial_state(still, jnp.zeros_like(still)), inputs)
+    whole = float(potential_terms(still, problem).repulsion)
+    shares = np.asarray(energy_shares("repulsion", still, problem))
     assert shares.sum() == pytest.approx(whole, rel=1e-4)
-    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole
+    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole > 0
 
 
-@pytest.mark.parametrize(("name", "change", "message"), [
-    ("gap", {"contact_faces": None, "body_rest_positions": None}, "rest pose, which contacts need"),
-    ("friction-energy", {"body_positions": None, "body_faces": None}, "has no body, and so no friction-energy"),
-    ("distance", {"body_positions": None, "body_faces": None}, "has no body"),
-])  # fmt: skip
-def test_what_a_run_lacks_for_a_field_is_said(runs, name, change, message):
-    run = dataclasses.replace(runs[0], trajectory=dataclasses.replace(runs[0].trajectory, **change))
-    with pytest.raises(AssetError, match=message) as caught:
+@pytest.mark.parametrize("name", ["friction-energy", "distance"])
+def test_a_run_without_a_body_has_no_field_of_it(runs, name):
+    run = dataclasses.replace(runs[0], trajectory=dataclasses.replace(runs[0].trajectory, body=None))
+    with pytest.raises(AssetError, match=f"has no body, and so no {name}") as caught:
         run_field(run, name)
     assert "\n" not in str(caught.value)
 

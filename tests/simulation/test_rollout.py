@@ -165,7 +165,7 @@ def test_other_values_compile_nothing_anew(cloth, poses):
     faster = scene.replace(
         initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
         constants=scene.constants.replace(gravity=jnp.float32(3.0)),
-        material=FABRICS[1],
+        material=jax.tree.map(jnp.asarray, FABRICS[1]),
     )
     rollout_scene(None, faster, SOLVER)
     assert rollout_scene._cache_size() == before
