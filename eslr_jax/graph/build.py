@@ -30,7 +30,7 @@ from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 
-Rows = dict[str, Float[Array, "_ features"]]
+Rows = dict[str, Float[Array, "_ _"]]
 
 
 class Topology(TypedDict, total=False):

@@ -132,7 +132,7 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(co
 
 
 def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small_problem):
-    """The mean share of the gap that a step leaves; the last energy stands for the optimum, to 1 % of the first."""
+    """The mean share of the gap that a step leaves; the last energy stands for the optimum."""
     model = dataclasses.replace(config.model, refinement_steps=3)
     config = dataclasses.replace(config, model=model, refinement_weights="contraction")
     params = init_model(model)
