@@ -137,7 +137,7 @@ def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
     step = (
         (poses.positions[1] - poses.positions[0]).mean(axis=0) if len(poses.positions) > 1 else jnp.zeros(3)
     )
-    shifts = jnp.arange(-num_frames, 0)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
+    shifts = jnp.arange(-num_frames, 0, dtype=step.dtype)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
     held = jnp.repeat(poses.joint_transforms[:1], num_frames, axis=0)
     return poses.replace(
         positions=jnp.concatenate([poses.positions[:1] + shifts[:, None], poses.positions]),

@@ -34,7 +34,7 @@ def cloth():
 
 @pytest.fixture(scope="module")
 def poses():
-    return drifting_ball(4)
+    return drifting_ball(3)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def learned(cloth, poses, params):
 def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
     assert int(solved.status) == Status.OK
     positions = np.asarray(solved.positions)
-    assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.03, "corners fall"
+    assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.02, "corners fall"
     middle = positions[-1].reshape(8, 8, 3)[3:5, 3:5].reshape(-1, 3)
     assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
 
@@ -76,7 +76,7 @@ def test_vmap_over_fabrics_equals_one_by_one(cloth, poses):
 
 
 def test_vmap_over_motions_equals_one_by_one(cloth):
-    motions = [drifting_ball(4, speed=speed) for speed in (0.2, 0.6)]
+    motions = [drifting_ball(3, speed=speed) for speed in (0.2, 0.6)]
     together = jax.vmap(lambda poses: rollout(None, cloth, poses, config=SOLVER).positions)(stack(motions))
     for row, poses in enumerate(motions):
         np.testing.assert_allclose(
@@ -115,7 +115,7 @@ def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
     scene = prepare_scene(cloth, poses, options=options)
     assert scene.body is None
     trajectory = rollout_scene(None, scene, SOLVER)
-    frames = np.arange(4)
+    frames = np.arange(3)
     # Backward Euler: velocity after n steps is -g n dt, so the fall is g dt^2 n (n + 1) / 2.
     fall = 9.81 * TIMESTEP**2 * frames * (frames + 1) / 2
     height = np.asarray(trajectory.positions)[..., 1].mean(axis=1)
@@ -132,13 +132,13 @@ def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved
     np.testing.assert_allclose(sum(trajectory.terms)[1:], found, rtol=1e-4)
     loads = find_friction_loads(trajectory.positions, trajectory.velocities, scene)
     np.testing.assert_allclose(loads, trajectory.friction_loads, rtol=1e-3, atol=1e-6)
-    assert float(trajectory.friction_loads[-1].sum()) > 0.3 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"
+    assert float(trajectory.friction_loads[-1].sum()) > 0.1 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"
 
 
 def test_non_finite_positions_raise_with_the_frame(cloth, poses):
-    broken = poses.replace(positions=poses.positions.at[3].set(jnp.nan))
+    broken = poses.replace(positions=poses.positions.at[2].set(jnp.nan))
     trajectory = rollout(None, cloth, broken, config=SOLVER)
-    with pytest.raises(NonFiniteError, match="frame 3"):
+    with pytest.raises(NonFiniteError, match="frame 2"):
         raise_for_status(trajectory)
 
 
@@ -164,7 +164,7 @@ def test_other_values_compile_nothing_anew(cloth, poses):
     before = rollout_scene._cache_size()
     faster = scene.replace(
         initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
-        constants=scene.constants.replace(gravity=jnp.float32(3.0)),
+        constants=scene.constants.replace(gravity=0.3 * scene.constants.gravity),
         material=jax.tree.map(jnp.asarray, FABRICS[1]),
     )
     rollout_scene(None, faster, SOLVER)
