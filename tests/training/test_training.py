@@ -66,6 +66,7 @@ def test_weights_move_as_far_as_adam_takes_them(finished, config):
     assert sum(value > 0.0 for value in jax.tree.leaves(moved)) > 0.8 * len(jax.tree.leaves(moved))
 
 
+@pytest.mark.slow
 def test_interrupted_run_resumes_bit_by_bit(finished, config, small_data, tmp_path):
     whole, _ = finished
 
