@@ -12,7 +12,7 @@ import pytest
 RECIPE = """
 garments = ["tshirt"]
 split = "validation"
-iterations = 120
+steps = 120
 log_every = 5
 checkpoint_every = 10
 [model]
@@ -65,7 +65,7 @@ def test_ten_kills_lose_nothing_but_the_steps_since_a_checkpoint(tmp_path):
     assert run(killed, "--resume").wait(timeout=900) == 0
     assert kills >= KILLS - 1
     records = [json.loads(line) for line in (killed / "metrics.jsonl").read_text().splitlines()]
-    assert [record["iteration"] for record in records] == list(range(5, 121, 5))
+    assert [record["step"] for record in records] == list(range(5, 121, 5))
     with np.load(whole / "model.npz") as ours, np.load(killed / "model.npz") as theirs:
         for name in ours.files:
             np.testing.assert_array_equal(ours[name], theirs[name])

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 from functools import partial
 
@@ -15,6 +16,7 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.models.registry import MODELS
 from eslr_jax.training import data, loop
+from eslr_jax.training.checkpoint import read_run_config, write_run_config
 from eslr_jax.training.loop import train
 from eslr_jax.training.loss import _mean_contraction
 from eslr_jax.training.pool import start_trajectory
@@ -23,7 +25,7 @@ MODEL = dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size
 CONFIG = TrainConfig(
     model=MODEL,
     garments=("tshirt",),
-    iterations=6,
+    steps=6,
     warmup=2,
     slots_per_garment=2,
     log_every=2,
@@ -35,7 +37,7 @@ CONFIG = TrainConfig(
 def one_clip_and_one_compilation():
     """Train on one clip, and let the runs of this file share data and compiled steps."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(data, "clips_of", lambda split: ["cmu_016_32"])
+    patch.setattr(data, "split_clips", lambda split: ["cmu_016_32"])
     loaded = data.load_training_data(CONFIG, "1k")
     patch.setattr(loop, "load_training_data", lambda config, vertices: loaded)
     steps = {}
@@ -61,7 +63,7 @@ def finished(tmp_path_factory):
 def test_run_leaves_metrics_and_a_model(finished):
     state, folder = finished
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    assert [record["iteration"] for record in records] == [2, 4, 6]
+    assert [record["step"] for record in records] == [2, 4, 6]
     assert all(np.isfinite(list(record.values())).all() for record in records)
     assert int(state.skipped) == 0
     params, config = load_model(folder / "model.npz")
@@ -73,12 +75,12 @@ def test_run_leaves_metrics_and_a_model(finished):
 def test_a_start_for_the_solver_trains_from_optima(tmp_path):
     """OptimalityGap and distance to where the solver ends shrink."""
     model = dataclasses.replace(MODELS["smooth-small"], latent_size=16)
-    config = dataclasses.replace(CONFIG, model=model, iterations=60, corrector_steps=10, log_every=10)
+    config = dataclasses.replace(CONFIG, model=model, steps=60, iterations=10, log_every=10)
     state = train(config, tmp_path)
     losses = [json.loads(line)["loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert int(state.skipped) == 0
     assert np.mean(losses[-2:]) < losses[0] - 0.03
-    with pytest.raises(ConfigError, match="corrector_steps"):
+    with pytest.raises(ConfigError, match="iterations"):
         from_dict(TrainConfig, {**to_dict(config), "energy_set": "hood"})
 
 
@@ -100,7 +102,7 @@ def test_interrupted_run_resumes_bit_by_bit(finished, tmp_path):
             os.kill(os.getpid(), signal.SIGTERM)
 
     part = train(CONFIG, tmp_path, on_progress=interrupt)
-    assert int(part.iteration) < CONFIG.iterations
+    assert int(part.step) < CONFIG.steps
     assert not (tmp_path / "model.npz").exists()
     resumed = train(CONFIG, tmp_path, resume=True)
     for ours, theirs in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
@@ -133,8 +135,41 @@ def test_half_written_checkpoint_is_not_taken(finished, tmp_path):
     assert Checkpoints(folder).latest() == latest
 
 
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(finished, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    for path in (tmp_path / "checkpoints" / "6").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.warns(UserWarning, match="checkpoint 6 can't be read and was removed; going on from 4"):
+        state = train(CONFIG, tmp_path, resume=True)
+    whole, _ = finished
+    for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_extended_but_not_cut(finished, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    with pytest.raises(CheckpointError, match="it can be extended to more, not cut to 4"):
+        train(dataclasses.replace(CONFIG, steps=4), tmp_path, resume=True)
+    longer = dataclasses.replace(CONFIG, steps=8)
+    assert int(train(longer, tmp_path, resume=True).step) == 8
+    assert read_run_config(tmp_path) == longer
+    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records] == [2, 4, 6, 8]
+
+
+def test_a_folder_without_a_checkpoint_starts_anew(tmp_path):
+    write_run_config(tmp_path, CONFIG)
+    with pytest.raises(CheckpointError, match="no checkpoint to resume from; start without --resume"):
+        train(CONFIG, tmp_path, resume=True)
+    assert int(train(CONFIG, tmp_path).step) == CONFIG.steps
+
+
 def test_unknown_split_lists_what_exists():
-    from eslr_jax.evaluation.evaluate import split_clips
+    from eslr_jax.assets import split_clips
 
     with pytest.raises(ConfigError, match="validation"):
         split_clips("holdout")
@@ -147,7 +182,7 @@ def test_hoods_recipe_takes_finite_steps(tmp_path):
     overrides = {
         "garments": ["tshirt"],
         "vertices": ["1k"],
-        "iterations": 3,
+        "steps": 3,
         "log_every": 1,
         "model": "mgn-15",
         "model.message_passing_steps": 2,
