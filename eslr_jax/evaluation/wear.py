@@ -28,8 +28,9 @@ def wear_report(
     """Measure how a garment sits on a moving body.
 
     Skin is covered where a face of the cloth lies in front of it in the rest pose, at most 3 cm away. It shows
-    through where it is later in front of the nearest face. Faces at a hem don't count: skin passes under them.
-    Every tenth frame and the last are looked at.
+    through where it is later in front of the nearest face. Faces at a hem don't count, since skin passes
+    under them, nor do faces turned towards the skin, which cover another limb. Every tenth frame and the last
+    are looked at.
 
     Args:
         positions: Simulated vertex positions [m], shape [frames, vertices, 3].
@@ -47,7 +48,7 @@ def wear_report(
     cloth, carried = np.asarray(positions)[:, is_real], np.asarray(skinned)[:, is_real]
     areas = np.asarray(garment.vertex_areas)[is_real]
     faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
-    body = np.asarray(poses.positions)
+    body, skin_faces = np.asarray(poses.positions), np.asarray(poses.faces)
     timestep = float(poses.timestep)
     slides = np.linalg.norm(np.average(cloth - carried, axis=1, weights=areas), axis=-1)
     is_below = cloth[..., 1].max(axis=1) < body[..., 1].min(axis=1)
@@ -61,19 +62,21 @@ def wear_report(
         "skin_through_share": None,
         "worst_skin_through": None,
     }
-    skin = np.unique(np.asarray(poses.faces)[np.asarray(poses.is_obstacle)])
+    skin = np.unique(skin_faces[np.asarray(poses.is_obstacle)])
     hem = np.zeros(cloth.shape[1], bool)
     for loop in boundary_loops(faces):
         hem[loop] = True
     rest = np.asarray(garment.rest_positions)[is_real]
-    side, distance = _sides(np.asarray(poses.rest_positions)[skin], rest, faces, hem)
+    unposed = np.asarray(poses.rest_positions)
+    side, distance = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
     covered = skin[(side < 0) & (distance < _COVER)]
     if not len(covered):
         return result
     frames = sorted({*range(0, len(cloth), _EVERY), len(cloth) - 1})
     through, shares = [], []
     for frame in frames:
-        side, distance = _sides(body[frame, covered], cloth[frame], faces, hem)
+        outward = vertex_normals(body[frame], skin_faces)[covered]
+        side, distance = _sides(body[frame, covered], outward, cloth[frame], faces, hem)
         through.append(np.where(distance < _POKING, np.maximum(side, 0.0), 0.0))
         shares.append(float(np.mean(distance < _NEAR)))
     depth = np.stack(through)
@@ -93,15 +96,17 @@ def wear_report(
 
 
 def _sides(
-    points: NDArray, positions: NDArray, faces: Int[np.ndarray, "faces 3"], hem: NDArray
+    points: NDArray, outward: NDArray, positions: NDArray, faces: Int[np.ndarray, "faces 3"], hem: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return how far points are in front of a mesh [m], negative behind, zero at its hem; and their distance."""
+    """Return how far skin is in front of cloth [m], negative behind it, and how far off it is [m].
+
+    The first is zero at a hem, and where the two face each other: there the cloth is another limb's.
+    """
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]
     offset = points - np.einsum("pk,pkx->px", weights, positions[corners])
     normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
     distance = np.linalg.norm(offset, axis=1)
-    height = np.where(
-        hem[corners].any(axis=1), 0.0, np.sign(np.einsum("px,px->p", offset, normals)) * distance
-    )
-    return height, distance
+    is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= 0)
+    sign = np.sign(np.einsum("px,px->p", offset, normals))
+    return np.where(is_other, 0.0, sign * distance), distance
