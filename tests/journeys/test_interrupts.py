@@ -33,7 +33,7 @@ def start(*words):
 
 
 def interrupt_after(seconds, *words):
-    """Run a command, press Ctrl-C after a time, and return exit code, words and the seconds that it took to end."""
+    """Run a command, press Ctrl-C after a time; return exit code, words and the seconds that it took to end."""
     process = start(*words)
     time.sleep(seconds)
     process.send_signal(signal.SIGINT)
