@@ -11,6 +11,7 @@ import warnings
 
 from eslr_jax.cli import assets, bodies, budget, evaluate, garments, runs, simulate, train
 from eslr_jax.cli.console import app, stderr
+from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
 from eslr_jax.errors import ConfigError, EslrError
 
 COMMANDS = (simulate, garments, bodies, runs, assets, train, evaluate, budget)  # each has registered its own
@@ -27,13 +28,14 @@ def main() -> None:
     warnings.showwarning = _show_warning
     try:
         _refuse_repetition(sys.argv[1:])
-        app.cli(prog="eslr")
+        with leave_at_once():
+            app.cli(prog="eslr")
     except EslrError as error:
         stderr.print(f"eslr: {error}", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         stderr.print("eslr: interrupted", markup=False)
-        sys.exit(130)
+        sys.exit(EXIT_CODE)
 
 
 def _show_warning(message, category, *_) -> None:

@@ -20,6 +20,11 @@ app = tyro.extras.SubcommandApp()
 stderr = Console(stderr=True)
 
 
+def say(text: str) -> None:
+    """Print a line on stderr as it is."""
+    stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Any]:
     """Show a progress bar on stderr; yields a function of (done, total)."""

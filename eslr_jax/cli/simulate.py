@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.budget import parse_request
-from eslr_jax.cli.console import app, progress, stderr, use_compile_cache
-from eslr_jax.errors import AssetError, ConfigError, MissingExtraError
+from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
+from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
+from eslr_jax.cli.options import Options, check_same_scene, interrupted_record, read_interrupted
+from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
 
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
-_FPS = 30.0  # of the simulation
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
 
@@ -45,12 +48,14 @@ def simulate(
     settle: int = 0,
     self_contact: bool = False,
     out: Path = Path("out"),
+    resume: bool = False,
     pictures: bool = True,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
     """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
 
     The fastest within a tolerance of 1 % is chosen, unless a budget, another tolerance or a simulator is given.
+    Ctrl-C keeps the frames that are done, and --resume goes on from them.
 
     Args:
         garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
@@ -85,15 +90,40 @@ def simulate(
         settle: Frames in which the garment settles on the first pose before frame 0; they are not kept.
         self_contact: Keep layers of cloth apart.
         out: Folder to write to.
+        resume: Go on with the simulation that was interrupted in this folder, with its own options.
         pictures: Render the contact sheet.
         json_: Print the report as JSON.
     """
+    given = locals()
+    options = Options(**{field.name: given[field.name] for field in dataclasses.fields(Options)})
+    report = _simulate(options, out, is_resumed=resume, has_pictures=pictures)
+    if json_:
+        print(json.dumps(report, indent=2))
+    else:
+        _print_report(report, out)
+    if report["error"] is not None:
+        raise EslrError(f"{report['error']}; the frames before are kept in {out}")
+    if report["interrupted_at"] is not None:
+        say(
+            f"stopped at frame {report['interrupted_at']['frame']}; "
+            f"go on with: eslr simulate --out {out} --resume"
+        )
+        sys.exit(EXIT_CODE)
+
+
+def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bool) -> dict[str, Any]:
+    """Simulate, write the run's folder, and return the report."""
     from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+    from eslr_jax.io.unfinished import NAME, write_unfinished
 
     use_compile_cache()
-    if frames is not None and frames < 2:
-        raise AssetError(f"--frames {frames}: a simulation needs two frames or more")
+    done, choice, capacity = None, None, None
+    if is_resumed:
+        done, options, choice, capacity = read_interrupted(out, options)
+    if options.frames is not None and options.frames < 2:
+        raise AssetError(f"--frames {options.frames}: a simulation needs two frames or more")
 
+    import jax
     import numpy as np
 
     from eslr_jax.assets import load_garment_file, load_model, prepare_stored
@@ -101,62 +131,64 @@ def simulate(
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.config import SimConfig
     from eslr_jax.contact.nearest import MAX_APPROACH
+    from eslr_jax.errors import Status
     from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.evaluation.wear import wear_report
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import describe_fit
     from eslr_jax.io.garment import write_garment_npz
-    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+    from eslr_jax.scene.build import skin_garment
+    from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
     from eslr_jax.simulation.budget import SOLVER, choose, keep_budget, read_calibration
-    from eslr_jax.simulation.simulate import last_frames
-    from eslr_jax.simulation.simulate import simulate as run_simulation
+    from eslr_jax.simulation.simulate import good_frames, last_frames, raise_for_status, try_simulate
 
+    simulator, model, iterations = options.simulator, options.model, options.iterations
     is_chosen = simulator is None and model is None and iterations is None
-    budget_ms, share = parse_request(budget, tolerance, is_chosen=is_chosen)
+    budget_ms, share = parse_request(options.budget, options.tolerance, is_chosen=is_chosen)
     if simulator == "physics" and model is not None:
         raise ConfigError(f"--simulator physics has no network; leave out --model {model}")
-    if settle < 0:
-        raise ConfigError(f"--settle {settle}: give a number of frames, 0 or more")
-    actor = _Actor(
-        body, motion, frames, joint_map, motion_up, arm_abduction, body_fps, body_units, betas, start, loop
-    )
+    if options.settle < 0:
+        raise ConfigError(f"--settle {options.settle}: give a number of frames, 0 or more")
     with stderr.status("loading garment, body and motion"):
-        rig, poses, motion = _load_actor(actor)
-        stored = load_garment_file(garment, vertices=vertices, body=rig)
-        choice = None
-        if budget_ms is not None or share is not None:
+        rig, poses, motion = load_actor(options)
+        stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
+        if choice is None and (budget_ms is not None or share is not None):
             choice = choose(
                 read_calibration(), len(stored.rest_positions), budget_ms=budget_ms, tolerance=share
             )
+        if choice is not None:
             simulator = "physics" if choice.method == SOLVER else "network"
             model = None if choice.method == SOLVER else choice.method
             iterations = choice.iterations
         simulator = simulator or ("physics" if iterations is not None and model is None else "network")
         params, architecture = None, None
-        options: dict[str, Any] = {}
+        layout: dict[str, Any] = {}
         if simulator == "network":
             model = model or default_model()
             params, architecture = load_model(model)
-            options = {
+            layout = {
                 "embedding_size": architecture.embedding_size,
                 "embedding_mode": architecture.embedding_mode,
             }
-        cloth = prepare_stored(stored, name=Path(garment).name, **options)
-        material = garment_material(fabric, cloth, stored)
+        cloth = prepare_stored(stored, name=Path(options.garment).name, **layout)
+        material = garment_material(options.fabric, cloth, stored)
         # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
         unseen = beyond_training(material) if simulator == "network" and share is None else ()
-        _check_skin(garment, cloth, rig, body)
-        settling = with_settling(poses, settle)
+        check_skin(options.garment, cloth, rig, options.body)
+        settling = with_settling(poses, options.settle)
         scene = prepare_scene(
-            cloth, settling, material=material, options=SceneOptions(self_contact=self_contact)
+            cloth, settling, material=material, options=SceneOptions(self_contact=options.self_contact)
         )
         if scene.body is not None:
             check_speed(poses, MAX_APPROACH, vertices=np.asarray(scene.body.surface.vertex_ids))
+        if done is not None:
+            check_same_scene(done, scene, out)
+            scene = scene.replace(self_contact=capacity)
     out = ensure_output_dir(out)
     if unseen:
-        text = f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics"
-        stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     if "fit" in stored.metadata:
-        stderr.print(describe_fit(stored.metadata["fit"]), markup=False, highlight=False, soft_wrap=True)
+        say(describe_fit(stored.metadata["fit"]))
     usual = _ITERATIONS if architecture is None else _BEHIND_NETWORK
     config = SimConfig(
         model=architecture,
@@ -164,25 +196,71 @@ def simulate(
         tolerance=0.0 if choice is None else choice.tolerance,
     )
     pace = None if choice is None or budget_ms is None else keep_budget(choice, budget_ms)
+    stop = Interruption("stopping after these frames; Ctrl-C again stops at once and loses them")
     with progress("simulating", scene.num_frames - 1) as advance:
-        trajectory, timing, scene = run_simulation(params, scene, config=config, pace=pace, on_frames=advance)
-    trajectory, scene = last_frames(trajectory, scene, poses.positions.shape[0])
-    if budget_ms is not None and timing.frame_ms > _KEPT * budget_ms:
-        text = (
-            f"missed --budget {budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells what the "
-            "scene costs, eslr calibrate what this machine can do"
+
+        def on_frames(count: int, total: int) -> None:
+            advance(count, total)
+            stop.begin()  # before the first frames are done there is nothing to keep
+
+        try:
+            whole, timing, scene = try_simulate(
+                params,
+                scene,
+                config=config,
+                pace=pace,
+                on_frames=on_frames,
+                is_stopping=lambda: stop.is_wanted,
+                done=done,
+            )
+        finally:
+            stop.end()
+    kept, total = good_frames(whole), poses.positions.shape[0]
+    error, count = None, kept.num_frames - options.settle
+    if int(whole.status) != Status.OK:
+        if count < 2:
+            raise_for_status(whole)
+        try:
+            raise_for_status(whole)
+        except EslrError as raised:
+            error = str(raised)
+    is_unfinished = count < total
+    if is_unfinished:
+        if count < 2:
+            raise KeyboardInterrupt
+        record = interrupted_record(options, choice, scene.self_contact)
+        write_unfinished(out, kept, record)
+        poses = poses.replace(
+            positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
         )
-        stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+        scene = first_frames(scene, kept.num_frames)
+    trajectory, scene = last_frames(kept, scene, count)
+    if budget_ms is not None and timing.frame_ms > _KEPT * budget_ms:
+        say(
+            f"missed --budget {options.budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells "
+            "what the scene costs, eslr calibrate what this machine can do"
+        )
     with stderr.status("measuring"):
+        skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
+        timestep = float(poses.timestep)
         report = {
-            "garment": garment,
-            "fabric": list(fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
+            "garment": options.garment,
+            "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
             "simulator": simulator,
             "model": model,
-            "self_contact": self_contact,
-            **trajectory_report(trajectory, scene),
+            "self_contact": options.self_contact,
+            "interrupted_at": {"frame": count - 1, "time_s": (count - 1) * timestep}
+            if is_unfinished
+            else None,
+            "error": error,
+            **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names)),
+            **wear_report(trajectory.positions, scene.garment, skinned, poses),
             "choice": None if choice is None else dataclasses.asdict(choice),
+            "tolerance": share,
+            "within_tolerance": None
+            if share is None
+            else float(np.mean(np.asarray(trajectory.iterations[1:]) < config.iterations)),
             "frame_ms": timing.frame_ms,
             "compile_s": timing.compile_s,
             **environment(),
@@ -192,76 +270,11 @@ def simulate(
             temporary.write_text(json.dumps(report, indent=2))
         write_garment_npz(out / "garment.npz", stored)
         _write_motion(out, trajectory, scene, rig, poses, stored)
-    if pictures:
+        if not is_unfinished:
+            (out / NAME).unlink(missing_ok=True)
+    if has_pictures and not is_unfinished:
         _write_sheet(out, np.asarray(trajectory.positions), cloth, poses)
-    if json_:
-        print(json.dumps(report, indent=2))
-    else:
-        _print_report(report, out)
-
-
-class _Actor(NamedTuple):
-    """What the command line says of body and motion."""
-
-    body: str
-    motion: str | None
-    frames: int | None
-    joint_map: Path | None
-    up: Literal["auto", "y", "z"]
-    arm_abduction: float | None
-    fps: float | None
-    units: str | None
-    betas: tuple[float, ...]
-    start: str | None
-    loop: str | None
-
-
-def _load_actor(actor: _Actor) -> tuple[Any, Any, str]:
-    """Load a body and set it in motion; return both, and the name of the motion."""
-    from eslr_jax.assets import load_body, load_motion
-    from eslr_jax.assets.load import own_motion
-    from eslr_jax.body.joints import read_joint_map
-    from eslr_jax.body.motion import pose_body
-    from eslr_jax.body.sequence import pose_sequence
-    from eslr_jax.body.timing import cut_start, loop_motion
-    from eslr_jax.cli.moment import parse_seconds
-    from eslr_jax.io.mesh_sequence import is_mesh_sequence, read_mesh_sequence
-
-    body = actor.body
-    if Path(body).exists() and is_mesh_sequence(body):
-        given = {"--motion": actor.motion, "--start": actor.start, "--loop": actor.loop}
-        for option, value in given.items():
-            if value is not None:
-                raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out {option}")
-        sequence = read_mesh_sequence(body, fps=actor.fps)
-        return *pose_sequence(sequence, num_frames=actor.frames, units=actor.units), body
-    if actor.fps is not None:
-        raise ConfigError(f"--body-fps is for bodies that are moving meshes, which {body} is not")
-    rig = load_body(body, units=actor.units, betas=actor.betas)
-    motion = actor.motion or own_motion(body)
-    changes = None if actor.joint_map is None else read_joint_map(actor.joint_map)
-    clip = load_motion(motion, body=rig, joint_map=changes, up=actor.up)
-    if actor.start is not None:
-        clip = cut_start(clip, parse_seconds(actor.start, _FPS, option="--start"))
-    if actor.loop is not None:
-        clip = loop_motion(clip, parse_seconds(actor.loop, _FPS, option="--loop"))
-    return rig, pose_body(rig, clip, num_frames=actor.frames, arm_abduction=actor.arm_abduction), motion
-
-
-def _check_skin(garment: str, cloth, rig, body: str) -> None:
-    """Refuse a garment that hangs on the joints of another body."""
-    import numpy as np
-
-    from eslr_jax.assets import asset_names, load_body
-
-    is_bundled = garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment")
-    if is_bundled and rig.joint_names != load_body().joint_names:
-        raise ConfigError(
-            f"garment {garment} hangs on the bundled body; for {body} give a mesh file (obj, ply, stl, glb), "
-            "which is fitted to it"
-        )
-    if int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
-        raise ConfigError(f"{garment} was fitted to another body; give the mesh it was fitted from")
+    return report
 
 
 def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
@@ -332,7 +345,14 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
 
 
 def _print_report(report: dict[str, Any], out: Path) -> None:
-    """Print what a person wants to know first."""
+    """Print what a person wants to know first: words, then figures."""
+    from eslr_jax.evaluation.words import describe_report
+
+    words = describe_report(report)
+    for text in words.good:
+        print(f"good: {text}")
+    for text in words.warnings:
+        print(f"warning: {text}")
     table = Table(show_header=False, box=None)
     terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items())
     rows = {

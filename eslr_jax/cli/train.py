@@ -44,7 +44,7 @@ def train(
         out: Folder of metrics, checkpoints and the exported model.
         config: TOML file of a training configuration; not needed with --resume.
         set_: Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4.
-        resume: Go on from the newest checkpoint of the folder.
+        resume: Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
         start_from: Name of a bundled network or an exported file whose weights to start from.
         tensorboard: Write event files for TensorBoard too.
         coordinator: Address of the first process as HOST:PORT, or "auto" under Slurm.
@@ -52,7 +52,7 @@ def train(
         process_id: Number of this process, from 0; not needed with "auto".
     """
     from eslr_jax.assets import load_model
-    from eslr_jax.config import parse_override
+    from eslr_jax.config import TrainConfig, from_dict, parse_override, to_dict
     from eslr_jax.models.registry import check_params
     from eslr_jax.training.checkpoint import read_run_config
     from eslr_jax.training.loop import is_first_process
@@ -61,12 +61,13 @@ def train(
     from eslr_jax.training.recipe import load_recipe
 
     if resume:
-        if config is not None or set_ or start_from is not None:
+        changes = dict(parse_override(text) for text in set_)
+        if config is not None or changes.keys() - {"steps"} or start_from is not None:
             raise ConfigError(
-                "--resume goes on with the run's own configuration; leave out --config, --set and --start-from, "
-                "or start a new run in another folder"
+                "--resume goes on with the run's own configuration; leave out --config, --start-from, and every "
+                "--set but steps=N, which extends the run, or start a new one in another folder"
             )
-        chosen = read_run_config(out)
+        chosen = from_dict(TrainConfig, to_dict(read_run_config(out)) | changes)
     elif config is None:
         raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
     else:

@@ -17,16 +17,22 @@ from eslr_jax.types import Scene, Trajectory
 _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
 
 
-def trajectory_report(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
+Parts = tuple[np.ndarray | None, tuple[str, ...]]
+"""Number of the part of every face, shape [faces], and the names of the parts; see `GarmentFile`."""
+
+
+def trajectory_report(trajectory: Trajectory, scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any]:
     """Measure a trajectory.
 
     Args:
         trajectory: What to measure.
         scene: Its scene.
+        parts: Parts of the garment, which the worst places are named by.
 
     Returns:
         Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
-        vertices that penetrate; without a body the penetration values are None.
+        vertices that penetrate; without a body the penetration values are None. `worst_stretch` and
+        `worst_penetration` hold frame, time [s], vertex and part of the largest values.
     """
     measures: FrameMeasures = jax.device_get(measure_frames(trajectory, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
@@ -42,9 +48,11 @@ def trajectory_report(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
         "start_principal_stretch": float(
             np.max(principal_stretches(trajectory.positions[0], scene.garment)[0])
         ),
+        "worst_stretch": _worst_stretch(trajectory, scene, int(np.argmax(measures.max_stretch)) + 1, parts),
         "penetration_p999_mm": None,
         "penetration_max_mm": None,
         "penetrating_share": None,
+        "worst_penetration": None,
         "rms_speed_m_s": float(measures.speed.mean()),
         "residual_median": float(np.median(trajectory.residuals[1:])),
         "iterations_mean": float(np.mean(trajectory.iterations[1:])),
@@ -54,7 +62,27 @@ def trajectory_report(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
         report["penetration_p999_mm"] = float(max(np.quantile(depth, 0.999), 0.0) * 1e3)
         report["penetration_max_mm"] = float(max(depth.max(), 0.0) * 1e3)
         report["penetrating_share"] = float((depth > 0).mean())
+        if depth.max() > 0:
+            frame, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
+            vertex = int(np.flatnonzero(is_real)[column])
+            report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
     return report
+
+
+def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:
+    """Return where a frame is stretched most."""
+    stretch = np.asarray(principal_stretches(trajectory.positions[frame], scene.garment)[0])
+    return _place(frame, int(np.asarray(scene.garment.faces)[stretch.argmax(), 0]), scene, parts)
+
+
+def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any]:
+    """Return a frame and a vertex as plain values, with the frame's time [s] and the vertex's part."""
+    numbers, names = parts
+    part = None
+    if numbers is not None and names:
+        around = (np.asarray(scene.garment.faces)[: len(numbers)] == vertex).any(axis=1)
+        part = names[int(np.bincount(numbers[around]).argmax())] if around.any() else None
+    return {"frame": frame, "time_s": frame * float(scene.timestep), "vertex": vertex, "part": part}
 
 
 def simulated_terms(trajectory: Trajectory) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.errors import ConfigError
 from eslr_jax.physics.guess import InitialGuess
 from eslr_jax.physics.lbfgs import Minimum, Stop, minimize
 from eslr_jax.physics.potential import Point, evaluate, potential
@@ -78,8 +79,14 @@ def solve(
         iterations: Upper bound of iterations; may be traced.
         tolerance: Share of the initial gap that may be left, see `SimConfig.tolerance`.
         memory: Number of pairs that L-BFGS keeps; static.
+
+    Raises:
+        ConfigError: The number of iterations is not an integer, as where somebody differentiates by it.
     """
-    return _solve(problem, jax.lax.stop_gradient(start), jnp.asarray(iterations), (tolerance, memory))
+    iterations = jnp.asarray(iterations)
+    if not jnp.issubdtype(iterations.dtype, jnp.integer):
+        raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
+    return _solve(problem, jax.lax.stop_gradient(start), iterations, (tolerance, memory))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))

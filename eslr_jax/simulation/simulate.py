@@ -51,6 +51,8 @@ def simulate(
     config: SimConfig | None = None,
     pace: Pace | None = None,
     on_frames: Callable[[int, int], None] = lambda done, total: None,
+    is_stopping: Callable[[], bool] = lambda: False,
+    done: Trajectory | None = None,
 ) -> Simulation:
     """Simulate a scene; check it first, enlarge buffers that are too small, and raise what goes wrong.
 
@@ -60,6 +62,8 @@ def simulate(
         config: Network, iterations and tolerance; the solver alone by default.
         pace: Chooses the iterations of every chunk; by default all take the configuration's.
         on_frames: Called with the number of frames done and the number in all.
+        is_stopping: Asked after every chunk; the trajectory ends where it answers yes.
+        done: First frames of the same scene, simulated before; the trajectory begins with them.
 
     Raises:
         ConfigError: A network is asked for without weights, or the fabric, a constant or the timestep is out of
@@ -69,7 +73,9 @@ def simulate(
         CapacityError: A buffer was too small and can't be enlarged.
         MotionError: The body is too fast to follow.
     """
-    simulation = try_simulate(params, scene, config=config, pace=pace, on_frames=on_frames)
+    simulation = try_simulate(
+        params, scene, config=config, pace=pace, on_frames=on_frames, is_stopping=is_stopping, done=done
+    )
     raise_for_status(simulation.trajectory)
     return simulation
 
@@ -81,6 +87,8 @@ def try_simulate(
     config: SimConfig | None = None,
     pace: Pace | None = None,
     on_frames: Callable[[int, int], None] = lambda done, total: None,
+    is_stopping: Callable[[], bool] = lambda: False,
+    done: Trajectory | None = None,
 ) -> Simulation:
     """Simulate a scene as `simulate` does, but leave what went wrong in the trajectory's status.
 
@@ -96,13 +104,19 @@ def try_simulate(
     larger: Scene | None = scene
     while larger is not None:
         scene = larger
-        trajectory, timing = _in_chunks(params, scene, config, pace, on_frames)
-        larger = enlarge_buffers(scene, trajectory)
+        trajectory, timing = _in_chunks(params, scene, config, pace, on_frames, is_stopping, done)
+        larger, done = None if is_stopping() else enlarge_buffers(scene, trajectory), None
     return Simulation(trajectory, timing, scene)
 
 
 def _in_chunks(
-    params: Any, scene: Scene, config: SimConfig, pace: Pace | None, on_frames: Callable[[int, int], None]
+    params: Any,
+    scene: Scene,
+    config: SimConfig,
+    pace: Pace | None,
+    on_frames: Callable[[int, int], None],
+    is_stopping: Callable[[], bool],
+    before: Trajectory | None,
 ) -> tuple[Trajectory, Timing]:
     """Simulate a scene a few frames at a time, and time compilation apart."""
     total = scene.num_frames - 1
@@ -115,8 +129,10 @@ def _in_chunks(
         return jax.tree.map(lambda leaf: leaf[frames], inputs)
 
     iterations = config.iterations
-    state, done, seconds, compile_s = scene.initial_state, [], 0.0, 0.0
-    for first in range(0, total, chunk):
+    start = scene.initial_state if before is None else last_state(before)
+    begin = 0 if before is None else before.num_frames - 1
+    state, done, seconds, compile_s = start, [], 0.0, 0.0
+    for first in range(begin, total, chunk):
         bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
         arguments = (params, constant, state, part(first), bound)
         program, took = _compiled(config, arguments)
@@ -133,11 +149,33 @@ def _in_chunks(
         if count == chunk or is_bad:
             state = end
         on_frames(first + count, total)
-        if is_bad:
+        if is_bad or is_stopping():
             break
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
-    trajectory = join_frames(scene.initial_state, joined, state)
+    trajectory = join_frames(start, joined, state)
+    if before is not None:
+        trajectory = _appended(before, trajectory)
     return trajectory, Timing(compile_s, seconds * 1e3 / (chunk * len(done)))
+
+
+def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
+    """Return a trajectory and the one that begins with its last frame as one."""
+    end = {"status": after.status, "first_bad_frame": after.first_bad_frame}
+    nothing = {"status": None, "first_bad_frame": None}
+    joined = jax.tree.map(
+        lambda first, second: jnp.concatenate([first, second[1:]]),
+        before.replace(**nothing),
+        after.replace(**nothing),
+    )
+    return joined.replace(**end)
+
+
+def last_state(trajectory: Trajectory) -> ClothState:
+    """Return the state that a trajectory without an error ended in."""
+    state = initial_state(trajectory.positions[-1], trajectory.velocities[-1])
+    return state.replace(
+        friction_load=trajectory.friction_loads[-1], frame=jnp.int32(trajectory.num_frames - 1)
+    )
 
 
 def _scan(
@@ -191,6 +229,15 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
         faces=math.ceil(_HEADROOM * faces) if faces > before.faces else before.faces,
     )
     return None if capacity == before else scene.replace(self_contact=capacity)
+
+
+def good_frames(trajectory: Trajectory) -> Trajectory:
+    """Return the frames before the first bad one; all if none is bad."""
+    bad = int(trajectory.first_bad_frame)
+    count = trajectory.num_frames if bad < 0 else min(bad, trajectory.num_frames)
+    whole = trajectory.replace(status=None, first_bad_frame=None)
+    kept = jax.tree.map(lambda leaf: leaf[:count], whole)
+    return kept.replace(status=jnp.int32(Status.OK), first_bad_frame=jnp.int32(-1))
 
 
 def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[Trajectory, Scene]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from eslr_jax.training.step import TrainState
 
 FORMAT = 1
 _KEPT = 3
+_LONGEST = 120  # characters of a library's message
+_FOLDER = "checkpoints"
 
 
 class Checkpoints:
@@ -27,7 +30,7 @@ class Checkpoints:
         options = ocp.CheckpointManagerOptions(
             max_to_keep=_KEPT, create=True, enable_async_checkpointing=True
         )
-        self._manager = ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
+        self._manager = ocp.CheckpointManager((folder / _FOLDER).absolute(), options=options)
 
     def save(self, state: TrainState) -> None:
         """Start writing a checkpoint; the state may be donated as soon as this returns.
@@ -55,27 +58,37 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def restore(self, example: TrainState) -> TrainState:
-        """Return the newest checkpoint.
+        """Return the newest checkpoint that can be read, and drop damaged ones that are newer.
 
         Args:
             example: A state of the same run: its shapes and types.
 
         Raises:
-            CheckpointError: There is none, or it is for another model.
+            CheckpointError: There is none, or none can be read.
         """
-        step = self.latest()
-        if step is None:
+        steps = sorted(self._manager.all_steps(), reverse=True)
+        if not steps:
             raise CheckpointError("there is no checkpoint to resume from; start without --resume")
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain(example))
-        try:
-            plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
-        except (ValueError, KeyError, TypeError) as error:
-            text = one_line(error)
-            raise CheckpointError(
-                f"checkpoint {step} is for another run: {text}; choose another --out"
-            ) from error
-        leaves = jax.tree.leaves(plain)
-        return jax.tree.unflatten(jax.tree.structure(example), leaves)
+        reasons = []
+        for step in steps:
+            try:
+                plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+            except (
+                Exception
+            ) as error:  # orbax, its storage and JAX each have classes of their own for bad bytes
+                reasons.append(f"{step}: {one_line(error)[:_LONGEST]}")
+                continue
+            for damaged in steps[: len(reasons)]:
+                warnings.warn(
+                    f"checkpoint {damaged} can't be read and was removed; going on from {step}", stacklevel=2
+                )
+                self._manager.delete(damaged)
+            return jax.tree.unflatten(jax.tree.structure(example), jax.tree.leaves(plain))
+        raise CheckpointError(
+            f"no checkpoint can be read ({'; '.join(reasons)}); they are damaged or of another version: "
+            "start a new run in another folder"
+        )
 
     def close(self) -> None:
         """Finish writing and release the folder."""
@@ -86,6 +99,11 @@ class Checkpoints:
 def _plain(state: TrainState) -> dict[str, Any]:
     """Return the state's leaves by number: a layout that no library's class names can break."""
     return {f"{number:05d}": leaf for number, leaf in enumerate(jax.tree.leaves(state))}
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Tell whether a folder holds a whole checkpoint: without one there is nothing to lose."""
+    return any(path.name.isdigit() for path in (folder / _FOLDER).glob("*"))
 
 
 def write_run_config(folder: Path, config: TrainConfig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -19,7 +20,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, CheckpointError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
-from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
+from eslr_jax.training.checkpoint import Checkpoints, has_checkpoint, read_run_config, write_run_config
 from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
@@ -37,8 +38,11 @@ def train(
 ) -> TrainState:
     """Train a network, or go on with a run.
 
+    The folder is made when everything has been checked, and gets a checkpoint before anything is compiled: from
+    then on a run resumes wherever it is stopped.
+
     Args:
-        config: The run.
+        config: The run. A run that is resumed may have more `steps` than before.
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial_params: Weights to start from instead of random ones.
@@ -51,24 +55,33 @@ def train(
         CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
-    checkpoints = _open_run(config, ensure_output_dir(out), resume)
+    _check_run(config, out, resume)
     datasets = datasets or tuple(load_training_data(config, vertices) for vertices in config.vertices)
     state = init_train_state(config, datasets)
     datasets, state = tuple(replicate(data, mesh) for data in datasets), replicate(state, mesh)
     if initial_params is not None:
         given = replicate(jax.tree.map(jax.numpy.array, initial_params), mesh)
         state = state.replace(params={**state.params, **given})
+    checkpoints = Checkpoints(ensure_output_dir(out))
     if resume:
         state = checkpoints.restore(state)
         _forget_after(out / "metrics.jsonl", int(state.step))
+    if is_first_process():
+        write_run_config(out, config)
+    if not resume:
+        checkpoints.save(state)
+        checkpoints.wait()
     step_functions = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.step)
     metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
-    with metrics_file.open("a") as log, _stop_requested() as is_stopping:
+    with metrics_file.open("a") as log, contextlib.ExitStack() as stack:
+        is_stopping: Callable[[int], bool] | None = None
         for step in range(first, config.steps):
             resolution = step % len(step_functions)
             state, metrics = step_functions[resolution](state, datasets[resolution])
+            if step - first == len(step_functions) - 1:  # all is compiled: now there are steps to lose
+                is_stopping = stack.enter_context(_stop_requested())
             window.append(metrics)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
@@ -88,7 +101,7 @@ def train(
                     )
             if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
-            if is_stopping(done):
+            if is_stopping is not None and is_stopping(done):
                 if done % config.checkpoint_every:
                     checkpoints.save(state)
                 break
@@ -106,17 +119,23 @@ def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
     return path
 
 
-def _open_run(config: TrainConfig, out: Path, resume: bool) -> Checkpoints:
-    """Create or reopen the run's folder, without touching another run's."""
-    if resume:
-        before = read_run_config(out)
-        if before != config:
-            raise CheckpointError(f"{out} holds a run with another configuration; resume it with its own")
-    elif is_first_process() and (out / "config.json").exists():
-        raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
-    if is_first_process() and not resume:
-        write_run_config(out, config)
-    return Checkpoints(out)
+def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:
+    """Check that a run may begin or go on in a folder.
+
+    Raises:
+        CheckpointError: The folder holds another run, one of another configuration, or none to resume.
+    """
+    if not resume:
+        if has_checkpoint(out):
+            raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
+        return
+    before = read_run_config(out)
+    if dataclasses.replace(before, steps=config.steps) != config:
+        raise CheckpointError(f"{out} holds a run with another configuration; resume it with its own")
+    if config.steps < before.steps:
+        raise CheckpointError(
+            f"{out} holds a run of {before.steps} steps; it can be extended to more, not cut to {config.steps}"
+        )
 
 
 def _forget_after(metrics: Path, step: int) -> None:

@@ -1,6 +1,9 @@
 """Derivatives of solved frames against central differences, in float64."""
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -172,3 +175,27 @@ def test_a_refined_prediction_has_right_gradients(output):
 
     expected = (loss(1.0 + STEP) - loss(1.0 - STEP)) / (2 * STEP)
     assert float(jax.jit(jax.grad(loss))(1.0)) == pytest.approx(float(expected), rel=1e-3)
+
+
+BY_A_COUNT = """
+import jax
+from draped_ball import drifting_ball, square
+from eslr_jax import SimConfig, prepare_scene
+from eslr_jax.errors import ConfigError
+from eslr_jax.simulation.rollout import rollout_scene
+scene = prepare_scene(square(4), drifting_ball(2))
+try:
+    jax.grad(lambda count: rollout_scene(None, scene, SimConfig(), count).positions.sum())(5.0)
+except ConfigError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_a_derivative_by_a_count_is_refused():
+    """In a process of its own: here the annotations are checked, and refuse it before."""
+    command = [sys.executable, "-c", BY_A_COUNT]
+    result = subprocess.run(
+        command, capture_output=True, text=True, cwd=Path(__file__).parents[1], check=True
+    )
+    assert result.stdout == "iterations are float32; give a whole number, which has no derivative\n"

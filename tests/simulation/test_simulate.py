@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +15,13 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import enlarge_buffers, raise_for_status, simulate, try_simulate
+from eslr_jax.simulation.simulate import (
+    enlarge_buffers,
+    good_frames,
+    raise_for_status,
+    simulate,
+    try_simulate,
+)
 from eslr_jax.types import PairCapacity, PhysicsConstants
 
 SOLVER = SimConfig(iterations=12)
@@ -39,6 +46,25 @@ def test_chunks_equal_one_scan(scene, whole):
     np.testing.assert_allclose(sum(trajectory.terms), sum(whole.terms), atol=1e-6)
     assert told == [(10, 13), (13, 13)]
     assert timing.frame_ms < 1e3
+
+
+def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
+    whole = simulate(None, scene, config=SOLVER).trajectory
+    first = simulate(None, scene, config=SOLVER, is_stopping=lambda: True).trajectory
+    assert first.num_frames == 11
+    told = []
+    joined = simulate(
+        None, scene, config=SOLVER, done=first, on_frames=lambda *counts: told.append(counts)
+    ).trajectory
+    assert told == [(13, 13)]
+    for ours, theirs in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_frames_before_a_bad_one_are_good(whole):
+    kept = good_frames(whole.replace(status=jnp.int32(Status.NON_FINITE), first_bad_frame=jnp.int32(4)))
+    assert (kept.num_frames, int(kept.status), int(kept.first_bad_frame)) == (4, Status.OK, -1)
+    np.testing.assert_array_equal(kept.positions, whole.positions[:4])
 
 
 def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):

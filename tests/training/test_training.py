@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import pushed_out_guess
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.network import refine
-from eslr_jax.training.checkpoint import Checkpoints
+from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
 from eslr_jax.training.loop import train
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.pool import start_trajectory
@@ -102,6 +103,39 @@ def test_half_written_checkpoint_is_not_taken(finished):
     latest = Checkpoints(folder).latest()
     (folder / "checkpoints" / f"{latest + 1}.orbax-checkpoint-tmp-1").mkdir()
     assert Checkpoints(folder).latest() == latest
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(finished, config, small_data, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    for path in (tmp_path / "checkpoints" / "6").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.warns(UserWarning, match="checkpoint 6 can't be read and was removed; going on from 4"):
+        state = train(config, tmp_path, datasets=(small_data,), resume=True)
+    whole, _ = finished
+    for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_extended_but_not_cut(finished, config, small_data, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    with pytest.raises(CheckpointError, match="it can be extended to more, not cut to 4"):
+        train(dataclasses.replace(config, steps=4), tmp_path, resume=True)
+    longer = dataclasses.replace(config, steps=8)
+    assert int(train(longer, tmp_path, datasets=(small_data,), resume=True).step) == 8
+    assert read_run_config(tmp_path) == longer
+    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records] == [2, 4, 6, 8]
+
+
+def test_a_folder_without_a_checkpoint_starts_anew(config, small_data, tmp_path):
+    write_run_config(tmp_path, config)
+    with pytest.raises(CheckpointError, match="no checkpoint to resume from; start without --resume"):
+        train(config, tmp_path, datasets=(small_data,), resume=True)
+    assert int(train(config, tmp_path, datasets=(small_data,)).step) == config.steps
 
 
 def test_unknown_split_lists_what_exists():

@@ -1,0 +1,59 @@
+"""Who moves in `eslr simulate`: a body and its motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from eslr_jax.cli.options import Options
+from eslr_jax.errors import ConfigError
+
+_FPS = 30.0  # of the simulation
+
+
+def load_actor(options: Options) -> tuple[Any, Any, str]:
+    """Load a body and set it in motion; return both, and the name of the motion."""
+    from eslr_jax.assets import load_body, load_motion
+    from eslr_jax.assets.load import own_motion
+    from eslr_jax.body.joints import read_joint_map
+    from eslr_jax.body.motion import pose_body
+    from eslr_jax.body.sequence import pose_sequence
+    from eslr_jax.body.timing import cut_start, loop_motion
+    from eslr_jax.cli.moment import parse_seconds
+    from eslr_jax.io.mesh_sequence import is_mesh_sequence, read_mesh_sequence
+
+    body = options.body
+    if Path(body).exists() and is_mesh_sequence(body):
+        given = {"--motion": options.motion, "--start": options.start, "--loop": options.loop}
+        for option, value in given.items():
+            if value is not None:
+                raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out {option}")
+        sequence = read_mesh_sequence(body, fps=options.body_fps)
+        return *pose_sequence(sequence, num_frames=options.frames, units=options.body_units), body
+    if options.body_fps is not None:
+        raise ConfigError(f"--body-fps is for bodies that are moving meshes, which {body} is not")
+    rig = load_body(body, units=options.body_units, betas=options.betas)
+    motion = options.motion or own_motion(body)
+    changes = None if options.joint_map is None else read_joint_map(options.joint_map)
+    clip = load_motion(motion, body=rig, joint_map=changes, up=options.motion_up)
+    if options.start is not None:
+        clip = cut_start(clip, parse_seconds(options.start, _FPS, option="--start"))
+    if options.loop is not None:
+        clip = loop_motion(clip, parse_seconds(options.loop, _FPS, option="--loop"))
+    return rig, pose_body(rig, clip, num_frames=options.frames, arm_abduction=options.arm_abduction), motion
+
+
+def check_skin(garment: str, cloth, rig, body: str) -> None:
+    """Refuse a garment that hangs on the joints of another body."""
+    import numpy as np
+
+    from eslr_jax.assets import asset_names, load_body
+
+    is_bundled = garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment")
+    if is_bundled and rig.joint_names != load_body().joint_names:
+        raise ConfigError(
+            f"garment {garment} hangs on the bundled body; for {body} give a mesh file (obj, ply, stl, glb), "
+            "which is fitted to it"
+        )
+    if int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
+        raise ConfigError(f"{garment} was fitted to another body; give the mesh it was fitted from")

@@ -1,0 +1,143 @@
+"""What the options of `eslr simulate` say of the simulation, and what `--resume` makes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from eslr_jax.errors import ConfigError
+
+if TYPE_CHECKING:
+    from eslr_jax.simulation.budget import Choice
+    from eslr_jax.types import PairCapacity, Scene, Trajectory
+
+_SAME = 1e-4  # [m] by which the beginning of the same scene may differ between machines
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """The options that decide what is simulated; see `eslr simulate --help`."""
+
+    garment: str
+    motion: str | None
+    body: str
+    simulator: Literal["network", "physics"] | None
+    model: str | None
+    vertices: Literal["1k", "4k", "10k"]
+    fabric: tuple[str, ...]
+    frames: int | None
+    iterations: int | None
+    budget: str | None
+    tolerance: str | None
+    joint_map: Path | None
+    motion_up: Literal["auto", "y", "z"]
+    arm_abduction: float | None
+    body_fps: float | None
+    body_units: str | None
+    betas: tuple[float, ...]
+    start: str | None
+    loop: str | None
+    settle: int
+    self_contact: bool
+
+
+def interrupted_record(
+    options: Options, choice: Choice | None, capacity: PairCapacity | None
+) -> dict[str, Any]:
+    """Return what an interrupted simulation goes on with, as values of JSON.
+
+    Args:
+        options: Its options.
+        choice: The simulator that was chosen, if a budget or a tolerance did.
+        capacity: Buffers of self-contact that sufficed.
+    """
+    values = {name: _plain(value) for name, value in vars(options).items()}
+    return {
+        "options": values,
+        "choice": None if choice is None else dataclasses.asdict(choice),
+        "capacity": None if capacity is None else dataclasses.asdict(capacity),
+    }
+
+
+def read_interrupted(
+    out: Path, given: Options
+) -> tuple[Trajectory, Options, Choice | None, PairCapacity | None]:
+    """Read an interrupted simulation; options that are not given are its own.
+
+    Args:
+        out: Its folder.
+        given: The options of this command.
+
+    Returns:
+        The frames that are done, the options, the simulator that was chosen, and the buffers of self-contact.
+
+    Raises:
+        AssetError: The folder holds no interrupted simulation.
+        ConfigError: An option is given that is not the simulation's own.
+    """
+    import inspect
+
+    from eslr_jax.cli.simulate import simulate
+    from eslr_jax.io.unfinished import read_unfinished
+    from eslr_jax.simulation.budget import Choice
+    from eslr_jax.types import PairCapacity
+
+    done, record = read_unfinished(out)
+    values, usual = record["options"], inspect.signature(simulate).parameters
+    for name, value in vars(given).items():
+        if value != usual[name].default and _plain(value) != values.get(name):
+            own = values.get(name)
+            raise ConfigError(
+                f"{out} was simulated with {name.replace('_', '-')} = {_text(own)}, not {_text(_plain(value))}; "
+                "leave out all options but --out to go on, or start in another folder without --resume"
+            )
+    values = values | {"fabric": tuple(values["fabric"]), "betas": tuple(values["betas"])}
+    if values["joint_map"] is not None:
+        values["joint_map"] = Path(values["joint_map"])
+    choice, capacity = record["choice"], record["capacity"]
+    return (
+        done,
+        Options(**values),
+        None if choice is None else Choice(**choice),
+        None if capacity is None else PairCapacity(**capacity),
+    )
+
+
+def check_same_scene(done: Trajectory, scene: Scene, out: Path) -> None:
+    """Check that the frames that are done begin as the scene does.
+
+    Args:
+        done: Frames of an interrupted simulation.
+        scene: The scene of the same options.
+        out: Folder of the simulation.
+
+    Raises:
+        ConfigError: A file has changed since.
+    """
+    import numpy as np
+
+    first, again = np.asarray(done.positions[0]), np.asarray(scene.initial_state.position)
+    if (
+        first.shape != again.shape
+        or np.abs(first - again).max() > _SAME
+        or done.num_frames >= scene.num_frames
+    ):
+        raise ConfigError(
+            f"{out} was simulated with another garment, body or motion: their files have changed since; "
+            "start in another folder without --resume"
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Return an option's value as one of JSON."""
+    if isinstance(value, tuple):
+        return list(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _text(value: Any) -> str:
+    """Return an option's value as it is typed."""
+    if value is None or value == []:
+        return "none"
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,100 @@
+"""A report in words: what is good, and what a person would see as wrong."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+_STRETCH = 1.5  # of a face, from which cloth looks torn
+_PENETRATION_MM = 5.0
+_THROUGH_MM = 1.0  # of skin in front of cloth
+_SLID_M = 0.25
+_LEFT = 0.75  # of the covered skin that cloth should still be near
+
+
+class Words(NamedTuple):
+    """Lines for a person."""
+
+    good: list[str]
+    warnings: list[str]
+
+
+def describe_report(report: dict[str, Any]) -> Words:
+    """Put a run's report into words.
+
+    Args:
+        report: Values of `trajectory_report`, of `wear_report`, and the `tolerance` that was asked for with the
+            share of frames within it, `within_tolerance`.
+    """
+    words = Words([], [])
+    if report["error"] is not None:
+        words.warnings.append(report["error"])
+    if report["tolerance"] is not None:
+        _describe_tolerance(report, words)
+    _describe_penetration(report, words)
+    _describe_place(report, words)
+    stretch = report["max_principal_stretch"]
+    text = f"cloth is stretched by {100 * (stretch - 1):.0f} % at most"
+    if stretch > _STRETCH:
+        words.warnings.append(f"{text}, {_where(report['worst_stretch'])}")
+    else:
+        words.good.append(text)
+    return words
+
+
+def _describe_tolerance(report: dict[str, Any], words: Words) -> None:
+    """Say in how many frames a tolerance was kept."""
+    tolerance, share = 100 * report["tolerance"], report["within_tolerance"]
+    if share == 1.0:
+        words.good.append(f"within {tolerance:g} % of the optimum on every frame")
+    else:
+        words.warnings.append(
+            f"{100 * (1 - share):.1f} % of the frames ran out of iterations before they were within "
+            f"{tolerance:g} % of the optimum"
+        )
+
+
+def _describe_penetration(report: dict[str, Any], words: Words) -> None:
+    """Say how deep cloth is in the body, and skin in front of cloth."""
+    depth, through = report["penetration_max_mm"], report["skin_through_mm"]
+    if depth is not None and depth > _PENETRATION_MM:
+        place = _where(report["worst_penetration"])
+        words.warnings.append(f"cloth is up to {depth:.1f} mm inside the body, {place}")
+    elif depth:
+        words.good.append(f"no vertex deeper than {depth:.2g} mm inside the body")
+    elif depth is not None:
+        words.good.append("no vertex inside the body")
+    if through is not None and through > _THROUGH_MM:
+        place, share = _where(report["worst_skin_through"]), report["skin_through_share"]
+        words.warnings.append(
+            f"skin shows through the cloth, by up to {through:.1f} mm, {place}; "
+            f"{100 * share:.2f} % of the covered skin"
+        )
+    elif through is not None:
+        words.good.append("no skin shows through the cloth")
+
+
+def _describe_place(report: dict[str, Any], words: Words) -> None:
+    """Say whether the garment is where it was put on."""
+    slide, frame, coverage = report["slide_m"], report["below_feet_at"], report["coverage"]
+    if frame is not None:
+        words.warnings.append(f"the garment fell off: in frame {frame} it is below the feet")
+    elif slide > _SLID_M:
+        place = _where(report["worst_slide"])
+        words.warnings.append(
+            f"the garment slid or fell: its centre is {slide:.2f} m from its place, {place}"
+        )
+    elif coverage is not None and coverage < _LEFT:
+        words.warnings.append(f"the garment left skin that it covered: {100 * (1 - coverage):.0f} % of it")
+    else:
+        words.good.append("the garment stays where it was put on")
+
+
+def _where(place: dict[str, Any]) -> str:
+    """Return a place as text."""
+    text = f"frame {place['frame']} ({place['time_s']:.2f} s)"
+    if place.get("part"):
+        text += f", part {place['part']}"
+    for key, word in (("vertex", "vertex"), ("body_vertex", "body vertex")):
+        if key in place:
+            text += f", {word} {place[key]}"
+    return text

@@ -1,0 +1,149 @@
+"""Let out a T-shirt that is too tight, so that its stretch on the body stays under a bar.
+
+    python experiments/inverse/fit.py [--smoke] [--out DIR]
+
+The shirt is cut 3 cm narrower all around. Parameters say how far each band of it (four heights of the trunk, the
+sleeves) is let out along its normals. The loss is the stretch above the bar on the body, after a few long frames
+in which the cloth comes to rest, and a small price for letting out. Writes fit.json and fit.png.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from search import descend, gradient_cost, search_simplex
+from sheet import keep, parse_options
+
+from eslr_jax.assets import load_body, load_garment
+from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax.config import SimConfig
+from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.physics.rest_shape import with_rest_positions
+from eslr_jax.render.pictures import render_frame
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.types import Garment, Scene
+
+BAR = 1.08  # largest principal stretch
+TIGHT = -0.03  # [m], how far the shirt is taken in
+UNIT = 0.02  # [m] of a parameter
+PRICE = 1e-6  # of a squared parameter, besides squared strain
+TIMESTEP = 0.1  # [s]: implicit Euler damps a long frame's motion away
+BANDS = ("hem", "waist", "chest", "shoulders", "sleeves")
+
+
+def band_weights(rest: np.ndarray) -> np.ndarray:
+    """Return the share of every band in every vertex, shape [vertices, bands]; rows sum to one."""
+    height = np.interp(rest[:, 1], np.quantile(rest[:, 1], [0.02, 0.98]), [0.0, 3.0])
+    trunk = np.maximum(1 - np.abs(height[:, None] - np.arange(4)), 0.0)
+    chest = np.quantile(np.abs(rest[rest[:, 1] < np.median(rest[:, 1]), 0]), 0.98)  # half the width [m]
+    sleeve = np.clip((np.abs(rest[:, 0]) - chest) / 0.04, 0.0, 1.0)[:, None]
+    return np.concatenate([trunk * (1 - sleeve), sleeve], axis=1)
+
+
+def vertex_normals(garment: Garment) -> np.ndarray:
+    """Return the unit normals of the rest mesh, zero where padded, shape [vertices, 3]."""
+    rest, faces = np.asarray(garment.rest_positions), np.asarray(garment.faces)
+    a, b, c = (rest[faces[:, corner]] for corner in range(3))
+    normals = np.zeros_like(rest)
+    np.add.at(normals, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def make_scene(num_frames: int) -> Scene:
+    """Return the T-shirt as it is cut, on a body that stands still."""
+    body = load_body()
+    scene = prepare_scene(load_garment("tshirt"), pose_body(body, still_motion(body, num_frames)))
+    return scene.replace(timestep=jnp.float32(TIMESTEP))
+
+
+def main() -> None:
+    """Let the shirt out by gradients and by Nelder-Mead, and keep both."""
+    options = parse_options(__doc__)
+    frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 3)
+    config = SimConfig(iterations=20 if options.smoke else 100)
+    scene = make_scene(frames)
+    garment = scene.garment
+    weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
+    normals = jnp.asarray(vertex_normals(garment), jnp.float32)
+
+    def wear(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the shirt on the body [m], and the larger principal stretch of every face."""
+        ease = TIGHT + UNIT * (weights @ parameters)
+        cut = with_rest_positions(garment, garment.rest_positions + ease[:, None] * normals)
+        worn = rollout_scene(None, scene.replace(garment=cut), config).positions[-1]
+        return worn, principal_stretches(worn, cut)[0]
+
+    def loss(parameters: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        worn, stretch = wear(parameters)
+        over = jnp.sum(garment.rest_areas * jnp.maximum(stretch - BAR, 0.0) ** 2) / jnp.sum(
+            garment.rest_areas
+        )
+        return over + PRICE * jnp.sum(parameters**2), (worn, stretch)
+
+    both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
+
+    def value_and_grad(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+        (value, _), gradient = slope(parameters)
+        return 1e4 * value, 1e4 * gradient
+
+    start = np.zeros(len(BANDS))
+    cost = gradient_cost(both, slope, start, turns)
+    by_gradient = descend(value_and_grad, start, steps)
+    simplex = search_simplex(lambda parameters: 1e4 * both(parameters)[0], start, round(cost * steps))
+    shirts = {"tight": start, "lbfgs": by_gradient.best, "nelder_mead": simplex.best}
+    worn = {name: both(jnp.asarray(best, jnp.float32))[1] for name, best in shirts.items()}
+    areas = np.asarray(garment.rest_areas)
+    result = {
+        "bar": BAR,
+        "bands": BANDS,
+        "gradient_in_evaluations": round(cost, 2),
+        "evaluations": round(cost * steps),
+        "refused": by_gradient.refused,
+        "let_out_mm": {name: np.round(1e3 * UNIT * best, 1) for name, best in shirts.items()},
+        "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, (_, stretch) in worn.items()},
+        "area_above_bar": {
+            name: float(areas[np.asarray(stretch) > BAR].sum() / areas.sum())
+            for name, (_, stretch) in worn.items()
+        },
+        "loss_1e-4": {"lbfgs": min(by_gradient.losses), "nelder_mead": min(simplex.losses)},
+    }
+    figure = draw(scene, worn, by_gradient.losses, simplex.losses, cost)
+    keep(options.out, Path(__file__).stem, result, figure)
+
+
+def stretch_below(share: float, stretch: jax.Array, areas: np.ndarray) -> float:
+    """Return the stretch that this share of the cloth's area stays below."""
+    order = np.argsort(np.asarray(stretch))
+    covered = np.cumsum(areas[order]) / areas.sum()
+    return float(np.asarray(stretch)[order][np.searchsorted(covered, share)])
+
+
+def draw(scene: Scene, worn: dict, losses: list[float], free: list[float], cost: float) -> plt.Figure:
+    """Return the shirts, coloured by stretch, and both searches."""
+    figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained")
+    body, faces = scene.body, np.asarray(scene.garment.faces)
+    for axis, name in zip(axes, ("tight", "lbfgs"), strict=False):
+        positions, stretch = (np.asarray(part) for part in worn[name])
+        count = np.maximum(np.bincount(faces.ravel(), minlength=len(positions)), 1)
+        mean = np.bincount(faces.ravel(), np.repeat(stretch, 3), minlength=len(positions)) / count
+        colors = plt.get_cmap("coolwarm")(np.clip((mean - 1) / (2 * (BAR - 1)), 0, 1))[:, :3]
+        axis.imshow(
+            render_frame(body.positions[-1], body.surface.faces, positions, faces, vertex_colors=colors)
+        )
+        axis.set(title=f"{name}\nstretch: blue 1, grey {BAR}, red {2 * BAR - 1:.2f}")
+        axis.axis("off")
+    curve = axes[2]
+    curve.semilogy(cost * np.arange(1, len(losses) + 1), np.minimum.accumulate(losses), label="L-BFGS")
+    curve.semilogy(np.minimum.accumulate(free), label="Nelder-Mead")
+    curve.set(xlabel="evaluations of the loss (a gradient counts by its time)", ylabel="lowest loss [1e-4]")
+    curve.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Train a small network frame by frame, and through time.
+
+    python experiments/inverse/unroll.py [--smoke] [--out DIR]
+
+The network simulates a swinging sheet alone, from its own states. Three losses, the same steps and motions:
+- "per frame": the potential of every frame, each from a given state (as `eslr train` does);
+- "potential through time": the same sum, with gradients through the states that a frame hands on;
+- "distance through time": the squared distance from the solver's motion, gradients through the states.
+Judged on a longer motion that none has seen. Writes unroll.json and unroll.png.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import optax
+from sheet import TIMESTEP, held_scene, keep, parse_options, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.gap import trajectory_gap
+from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.types import Scene
+
+SIDE, SIZE = 7, 0.24  # vertices, [m]
+FRAMES, TEST_FRAMES = 9, 25
+FABRIC = COTTON.replace(bending_stiffness=8e-4)
+MODEL = dataclasses.replace(MODELS["smooth-small"], latent_size=16, refinement_steps=3)
+ALONE, SOLVER = SimConfig(model=MODEL, iterations=0), SimConfig(iterations=150)
+ENERGY, DISTANCE = 1e-3, 1e-2  # [J], [m]: units of the losses
+LOSSES = ("per frame", "potential through time", "distance through time")
+GARMENT = square(SIDE, SIZE, [0, SIDE - 1])
+
+
+def make_scene(seed: int, num_frames: int) -> Scene:
+    """Return the sheet with one of its two pinned corners swung in a direction of its own."""
+    random = np.random.default_rng(seed)
+    swing = np.sin(2 * np.pi * TIMESTEP * np.arange(num_frames) / random.uniform(0.3, 0.6))
+    shift = np.zeros((num_frames, SIDE * SIDE, 3), np.float32)
+    shift[:, 0] = random.uniform(-0.04, 0.04, 3) * swing[:, None]
+    return held_scene(GARMENT, jnp.asarray(shift), FABRIC)
+
+
+def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
+    """Return every frame's potential [J] where the network's own motion ended it.
+
+    Args:
+        params: Weights of the network.
+        scene: The sheet.
+        is_detached: Stop gradients between frames.
+    """
+    step = make_stepper(params, ALONE)
+
+    def advance(state, inputs):
+        if is_detached:
+            state = jax.lax.stop_gradient(state)
+        state, report = step(frame_problem(scene, state, inputs), state)
+        return state, sum(report.terms)
+
+    return jax.lax.scan(advance, scene.initial_state, frame_inputs(scene))[1]
+
+
+def loss(weights, others: dict, scene: Scene, solved: jax.Array, *, kind: str) -> jax.Array:
+    """Return one of the three losses, without unit."""
+    params = {**others, "params": weights}
+    if kind == "distance through time":
+        apart = rollout_scene(params, scene, ALONE).positions - solved
+        return jnp.mean(jnp.sum(apart**2, axis=-1)) / DISTANCE**2
+    return jnp.mean(potentials(params, scene, is_detached=kind == "per frame")) / ENERGY
+
+
+def train(
+    kind: str, scenes: list[Scene], solved: list[jax.Array], steps: int
+) -> tuple[dict, float, list[float]]:
+    """Return trained parameters, the milliseconds of a step, and the norms of its gradients."""
+    params = init_model(MODEL)
+    others = {name: part for name, part in params.items() if name != "params"}
+    weights = params["params"]
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(2e-3, steps))
+    )
+
+    @jax.jit
+    def step(weights, state, scene, solved):
+        gradient = jax.grad(loss)(weights, others, scene, solved, kind=kind)
+        updates, state = optimizer.update(gradient, state)
+        return optax.apply_updates(weights, updates), state, optax.tree.norm(gradient)
+
+    state, norms, times = optimizer.init(weights), [], []
+    for index in range(steps):
+        began = time.perf_counter()
+        row = index % len(scenes)
+        weights, state, norm = step(weights, state, scenes[row], solved[row])
+        norms.append(float(norm))
+        times.append(1e3 * (time.perf_counter() - began))
+    return {**others, "params": weights}, float(np.median(times)), norms
+
+
+def judge(params, scene: Scene, solved: jax.Array) -> dict:
+    """Return the network's distance from the solver's motion by frame [mm], and its optimality gap."""
+    trajectory = rollout_scene(params, scene, ALONE)
+    apart = jnp.sqrt(jnp.mean(jnp.sum((trajectory.positions - solved) ** 2, axis=-1), axis=-1))
+    gap = trajectory_gap(trajectory, scene, every=1)
+    return {
+        "rms_mm": np.round(1e3 * np.asarray(apart, float), 3),
+        "gap_mj": round(float(jnp.median(gap.reached - gap.optimum)) * 1e3, 4),
+        "stretch_mj": round(float(jnp.mean(trajectory.terms.stretch)) * 1e3, 4),
+    }
+
+
+def main() -> None:
+    """Train with every loss and judge all on the same motion."""
+    options = parse_options(__doc__)
+    steps, count, seen = (2, 1, 3) if options.smoke else (150, 12, FRAMES)
+    kinds = LOSSES[2:] if options.smoke else LOSSES
+    scenes = [make_scene(seed, seen) for seed in range(count)]
+    solved = [rollout_scene(None, scene, SOLVER).positions for scene in scenes]
+    test = make_scene(1000, 3 if options.smoke else TEST_FRAMES)
+    truth = rollout_scene(None, test, SOLVER).positions
+    result = {"steps": steps, "untrained": judge(init_model(MODEL), test, truth)}
+    figure, (error, slope) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
+    error.plot(result["untrained"]["rms_mm"], "k:", label="untrained")
+    for kind in kinds:
+        params, milliseconds, norms = train(kind, scenes, solved, steps)
+        result[kind] = {"step_ms": round(milliseconds, 2), **judge(params, test, truth)}
+        error.plot(result[kind]["rms_mm"], label=kind)
+        slope.semilogy(norms, label=kind)
+    error.axvline(seen - 1, color="0.7", linewidth=1)
+    error.set(
+        xlabel="frame (training ends at the line)", ylabel="distance from the solver, rms [mm]", yscale="log"
+    )
+    slope.set(xlabel="step", ylabel="norm of the gradient")
+    for axis in (error, slope):
+        axis.legend()
+    keep(options.out, Path(__file__).stem, result, figure)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""How a garment sits, and the words for it: a square of cloth over a ball."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import RADIUS, drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import trajectory_report
+from eslr_jax.evaluation.wear import wear_report
+from eslr_jax.evaluation.words import describe_report
+from eslr_jax.scene.build import skin_garment
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+
+
+@pytest.fixture(scope="module")
+def worn():
+    """A square that covers the top of the ball, its scene and its place when it is skinned."""
+    garment, poses = square(), drifting_ball(3)
+    scene = prepare_scene(garment, poses)
+    trajectory = rollout_scene(None, scene, SimConfig(iterations=12))
+    return garment, poses, scene, trajectory, np.asarray(skin_garment(garment, poses.joint_transforms))
+
+
+def report_of(worn, positions):
+    garment, poses, scene, trajectory, skinned = worn
+    moved = trajectory.replace(positions=jnp.asarray(positions, jnp.float32))
+    rest = {"error": None, "tolerance": 0.01, "within_tolerance": 1.0}
+    parts = (np.zeros(len(garment.faces), int), ("scarf",))
+    return (
+        rest | trajectory_report(moved, scene, parts=parts) | wear_report(positions, garment, skinned, poses)
+    )
+
+
+def test_cloth_in_its_place_is_good(worn):
+    report = report_of(worn, worn[4])
+    assert report["slide_m"] == pytest.approx(0.0, abs=1e-6)
+    assert report["coverage"] == 1.0
+    assert report["skin_through_mm"] == pytest.approx(0.0, abs=1e-3)
+    words = describe_report(report)
+    assert words.warnings == []
+    assert "within 1 % of the optimum on every frame" in words.good
+    assert "no skin shows through the cloth" in words.good
+
+
+def test_skin_through_cloth_is_measured_and_told(worn):
+    sunk = worn[4].copy()
+    sunk[2, :, 1] -= 0.010  # 4 mm above the ball's top before: 6 mm below it now
+    report = report_of(worn, sunk)
+    assert report["skin_through_mm"] == pytest.approx(6.0, abs=0.1)
+    assert report["worst_skin_through"]["frame"] == 2
+    top = np.asarray(worn[1].rest_positions)[report["worst_skin_through"]["body_vertex"]]
+    np.testing.assert_allclose(top, [0, RADIUS, 0], atol=1e-6)
+    assert any(
+        "skin shows through the cloth, by up to 6.0 mm, frame 2 (0.07 s)" in text
+        for text in describe_report(report).warnings
+    )
+
+
+def test_penetration_and_stretch_name_frame_part_and_vertex(worn):
+    pulled = worn[4].copy()
+    pulled[1, 0] += [-0.06, 0.0, 0.0]
+    pulled[2, 27, 1] -= 0.02
+    report = report_of(worn, pulled)
+    assert report["worst_penetration"] == {
+        "frame": 2,
+        "time_s": pytest.approx(2 / 30),
+        "vertex": 27,
+        "part": "scarf",
+    }
+    assert report["worst_stretch"]["frame"] in (1, 2)
+    warnings = describe_report(report).warnings
+    assert any("mm inside the body, frame 2 (0.07 s), part scarf, vertex 27" in text for text in warnings)
+    assert any("cloth is stretched by" in text and "part scarf" in text for text in warnings)
+
+
+def test_cloth_that_slides_or_falls_is_told(worn):
+    slid, fallen = worn[4].copy(), worn[4].copy()
+    slid[2] += [0.3, 0.0, 0.0]
+    fallen[1:, :, 1] -= 1.0
+    report = report_of(worn, slid)
+    assert report["slide_m"] == pytest.approx(0.3, abs=1e-5)
+    assert any(
+        "its centre is 0.30 m from its place, frame 2" in text for text in describe_report(report).warnings
+    )
+    report = report_of(worn, fallen)
+    assert report["below_feet_at"] == 1
+    assert report["coverage"] == 0.0
+    assert "the garment fell off: in frame 1 it is below the feet" in describe_report(report).warnings
