@@ -61,6 +61,9 @@ def test_devices_and_processes_do_not_change_the_losses(tmp_path):
         finish(process, tmp_path / "pair")
     expected = losses(tmp_path / "one")
     assert expected.shape == (3, 2)
-    np.testing.assert_allclose(losses(tmp_path / "four"), expected, rtol=1e-5)
-    np.testing.assert_allclose(losses(tmp_path / "pair"), expected, rtol=1e-5)
+    for name in ("four", "pair"):
+        found = losses(tmp_path / name)
+        np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-5)
+        # Sums in another order: Adam turns the rounding of a gradient near zero into a step of full length.
+        np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=1e-3)
     assert (tmp_path / "pair" / "model.npz").exists()
