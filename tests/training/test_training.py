@@ -67,6 +67,7 @@ def test_weights_move_as_far_as_adam_takes_them(finished, config):
     assert sum(value > 0.0 for value in jax.tree.leaves(moved)) > 0.8 * len(jax.tree.leaves(moved))
 
 
+@pytest.mark.slow
 def test_interrupted_run_resumes_bit_by_bit(finished, config, small_data, tmp_path):
     whole, _ = finished
 
@@ -104,6 +105,7 @@ def test_half_written_checkpoint_is_not_taken(finished):
     assert Checkpoints(folder).latest() == latest
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(finished, config, small_data, tmp_path):
     _, folder = finished
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
