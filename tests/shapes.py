@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import beartype
+from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
 
 KERNELS = [
@@ -23,12 +23,15 @@ KERNELS = [
 ]
 
 
+_checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+
+
 def check(function: Callable) -> Callable:
     """Return the function with its arguments and its result checked.
 
     Constructors are let through: JAX fills pytrees with axes, masks and shapes as it maps over them.
     """
-    return function if function.__name__ == "__init__" else beartype.beartype(function)
+    return function if function.__name__ == "__init__" else _checked(function)
 
 
 def check_kernels() -> None:

@@ -22,7 +22,7 @@ repulsion = jax.jit(jax.value_and_grad(repulsion_energy))
 push = jax.jit(push_apart)
 
 
-def make_cloth(rows=30, columns=10, spacing=0.012):
+def make_cloth(rows=24, columns=8, spacing=0.012):
     """A sheet whose rows lie along x."""
     return make_garment(*make_sheet(columns, rows, spacing, jitter=0))
 
@@ -128,9 +128,8 @@ def found_pairs(garment, contacts):
     return {(v, table[tuple(sorted(c))]): side for v, c, side in rows}
 
 
-@pytest.mark.parametrize("gap", [0.006, 0.012])
-def test_pairs_equal_brute_force(cloth, gap):
-    position = roll_up(cloth, gap)
+def test_pairs_equal_brute_force(cloth):
+    position = roll_up(cloth)
     velocity = np.random.default_rng(1).normal(scale=5e-3, size=position.shape)
     predicted = position + velocity
     contacts = find_self_contacts(
