@@ -95,12 +95,14 @@ def test_fabrics_are_listed_with_their_sources():
     assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
 
 
+@pytest.mark.slow
 def test_render_and_view_refuse_what_is_no_run(tmp_path):
     refused(eslr("render", tmp_path, "--out", tmp_path / "a.gif"), ".mp4", ".png")
     refused(eslr("render", tmp_path, "--out", tmp_path / "a.png"), "is no run")
     refused(eslr("view", tmp_path), "is no run")
 
 
+@pytest.mark.slow
 def test_fit_refuses_what_it_cannot_do(tmp_path, body):
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
     refused(eslr("fit", scan, "--out", tmp_path / "shirt.obj"), "npz")

@@ -18,7 +18,7 @@ NORM_EPSILON = 1e-5  # PyTorch's LayerNorm, as in HOOD
 TALL = 512  # rows from which a weight gradient pays for a transposed copy
 
 
-def kernel_spread(gain: float):
+def kernel_spread(gain: float | int):
     """Return an initialiser that fills a kernel with the standard deviation of its weights.
 
     `registry.init_model` multiplies the kernels by normal numbers from NumPy. These are the same on every

@@ -141,7 +141,8 @@ class HierarchicalNetwork(EncodeProcessDecode):
         tables["mesh"] = mesh_tables(graph, encoded.dtype)
         garment = encoded
         for sets, layers in zip(STAGES, self.stages, strict=True):
-            mask = world_mask(graph, encoded.dtype) * kept_vertices(graph, sets)[:, None]
+            kept = kept_vertices(graph, sets)[:, None]
+            mask = jnp.where(kept, world_mask(graph, encoded.dtype), 0.0)
             state = StageLatents(garment, {name: latents[name] for name in sets}, world)
             state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
@@ -162,7 +163,7 @@ class HierarchicalNetwork(EncodeProcessDecode):
 
 def vertex_levels(graph: jraph.GraphsTuple) -> Int[Array, " vertices"]:
     """Return the coarsest level that every vertex is on; 0 is the mesh."""
-    levels = [level.is_kept * (k + 1) for k, level in enumerate(graph.globals["coarse"])]
+    levels = [jnp.where(level.is_kept, k + 1, 0) for k, level in enumerate(graph.globals["coarse"])]
     return jnp.max(jnp.stack(levels), axis=0)
 
 

@@ -60,7 +60,7 @@ class EncodeProcessDecode(TwoBranches):
         if config.features == "hood":
             self.type_embedding = self.param(
                 "type_embedding",
-                kernel_spread(float(features.NUM_TYPES)),
+                kernel_spread(features.NUM_TYPES),
                 (features.NUM_TYPES, features.NUM_TYPES),
             )
             self.garment_encoder = encoder(sizes["garment"] + features.NUM_TYPES)

@@ -305,7 +305,7 @@ def _new_statistics(config: ModelConfig) -> Statistics:
 
 def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Places]:
     """Return the smallest graph that touches every weight: one edge, two body points."""
-    sizes, zeros, pair = feature_sizes(config), jnp.zeros, jnp.arange(2)
+    sizes, zeros, pair = feature_sizes(config), functools.partial(jnp.zeros, dtype=jnp.float32), jnp.arange(2)
     worlds = ("world", "world_reverse") if config.update_body else ("world",)
     graph = jraph.GraphsTuple(
         nodes={"garment": zeros((2, sizes["garment"])), "body": zeros((2, sizes["body"]))},
@@ -315,8 +315,8 @@ def _example(config: ModelConfig) -> tuple[jraph.GraphsTuple, Places]:
         globals={
             "reverse_edges": pair[::-1],
             "incoming_edges": pair[:, None],
-            "garment_type": zeros(2, jnp.int32),
-            "body_type": zeros(2, jnp.int32),
+            "garment_type": jnp.zeros(2, jnp.int32),
+            "body_type": jnp.zeros(2, jnp.int32),
             "world_mask": jnp.ones(2, bool),
         },
         n_node=None,

@@ -99,8 +99,9 @@ def test_gradient_matches_that_of_plain_code_in_float64(name):
     few = {"message_passing_steps": 1, "smoothing_steps": 2, "attention_blocks": 1}
     config = dataclasses.replace(VARIANTS[name.removesuffix("-free")], **few)
     scene = make_scene(6, 4, body=not name.endswith("-free"))
+    single = (*scene, weights(config))
     with jax.enable_x64(True):
-        *scene, params = (tree_cast(tree, jnp.float64) for tree in (*scene, weights(config)))
+        *scene, params = (tree_cast(tree, jnp.float64) for tree in single)
         graph = quick_jit(build_graph, static_argnums=3)(*scene, config)
         direction = np.random.default_rng(0).standard_normal(scene[0].rest_positions.shape)
 
@@ -146,7 +147,7 @@ def test_a_change_spreads_layers_times_one_plus_smoothings_hops(sizes, scene):
         GRADIENT, message_passing_steps=layers, smoothing_steps=smoothings, attention_blocks=0
     )
     graph = run(SMOOTHING, weights(SMOOTHING), *scene)[1]  # the features are the same
-    nudged = graph.nodes["garment"].at[0].add(1.0)
+    nudged = graph.nodes["garment"].at[0].add(10.0)  # far enough for float32 to show the farthest
     moved = graph._replace(nodes={**graph.nodes, "garment": nudged})
     first, second = (apply(config, weights(config), rows, scene[0]) for rows in (graph, moved))
     reached = np.abs(second - first).max(axis=1) > 0

@@ -127,6 +127,7 @@ def test_ten_hanging_frames_have_right_gradients_by_every_parameter():
     check_every_parameter(small_scene(11, has_body=False), 1e-3)
 
 
+@pytest.mark.slow
 def test_forward_mode_agrees_with_reverse_mode():
     scene = small_scene(2, has_body=False)
 
@@ -155,6 +156,7 @@ def test_the_linear_system_reports_what_it_did():
     assert bool(jax.jit(solve_hessian)(problem, crushed, force).is_indefinite)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["subspace", "descent"])
 def test_a_refined_prediction_has_right_gradients(output):
     """Through the combination weights too, which training alone may take as constants."""

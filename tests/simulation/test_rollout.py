@@ -84,6 +84,7 @@ def test_vmap_over_motions_equals_one_by_one(cloth):
         )
 
 
+@pytest.mark.slow
 def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, params, learned):
     wider = cloth.replace(rest_positions=cloth.rest_positions * jnp.array([[1.1, 1.0, 1.1]], jnp.float32))
     other = {**params, "params": jax.tree.map(lambda leaf: 0.5 * leaf, params["params"])}
@@ -95,6 +96,7 @@ def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, params, 
     np.testing.assert_allclose(together[1], run(other, wider, poses).positions, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
     plan = plan_scene(cloth, poses)
     assert not plan.has_pins
@@ -171,6 +173,7 @@ def test_other_values_compile_nothing_anew(cloth, poses):
     assert rollout_scene._cache_size() == before
 
 
+@pytest.mark.slow
 def test_gradient_through_five_frames_of_the_network(cloth):
     """Along the gradient, against central differences."""
     poses = drifting_ball(6)

@@ -105,6 +105,7 @@ def test_half_written_checkpoint_is_not_taken(finished):
     assert Checkpoints(folder).latest() == latest
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(finished, config, small_data, tmp_path):
     _, folder = finished
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
