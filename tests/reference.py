@@ -134,17 +134,3 @@ def hood_friction(position, start, body_before, body, faces, mass, coefficient, 
         cosine = tangential[2] / length if length > 0 else 0.0
         total += mass[v] * np.sqrt(abs(1 - cosine**2) + 1e-4) * length
     return coefficient * acceleration * total
-
-
-# --- derivatives --------------------------------------------------------------------------------------------
-
-
-def central_difference(function, x, step=1e-6):
-    """Return the gradient of a scalar function by central differences, coordinate by coordinate."""
-    gradient = np.zeros_like(x)
-    for index in np.ndindex(x.shape):
-        ahead, behind = x.copy(), x.copy()
-        ahead[index] += step
-        behind[index] -= step
-        gradient[index] = (function(ahead) - function(behind)) / (2 * step)
-    return gradient
