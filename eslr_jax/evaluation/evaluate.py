@@ -23,7 +23,7 @@ from eslr_jax.simulation.simulate import try_simulate
 from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
-_REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the drop from the optimum
+_REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
+from eslr_jax.assets import load_motion
+from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.rest_shape import with_rest_positions
@@ -177,6 +179,39 @@ def test_a_refined_prediction_has_right_gradients(output):
 
     expected = (loss(1.0 + STEP) - loss(1.0 - STEP)) / (2 * STEP)
     assert float(jax.jit(jax.grad(loss))(1.0)) == pytest.approx(float(expected), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshirt, body):
+    """Five frames of a walk at 1k vertices; here contacts may switch."""
+    with jax.enable_x64(False):
+        poses = pose_body(body, load_motion("cmu_016_32"), num_frames=6)
+        scene = prepare_scene(tshirt, poses)
+    scene = tree_cast(jax.tree.map(jnp.asarray, scene), jnp.float64)
+    weights = jnp.asarray(np.random.default_rng(0).standard_normal(scene.initial_state.position.shape))
+
+    @jax.jit
+    def loss(change):
+        material, garment, surroundings = scene.material, scene.garment, scene.body
+        stiffer = material.replace(
+            lame_mu=material.lame_mu * (1 + change["fabric"]),
+            lame_lambda=material.lame_lambda * (1 + change["fabric"]),
+            density=material.density * (1 - change["fabric"]),
+        )
+        shift = change["body"] * jnp.array([[[1.0, 0.0, 0.0]]])
+        moved = scene.replace(
+            material=stiffer,
+            garment=with_rest_positions(garment, garment.rest_positions * (1 + change["rest"])),
+            body=surroundings.replace(positions=surroundings.positions + shift),
+        )
+        trajectory = rollout_scene(None, moved, SimConfig(iterations=3000))
+        return jnp.sum(weights * trajectory.positions[-1]) / 1000 + jnp.sum(trajectory.terms.stretch)
+
+    zeros = dict.fromkeys(("fabric", "body", "rest"), jnp.zeros(()))
+    gradient = jax.jit(jax.grad(loss))(zeros)
+    for name, step in (("fabric", 1e-3), ("body", 1e-5), ("rest", 1e-4)):
+        ends = [float(loss({**zeros, name: jnp.asarray(sign * step)})) for sign in (1.0, -1.0)]
+        assert float(gradient[name]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02), name
 
 
 BY_A_COUNT = """
