@@ -189,7 +189,6 @@ def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshir
         poses = pose_body(body, load_motion("cmu_016_32"), num_frames=6)
         scene = prepare_scene(tshirt, poses)
     scene = tree_cast(jax.tree.map(jnp.asarray, scene), jnp.float64)
-    weights = jnp.asarray(np.random.default_rng(0).standard_normal(scene.initial_state.position.shape))
 
     @jax.jit
     def loss(change):
@@ -206,7 +205,8 @@ def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshir
             body=surroundings.replace(positions=surroundings.positions + shift),
         )
         trajectory = rollout_scene(None, moved, SimConfig(iterations=3000))
-        return jnp.sum(weights * trajectory.positions[-1]) / 1000 + jnp.sum(trajectory.terms.stretch)
+        # Of the whole shirt: single vertices in a fold leave the linear range at once.
+        return jnp.mean(trajectory.positions[-1, :, 0]) + jnp.sum(trajectory.terms.stretch)
 
     zeros = dict.fromkeys(("fabric", "body", "rest"), jnp.zeros(()))
     gradient = jax.jit(jax.grad(loss))(zeros)
