@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import tomllib
 from typing import Any, Literal, TypeVar
 
@@ -247,11 +246,6 @@ def _convert(cls: type, field: dataclasses.Field, value: Any, name: str) -> Any:
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a config as plain values, ready for JSON."""
     return dataclasses.asdict(config)
-
-
-def to_json(config: Any) -> str:
-    """Return a config as JSON text."""
-    return json.dumps(to_dict(config), indent=2)
 
 
 def apply_overrides(values: dict[str, Any], overrides: dict[str, Any]) -> None:

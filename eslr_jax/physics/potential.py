@@ -34,7 +34,7 @@ from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.physics.problem import BodyContact, FrameProblem, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import PotentialTerms
 
@@ -59,7 +59,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
     garment, material, constants = problem.garment, problem.material, problem.constants
     collision = friction = repulsion = jnp.zeros((), position.dtype)
     if problem.body is not None:
-        collision, friction = _body_energies(position, problem)
+        collision, friction = _body_energies(position, problem, problem.body)
     if problem.layers is not None:
         layers = problem.layers
         repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
@@ -75,12 +75,10 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
 
 
 def _body_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem
+    position: Float[Array, "vertices 3"], problem: FrameProblem, body: BodyContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a body [J]."""
-    body, constants = problem.body, problem.constants
-    if body is None:
-        raise ValueError("a frame without a body has no energies of contact with it")
+    constants = problem.constants
     collision = sum(
         collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
         for contacts in (body.nearest, body.opposing)
