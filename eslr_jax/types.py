@@ -138,6 +138,14 @@ class BodyMotion:
     surface: BodySurface  # all obstacle faces; a scene may search fewer, see `scene.plan_scene`
 
 
+class PastState(NamedTuple):
+    """The cloth one frame ago."""
+
+    position: Float[Array, "vertices 3"]  # [m]
+    velocity: Float[Array, "vertices 3"]  # [m/s]
+    is_known: Bool[Array, ""]  # False before the first frame: that one is stepped by implicit Euler
+
+
 @struct.dataclass
 class ClothState:
     """What changes from frame to frame."""
@@ -148,6 +156,7 @@ class ClothState:
     frame: Int[Array, ""]  # index of this frame
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # -1 while status is OK
+    past: PastState | None = None  # at t - 1, for BDF2; None: implicit Euler
 
 
 @struct.dataclass

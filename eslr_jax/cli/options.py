@@ -40,6 +40,7 @@ class Options:
     loop: str | None
     settle: int
     self_contact: bool
+    integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
 
 
 def interrupted_record(

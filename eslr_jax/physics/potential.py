@@ -66,7 +66,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
-        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.timestep),
+        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.inertial_timestep),
         gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
         collision=collision,
         friction=friction,

@@ -54,7 +54,7 @@ def hessian_diagonal(
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     garment, constants = problem.garment, problem.constants
-    diagonal = problem.masses / problem.timestep**2 + stretch_diagonal(garment, problem.material)
+    diagonal = problem.masses / problem.inertial_timestep**2 + stretch_diagonal(garment, problem.material)
     if problem.body is not None:
         body = problem.body
         depth = penetration(position, body.nearest, body.thickness)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -42,19 +44,34 @@ class SelfContact:
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
 
 
+class SecondOrder(NamedTuple):
+    """What BDF2 puts in the place of a frame's first positions and timestep, see `simulation.frame`."""
+
+    origin: Float[Array, "vertices 3"]  # [m]
+    timestep: Float[Array, ""]  # [s]
+
+
 @struct.dataclass
 class FrameProblem:
-    """One step of implicit Euler as a minimisation. A part that is None is not modelled."""
+    """One step of implicit Euler, or of BDF2, as a minimisation. A part that is None is not modelled."""
 
     garment: Garment
     material: Material
     constants: PhysicsConstants
     timestep: Float[Array, ""]  # [s]
     position: Float[Array, "vertices 3"]  # at t [m]
-    inertial_guess: Float[Array, "vertices 3"]  # position + timestep * velocity [m]
+    inertial_guess: Float[
+        Array, "vertices 3"
+    ]  # where inertia alone takes the cloth [m], see `simulation.frame`
     body: BodyContact | None = None
     layers: SelfContact | None = None
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
+    bdf2: SecondOrder | None = None  # None: implicit Euler
+
+    @property
+    def inertial_timestep(self) -> Float[Array, ""]:
+        """Time for which a frame's acceleration acts [s]."""
+        return self.timestep if self.bdf2 is None else self.bdf2.timestep
 
     @property
     def masses(self) -> Float[Array, " vertices"]:

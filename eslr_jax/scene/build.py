@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -15,10 +17,14 @@ from eslr_jax.types import (
     Garment,
     Material,
     PairCapacity,
+    PastState,
     PhysicsConstants,
     Scene,
     SceneBody,
 )
+
+Integrator = Literal["euler", "bdf2"]
+"""Implicit Euler is the paper's, and networks are trained with it. BDF2, of second order, keeps motion alive."""
 
 
 @struct.dataclass
@@ -32,6 +38,7 @@ class ScenePlan:
         pytree_node=False, default=False
     )  # else frame 0 moves as the body does
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
+    integrator: Integrator = struct.field(pytree_node=False, default="euler")
 
 
 def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: ScenePlan) -> Scene:
@@ -57,7 +64,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         garment=garment,
         material=material,
         constants=plan.constants,
-        initial_state=initial_state(position, velocity),
+        initial_state=start_integrator(initial_state(position, velocity), plan.integrator),
         timestep=poses.timestep,
         body=body,
         pin_targets=skinned if plan.has_pins else None,
@@ -95,6 +102,14 @@ def skin_garment(
 def skin_frame(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
     """Return the garment carried by the joints of one frame [m], shape [vertices, 3]."""
     return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
+
+
+def start_integrator(state: ClothState, integrator: Integrator) -> ClothState:
+    """Return a state without a past, from which an integrator can begin."""
+    if integrator == "euler":
+        return state.replace(past=None)
+    nothing = jnp.zeros_like(state.position)
+    return state.replace(past=PastState(nothing, nothing, jnp.zeros((), bool)))
 
 
 def initial_state(position: Float[Array, "vertices 3"], velocity: Float[Array, "vertices 3"]) -> ClothState:

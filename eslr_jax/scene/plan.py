@@ -15,7 +15,7 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import ScenePlan, build_scene, skin_garment, slice_tracks
+from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
@@ -34,6 +34,7 @@ class SceneOptions:
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
     self_contact: bool = False  # keep layers of cloth apart
+    integrator: Integrator = "euler"
 
 
 def plan_scene(
@@ -72,6 +73,7 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
+        integrator=options.integrator,
     )
 
 
