@@ -169,6 +169,7 @@ class Contacts:
     next_normals: Float[Array, "vertices 3"]  # at t + 1
     distances: Float[Array, " vertices"]  # signed distance of the vertex at t, positive outside [m]
     is_near: Bool[Array, " vertices"]  # close enough for the tangent plane to stand for the body
+    faces: Int[Array, " vertices"]  # of the body surface, that hold the points
 
 
 @struct.dataclass
@@ -177,6 +178,7 @@ class SceneBody:
 
     surface: BodySurface
     positions: Float[Array, "frames surface_vertices 3"]  # [m], in the order of the surface
+    has_skin: bool = struct.field(pytree_node=False, default=False)  # its vertices keep off the cloth's faces
     is_sharp: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
 
 

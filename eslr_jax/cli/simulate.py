@@ -168,7 +168,9 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         check_skin(options.garment, cloth, rig, options.body)
         settling = with_settling(poses, options.settle)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
-        modelled = SceneOptions(self_contact=options.self_contact, integrator=integrator)
+        modelled = SceneOptions(
+            self_contact=options.self_contact, has_skin=method.config.iterations > 0, integrator=integrator
+        )
         scene = prepare_scene(cloth, settling, material=material, options=modelled)
         if scene.body is not None:
             check_speed(poses, MAX_APPROACH, vertices=np.asarray(scene.body.surface.vertex_ids))

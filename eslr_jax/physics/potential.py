@@ -29,12 +29,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.physics.bending import bending_energy
-from eslr_jax.physics.collision import collision_energy, contact_forces
+from eslr_jax.physics.collision import collision_energy, contact_forces, skin_energy
 from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import BodyContact, FrameProblem, pin
+from eslr_jax.physics.problem import BodyContact, FrameProblem, mean_vertex_area, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import PotentialTerms
 
@@ -83,6 +83,10 @@ def _body_energies(
         collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
         for contacts in (body.nearest, body.opposing)
     )
+    if body.skin is not None:
+        area = mean_vertex_area(problem.garment)
+        thickness = constants.collision_thickness
+        collision += skin_energy(position, body.skin, area, constants.collision_stiffness, thickness)
     if body.tips is not None:
         collision = collision + repulsion_energy(
             position,

@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.repulsion import push_apart
@@ -33,6 +34,7 @@ class BodyContact:
     opposing: Contacts  # with the body part on the other side of the cloth
     friction_load: Float[Array, " vertices"]  # normal force at t [N]
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
+    skin: SkinContacts | None = None  # None: skin may show between vertices
     tips: TipContact | None = None  # None: a tip may pass between vertices
 
 
@@ -89,9 +91,13 @@ def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> 
         garment: Rest mesh; its mean vertex area gives the spacing.
         thickness: Distance that a smooth sheet would keep [m].
     """
-    mean_area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_area  # of equilateral triangles, two per vertex
+    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_vertex_area(garment)  # of equilateral triangles, two per vertex
     return thickness + squared_edge / (8.0 * _LIMB_RADIUS)
+
+
+def mean_vertex_area(garment: Garment) -> Float[Array, ""]:
+    """Return the area of cloth that a vertex stands for in the mean [m^2]."""
+    return jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
 
 
 def weight_norm(problem: FrameProblem) -> Float[Array, ""]:

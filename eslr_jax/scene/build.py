@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.body import lbs
 from eslr_jax.contact.nearest import clear_of_body
+from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.types import (
     BodyMotion,
     BodySurface,
@@ -38,6 +39,7 @@ class ScenePlan:
         pytree_node=False, default=False
     )  # else frame 0 moves as the body does
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
+    has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
 
 
@@ -55,8 +57,10 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     skinned = skin_garment(garment, poses.joint_transforms)
     position, body = skinned[0], None
     if plan.surface is not None:
-        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids])
+        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids], has_skin=plan.has_skin)
         position = clear_of_body(position, body.positions[0], plan.surface, garment)
+        if plan.has_skin:
+            position = lift_off_skin(position, body.positions[0], plan.surface, garment)
     velocity = (skinned[1] - skinned[0]) / poses.timestep
     if plan.starts_at_rest:
         velocity = jnp.zeros_like(velocity)

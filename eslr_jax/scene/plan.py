@@ -34,6 +34,7 @@ class SceneOptions:
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
     self_contact: bool = False  # keep layers of cloth apart
+    has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
     integrator: Integrator = "euler"
 
 
@@ -73,6 +74,7 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
+        has_skin=options.has_skin,
         integrator=options.integrator,
     )
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
+from eslr_jax.contact.skin import find_skin_contacts
 from eslr_jax.physics.problem import (
     BodyContact,
     FrameProblem,
@@ -105,7 +106,10 @@ def _body_contact(
     """Return the contact of a frame with the scene's body."""
     garment, constants = problem.garment, problem.constants
     nearest, opposing = find_both_sides(problem.position, step.start, step.end, body.surface)
-    tips = None
+    skin = tips = None
+    if body.has_skin:
+        cloth = (problem.position, problem.inertial_guess)
+        skin = find_skin_contacts(cloth, (step.start, step.end), nearest, body.surface, garment)
     if body.is_sharp:
         pairs = find_tip_contacts(problem.position, problem.inertial_guess, step.start, step.end, garment)
         tips = TipContact(pairs, step.end)
@@ -114,5 +118,6 @@ def _body_contact(
         opposing=opposing,
         friction_load=friction_load,
         thickness=contact_thickness(garment, constants.collision_thickness),
+        skin=skin,
         tips=tips,
     )
