@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import components, dot3, sub3
+from eslr_jax.numerics import Vector3, components, dot3, sub3
 from eslr_jax.types import Contacts, Garment
 
 
 def penetration(
-    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
+    position: Float[Array, "vertices 3"] | Vector3, contacts: Contacts, thickness: Float[Array, ""] | float
 ) -> Float[Array, " vertices"]:
     """Return max(thickness - d, 0) [m], d the height over the tangent plane at t + 1; zero where far."""
     offset = sub3(components(position), components(contacts.next_points))
@@ -19,7 +19,7 @@ def penetration(
 
 
 def collision_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     contacts: Contacts,
     garment: Garment,
     stiffness: Float[Array, ""] | float,
