@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.skin import SkinContacts, skin_heights
-from eslr_jax.numerics import components, dot3, segment_sum, sub3
+from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3
 from eslr_jax.types import Contacts, Garment
 
 
 def penetration(
-    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
+    position: Float[Array, "vertices 3"] | Vector3, contacts: Contacts, thickness: Float[Array, ""] | float
 ) -> Float[Array, " vertices"]:
     """Return max(thickness - d, 0) [m], d the height over the tangent plane at t + 1; zero where far."""
     offset = sub3(components(position), components(contacts.next_points))
@@ -20,7 +20,7 @@ def penetration(
 
 
 def collision_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     contacts: Contacts,
     garment: Garment,
     stiffness: Float[Array, ""] | float,
@@ -44,14 +44,14 @@ def collision_energy(
 
 
 def skin_depths(
-    position: Float[Array, "vertices 3"], skin: SkinContacts, thickness: Float[Array, ""] | float
+    position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts, thickness: Float[Array, ""] | float
 ) -> Float[Array, " rows"]:
     """Return max(thickness - d, 0) [m], d the height of the cloth's face over the skin; zero where far."""
     return jnp.where(skin.is_near, jnp.maximum(thickness - skin_heights(position, skin), 0.0), 0.0)
 
 
 def skin_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     skin: SkinContacts,
     area: Float[Array, ""],
     stiffness: Float[Array, ""] | float,

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import Vector3, components
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import collision_energy, contact_forces, skin_energy
 from eslr_jax.physics.friction import friction_energy
@@ -55,9 +56,10 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
             so that the gradient vanishes there.
         problem: The frame's problem.
     """
-    position = pin(problem, position)
+    # Split once: the gradients of all terms are then summed by components, and joined once.
+    position = components(pin(problem, position))
     garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = jnp.zeros((), position.dtype)
+    collision = friction = repulsion = jnp.zeros((), position[0].dtype)
     if problem.body is not None:
         collision, friction = _body_energies(position, problem, problem.body)
     if problem.layers is not None:
@@ -75,7 +77,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
 
 
 def _body_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, body: BodyContact
+    position: Vector3, problem: FrameProblem, body: BodyContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a body [J]."""
     constants = problem.constants
