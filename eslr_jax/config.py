@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import json
 import tomllib
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from eslr_jax.errors import ConfigError
 
@@ -92,6 +92,20 @@ class ModelConfig:
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
 
 
+@runtime_checkable
+class Predictor(Protocol):
+    """A network of one's own, such as a Flax module: hashable, and without state besides its weights."""
+
+    def apply(self, params: Any, problem: Any, state: Any, /) -> Any:
+        """Return positions at t + 1 [m], shape [vertices, 3]; pinned vertices are put in place afterwards.
+
+        Args:
+            params: Its weights.
+            problem: The frame's `physics.problem.FrameProblem`.
+            state: Cloth at t, a `types.ClothState`.
+        """
+
+
 @dataclasses.dataclass(frozen=True)
 class SimConfig:
     """How a frame is solved; static, so a change compiles anew.
@@ -100,7 +114,7 @@ class SimConfig:
     `iterations=0` then leaves the prediction as it is.
     """
 
-    model: ModelConfig | None = None  # architecture of the network; None: no network
+    model: ModelConfig | Predictor | None = None  # architecture, or a network of one's own; None: no network
     iterations: int = 100  # of L-BFGS per frame, at most
     # A frame's iterations stop where its optimality gap is estimated to be below this share of the initial gap;
     # 0.01 is kept on 99 % of frames.

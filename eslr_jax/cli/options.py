@@ -40,6 +40,7 @@ class Options:
     loop: str | None
     settle: int
     self_contact: bool
+    ground: Literal["auto", "on", "off"]
 
 
 def interrupted_record(

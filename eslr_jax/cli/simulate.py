@@ -47,6 +47,7 @@ def simulate(
     loop: str | None = None,
     settle: int = 0,
     self_contact: bool = False,
+    ground: Literal["auto", "on", "off"] = "auto",
     out: Path = Path("out"),
     resume: bool = False,
     pictures: bool = True,
@@ -89,6 +90,7 @@ def simulate(
         loop: How long to repeat the motion: frames or a time, such as 30s.
         settle: Frames in which the garment settles on the first pose before frame 0; they are not kept.
         self_contact: Keep layers of cloth apart.
+        ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
         out: Folder to write to.
         resume: Go on with the simulation that was interrupted in this folder, with its own options.
         pictures: Render the contact sheet.
@@ -177,7 +179,10 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         check_skin(options.garment, cloth, rig, options.body)
         settling = with_settling(poses, options.settle)
         scene = prepare_scene(
-            cloth, settling, material=material, options=SceneOptions(self_contact=options.self_contact)
+            cloth,
+            settling,
+            material=material,
+            options=SceneOptions(self_contact=options.self_contact, ground=options.ground),
         )
         if scene.body is not None:
             check_speed(poses, MAX_APPROACH, vertices=np.asarray(scene.body.surface.vertex_ids))
@@ -250,6 +255,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "simulator": simulator,
             "model": model,
             "self_contact": options.self_contact,
+            "ground_m": None if scene.ground is None else float(scene.ground),
             "interrupted_at": {"frame": count - 1, "time_s": (count - 1) * timestep}
             if is_unfinished
             else None,
@@ -315,6 +321,7 @@ def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
         timestep=float(poses.timestep),
         body=body,
         friction_loads=np.asarray(trajectory.friction_loads),
+        ground=None if scene.ground is None else float(scene.ground),
         material=jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scene.material),
     )
     write_trajectory(out / "trajectory.npz", file)

@@ -19,7 +19,7 @@ _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
-_CLEARANCE = 2e-3  # [m] at which they leave it; the collision thickness
+CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 
 
@@ -306,7 +306,7 @@ def clear_of_body(
         contacts = find_contacts(position, body, body, surface)
         height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
         height = jnp.minimum(height, contacts.distances)
-        lift = jnp.where(contacts.is_near, jnp.maximum(_CLEARANCE - height, 0.0), 0.0)
+        lift = jnp.where(contacts.is_near, jnp.maximum(CLEARANCE - height, 0.0), 0.0)
         lift = jnp.where(garment.is_pinned, 0.0, lift)
         return position + lift[:, None] * contacts.normals
 

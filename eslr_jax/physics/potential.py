@@ -18,6 +18,8 @@ published losses for its tables. Side by side, from x_t to x_{t+1}:
 |           | at t, u in the tangent plane                  | contact force; s a slope against the z axis |
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
 | repulsion | between layers of cloth, where they can meet  | none                                        |
+| ground    | collision and friction as with the body       | none                                        |
+| own       | terms that the scene was given                | none                                        |
 """
 
 from __future__ import annotations
@@ -57,12 +59,17 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
     """
     position = pin(problem, position)
     garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = jnp.zeros((), position.dtype)
+    collision = friction = repulsion = own = jnp.zeros((), position.dtype)
     if problem.body is not None:
         collision, friction = _body_energies(position, problem)
+    if problem.ground is not None:
+        on_ground = _ground_energies(position, problem)
+        collision, friction = collision + on_ground[0], friction + on_ground[1]
     if problem.layers is not None:
         layers = problem.layers
         repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+    for energy in problem.energies:
+        own = own + energy(position, problem)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
@@ -71,6 +78,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         collision=collision,
         friction=friction,
         repulsion=repulsion,
+        own=own,
     )
 
 
@@ -102,6 +110,27 @@ def _body_energies(
         constants.friction_speed * problem.timestep,
     )
     return jnp.asarray(collision), friction
+
+
+def _ground_energies(
+    position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the collision and the friction energy of a frame with a ground [J]."""
+    ground, constants = problem.ground, problem.constants
+    if ground is None:
+        raise ValueError("a frame without a ground has no energies of contact with it")
+    collision = collision_energy(
+        position, ground.contacts, problem.garment, constants.collision_stiffness, ground.thickness
+    )
+    friction = friction_energy(
+        position,
+        problem.position,
+        ground.contacts,
+        ground.friction_load,
+        constants.friction_coefficient,
+        constants.friction_speed * problem.timestep,
+    )
+    return collision, friction
 
 
 def potential(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
