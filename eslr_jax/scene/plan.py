@@ -192,9 +192,11 @@ def _could_fall(garment: Garment, poses: BodyMotion) -> bool:
 
 
 def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray) -> bool:
-    """Tell whether a vertex comes as near to the ground as it may stray, in a sample of frames."""
-    height = skinned[_sampled(len(skinned))][:, np.asarray(garment.vertex_mask), 1]
-    return bool((height - radii < float(ground_height(poses))).any())
+    """Tell whether a free vertex comes as near to the ground as it may stray, in a sample of frames."""
+    is_real = np.asarray(garment.vertex_mask)
+    lowest = skinned[_sampled(len(skinned))][:, is_real, 1].min(axis=0) - radii
+    is_free = ~np.asarray(garment.is_pinned)[is_real]
+    return bool((lowest[is_free] < float(ground_height(poses))).any())
 
 
 def _sampled(num_frames: int) -> np.ndarray:

@@ -62,7 +62,7 @@ def test_friction_stops_a_sliding_sheet_after_its_known_way():
 
 
 def test_newton_and_the_solver_find_the_same_minimum_on_the_ground():
-    problem = first_problem(sliding(0.5))
+    problem = jax.jit(first_problem)(sliding(0.5))
     reference = minimize_newton(problem)
     assert reference.is_converged
     found = jax.jit(lambda p: solve(p, start_from_guess(p, initial_guess(p)), iterations=100))(problem)
@@ -92,4 +92,4 @@ def test_scenes_of_a_batch_share_the_ground():
 
 def test_no_ground_is_compiled_where_there_is_none():
     scene = prepare_scene(square(), drifting_ball(), options=SceneOptions(ground="off"))
-    assert first_problem(scene).ground is None
+    assert jax.eval_shape(first_problem, scene).ground is None
