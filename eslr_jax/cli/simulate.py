@@ -151,6 +151,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         raise ConfigError(f"--simulator physics has no network; leave out --model {model}")
     if options.settle < 0:
         raise ConfigError(f"--settle {options.settle}: give a number of frames, 0 or more")
+    if iterations is not None and iterations < 0:
+        raise ConfigError(f"--iterations {iterations}: give a number, 0 or more")
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)
         stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)

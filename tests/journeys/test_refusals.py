@@ -92,14 +92,13 @@ BODY = {"positions": np.zeros((4, 4, 3)), "faces": np.array([[0, 1, 2], [0, 2, 3
 GARMENTS = {
     "empty obj": (text("a.obj", ""), "empty"),
     "obj without faces": (text("a.obj", TRIANGLE), "face"),
-    "obj face beyond the vertices": (text("a.obj", TRIANGLE + "f 1 2 9\n"), "9"),
+    "obj face beyond the vertices": (text("a.obj", TRIANGLE + "f 1 2 9\n"), "outside 0..2"),
     "obj face zero": (text("a.obj", TRIANGLE + "f 0 1 2\n"), "0"),
     "obj with nan": (text("a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "finite"),
     "obj with a huge number": (text("a.obj", "v 1e300 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
     "obj with words for numbers": (text("a.obj", "v a b c\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
     "obj vertex of two numbers": (text("a.obj", "v 1 2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
     "obj of noise": ({"a.obj": bytes(range(256)) * 9}, ""),
-    "obj of one triangle": (text("a.obj", TRIANGLE + "f 1 2 3\n"), ""),
     "obj of one point": (text("a.obj", "v 0 1 0\n" * 3 + "f 1 2 3\n"), ""),
     "obj face of two corners": (text("a.obj", TRIANGLE + "f 1 2\n"), "face"),
     "three faces at an edge": (
@@ -158,7 +157,7 @@ MOTIONS = {
     "amass of two lengths": (arrays("a.npz", **POSES | {"trans": np.zeros((3, 3))}), ""),
     "motion pkl of noise": ({"a.pkl": b"noise"}, ""),
     "a folder for a motion": ({"a.bvh": None}, ""),
-    "a motion of an unknown suffix": (text("a.fbx", "hello"), "BVH"),
+    "a motion of an unknown suffix": (text("a.abc", "hello"), ".bvh"),
     "glb without a clip of that name": ({"a.glb#run": b"glTF" + b"\0" * 20}, ""),
 }  # fmt: skip
 BODIES = {
@@ -197,8 +196,8 @@ OPTIONS = {
     "arms at no angle": (("--arm-abduction", "nan"), ""),
     "arms around the clock": (("--arm-abduction", "1e9"), ""),
     "a rate for a rigged body": (("--body-fps", "30"), "--body-fps"),
-    "betas for another body": (("--betas", "1", "2"), "betas"),
-    "a unit for the bundled body": (("--body-units", "cm"), ""),
+    "betas for another body": (("--betas", *["1"] * 99), "betas"),
+    "a unit for the bundled body": (("--body-units", "cm"), "metres"),
     "minus one iteration": (("--iterations", "-1"), "iterations"),
     "a missing model": (("--model", "missing.npz"), "missing.npz"),
     "an unknown model": (("--model", "eslr-huge"), "eslr-huge"),
