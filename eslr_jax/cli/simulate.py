@@ -262,7 +262,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             if is_unfinished
             else None,
             "error": error,
-            **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names)),
+            **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
             **wear_report(trajectory.positions, scene.garment, skinned, poses),
             "choice": None if choice is None else dataclasses.asdict(choice),
             "tolerance": share,
@@ -363,12 +363,12 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
     for text in words.warnings:
         print(f"warning: {text}")
     table = Table(show_header=False, box=None)
-    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items())
+    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
     rows = {
         "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
         "time": f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation",
         "energy": f"{report['total']:.4f} J a frame ({terms})",
-        "stretch": f"{report['max_principal_stretch']:.3f} at most",
+        "stretch": f"{report['p99_principal_stretch']:.3f} (99 %), {report['max_principal_stretch']:.3f} at most",
     }
     if report["penetration_max_mm"] is not None:
         rows["penetration"] = (
