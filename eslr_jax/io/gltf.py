@@ -4,8 +4,8 @@ glTF is right-handed, Y up, in metres and seconds, as this package is: nothing i
 
 A mesh with a skin becomes a skin: its rest mesh, one node per joint, and their rotations and translations over
 time. What joints can't do, and all of the motion of a mesh without a skin, becomes morph targets: a few principal
-shapes whose weights are animated. Each vertex is within 0.5 mm of its place in every frame. Shapes of less than 6 cm are
-stored in 16 bits (KHR_mesh_quantization); normals follow the largest shapes, to about a degree.
+shapes whose weights are animated. Each vertex is within 0.5 mm of its place in every frame. Shapes of less than
+6 cm are stored in 16 bits (KHR_mesh_quantization); normals follow the largest shapes, to about a degree.
 """
 
 from __future__ import annotations

@@ -172,10 +172,12 @@ def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
 
 def last_state(trajectory: Trajectory) -> ClothState:
     """Return the state that a trajectory without an error ended in."""
-    state = initial_state(trajectory.positions[-1], trajectory.velocities[-1])
-    return state.replace(
-        friction_load=trajectory.friction_loads[-1], frame=jnp.int32(trajectory.num_frames - 1)
+    position, velocity, load = (  # of a file they are NumPy's
+        jnp.asarray(leaf[-1])
+        for leaf in (trajectory.positions, trajectory.velocities, trajectory.friction_loads)
     )
+    state = initial_state(position, velocity)
+    return state.replace(friction_load=load, frame=jnp.int32(trajectory.num_frames - 1))
 
 
 def _scan(
