@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.cli.actor import check_skin, load_actor
-from eslr_jax.cli.budget import parse_request
+from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
 from eslr_jax.cli.options import Options, check_same_scene, interrupted_record, read_interrupted
@@ -137,11 +137,11 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.evaluation.report import environment, trajectory_report
     from eslr_jax.evaluation.wear import wear_report
     from eslr_jax.fabric import beyond_training, garment_material
-    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
     from eslr_jax.io.garment import write_garment_npz
     from eslr_jax.scene.build import skin_garment
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-    from eslr_jax.simulation.budget import SOLVER, choose, keep_budget, read_calibration
+    from eslr_jax.simulation.budget import SOLVER, choose, expected_ms, keep_budget, read_calibration
     from eslr_jax.simulation.simulate import good_frames, last_frames, raise_for_status, try_simulate
 
     simulator, model, iterations = options.simulator, options.model, options.iterations
@@ -155,7 +155,12 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         raise ConfigError(f"--iterations {iterations}: give a number, 0 or more")
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)
-        stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
+        stored = load_garment_file(
+            options.garment,
+            vertices=options.vertices,
+            body=rig,
+            on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
+        )
         if choice is None and (budget_ms is not None or share is not None):
             choice = choose(
                 read_calibration(), len(stored.rest_positions), budget_ms=budget_ms, tolerance=share
@@ -202,6 +207,15 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         iterations=usual if iterations is None else iterations,
         tolerance=0.0 if choice is None else choice.tolerance,
     )
+    num_vertices = len(stored.rest_positions)
+    if num_vertices >= LARGE:
+        method = model if architecture is not None and model is not None else SOLVER
+        frame_ms = (
+            expected_ms(read_calibration(), num_vertices, method, config.iterations)
+            if choice is None
+            else choice.expected_ms
+        )
+        say(describe_load(num_vertices, scene.num_frames, frame_ms))
     pace = None if choice is None or budget_ms is None else keep_budget(choice, budget_ms)
     stop = Interruption("stopping after these frames; Ctrl-C again stops at once and loses them")
     with progress("simulating", scene.num_frames - 1) as advance:
@@ -283,6 +297,12 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     if has_pictures and not is_unfinished:
         _write_sheet(out, np.asarray(trajectory.positions), cloth, poses)
     return report
+
+
+def _say_if_any(text: str | None) -> None:
+    """Print a line on stderr, if there is one."""
+    if text:
+        say(text)
 
 
 def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:

@@ -62,6 +62,7 @@ def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_interrupted_at_any_of_ten_points_it_ends_bit_by_bit_as_the_whole(tmp_path):
     scene = prepare_scene(square(), drifting_ball(115))
     whole = simulate(None, scene, config=SOLVER).trajectory
