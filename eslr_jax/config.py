@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import tomllib
-from typing import Any, Literal, TypeVar
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from eslr_jax.errors import ConfigError
 
@@ -32,7 +33,7 @@ class ModelConfig:
     attention_norm: bool = False  # LayerNorm before attention; keeps q and k small for "softmax"
     attention_feedforward: bool = False  # an MLP behind the attention of every block
     embedding_size: int = 8  # open: k of the geodesic embedding
-    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"
+    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
     features: Literal["hood", "gradient"] = "hood"  # HOOD's, or scaled ones with the potential's gradient
     # "acceleration" changes the state's velocity; "correction" moves the inertial guess. "descent" adds the
     # preconditioned gradient step and the last correction, each with a gate per vertex. "subspace" takes the
@@ -91,6 +92,20 @@ class ModelConfig:
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
 
 
+@runtime_checkable
+class Predictor(Protocol):
+    """A network of one's own, such as a Flax module: hashable, and without state besides its weights."""
+
+    def apply(self, params: Any, problem: Any, state: Any, /) -> Any:
+        """Return positions at t + 1 [m], shape [vertices, 3]; pinned vertices are put in place afterwards.
+
+        Args:
+            params: Its weights.
+            problem: The frame's `physics.problem.FrameProblem`.
+            state: Cloth at t, a `types.ClothState`.
+        """
+
+
 @dataclasses.dataclass(frozen=True)
 class SimConfig:
     """How a frame is solved; static, so a change compiles anew.
@@ -99,7 +114,7 @@ class SimConfig:
     `iterations=0` then leaves the prediction as it is.
     """
 
-    model: ModelConfig | None = None  # architecture of the network; None: no network
+    model: ModelConfig | Predictor | None = None  # architecture, or a network of one's own; None: no network
     iterations: int = 100  # of L-BFGS per frame, at most
     # A frame's iterations stop where its optimality gap is estimated to be below this share of the initial gap;
     # 0.01 is kept on 99 % of frames.
@@ -123,8 +138,8 @@ class SimConfig:
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
-    model: ModelConfig
-    garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
+    model: ModelConfig  # architecture: a table, or `base`, a name that `eslr info` knows, with changes
+    garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
     steps: int = 20_000  # of the optimiser
@@ -151,9 +166,9 @@ class TrainConfig:
     # Energies of which passes count: all, the last one's, or each by the share of its gap that it leaves.
     refinement_weights: Literal["equal", "last", "contraction"] = "equal"
     max_skipped: int = 100  # non-finite updates skipped before training stops
-    log_every: int = 100
-    checkpoint_every: int = 1000
-    seed: int = 0
+    log_every: int = 100  # steps between lines of metrics.jsonl
+    checkpoint_every: int = 1000  # steps
+    seed: int = 0  # of weights, clips and fabrics
 
     def __post_init__(self) -> None:
         """Reject impossible values.
@@ -241,6 +256,29 @@ def _convert(cls: type, field: dataclasses.Field, value: Any, name: str) -> Any:
         if isinstance(origin, type) and isinstance(value, origin):
             return value
     raise ConfigError(f"{name} = {value!r} has the wrong type; expected {hint}")
+
+
+def describe_keys(cls: type, prefix: str = "") -> list[str]:
+    """Return a line for every key of a config: its name, its default, and what its source says of it.
+
+    Args:
+        cls: A frozen dataclass of this module.
+        prefix: What goes before the names, such as "model.".
+    """
+    said: dict[str, str] = {}
+    above: list[str] = []
+    source = Path(__file__).read_text()  # `inspect` would tokenise all of it
+    for line in source.partition(f"\nclass {cls.__name__}:")[2].partition("\n    def ")[0].splitlines():
+        text, _, comment = line.strip().partition("# ")
+        name, is_field, _ = text.partition(": ")
+        if is_field and name.isidentifier() and name in cls.__annotations__:
+            said[name] = " ".join([*above, comment]).strip()
+        above = [*above, comment] if comment and not text else []
+    lines = []
+    for field in dataclasses.fields(cls):
+        is_given = field.default is dataclasses.MISSING
+        lines.append(f"{prefix}{field.name}{'' if is_given else f' = {field.default}'}: {said[field.name]}")
+    return lines
 
 
 def to_dict(config: Any) -> dict[str, Any]:

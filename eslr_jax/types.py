@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 from flax import struct
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -169,7 +170,7 @@ class Contacts:
     next_normals: Float[Array, "vertices 3"]  # at t + 1
     distances: Float[Array, " vertices"]  # signed distance of the vertex at t, positive outside [m]
     is_near: Bool[Array, " vertices"]  # close enough for the tangent plane to stand for the body
-    faces: Int[Array, " vertices"]  # of the body surface, that hold the points
+    faces: Int[Array, " vertices"]  # of the body surface, that hold the points; zero on the ground
 
 
 @struct.dataclass
@@ -203,6 +204,8 @@ class Scene:
     pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
     num_frames: int = struct.field(pytree_node=False)
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
+    ground: Float[Array, ""] | None = None  # height of a level ground [m]
+    energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
 
 
 class PotentialTerms(NamedTuple):
@@ -215,6 +218,7 @@ class PotentialTerms(NamedTuple):
     collision: Float[Array, "*frames"]
     friction: Float[Array, "*frames"]
     repulsion: Float[Array, "*frames"]  # between layers of cloth
+    own: Float[Array, "*frames"]  # of the scene's own terms, see `Scene.energies`
 
 
 @struct.dataclass

@@ -52,9 +52,9 @@ def small_config():
 @pytest.fixture(scope="session")
 def small_scene(small_garment, small_poses):
     """The sleeve on the limb."""
-    from eslr_jax.scene.plan import prepare_scene
+    from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
-    return prepare_scene(small_garment, small_poses)
+    return prepare_scene(small_garment, small_poses, options=SceneOptions(ground="off"))
 
 
 @pytest.fixture(scope="session")

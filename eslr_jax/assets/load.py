@@ -19,7 +19,7 @@ from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_body, make_motion, skeleton_motion
 from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.config import ModelConfig
-from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
@@ -66,7 +66,7 @@ def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Seq
 
     Raises:
         AssetError: There is no such body, the file is damaged, or its unit is unknown.
-        ConfigError: The body has fewer shapes than betas.
+        ConfigError: The body has fewer shapes than betas, or a unit is given and it is always in metres.
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body in the bundled format is not closed, or inside out.
     """
@@ -76,10 +76,13 @@ def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Seq
 
 def _read_body(text: str, units: str | None) -> Body:
     """Return a body by name or file, in its average shape."""
-    if not _is_path(text):
-        return _closed(read_body(find_asset("body", text)), text)
     file, meshes = _split_name(text)
     suffix = Path(file).suffix.lower()
+    is_bundled = not _is_path(text) or (suffix == ".npz" and not is_smpl_model(file))
+    if is_bundled and units is not None:
+        raise ConfigError(f"body {text} is in metres; leave out its unit")
+    if not _is_path(text):
+        return _closed(read_body(find_asset("body", text)), text)
     if suffix in GLTF_SUFFIXES:
         return make_body(read_gltf_body(file, meshes), units=units)
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):

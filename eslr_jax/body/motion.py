@@ -18,6 +18,7 @@ from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.io.skeleton import Skeleton
 from eslr_jax.types import Body, BodyMotion, BodySurface
 
+_MAX_ABDUCTION = 90.0  # [degrees]; arms lifted further are above the shoulders
 _ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is taken to face it
 
 
@@ -93,7 +94,8 @@ def pose_body(
         num_frames: Number of frames to keep; None keeps all.
 
     Raises:
-        MotionError: The motion is for another skeleton or has fewer frames than asked for.
+        MotionError: The motion is for another skeleton or has fewer frames than asked for, or the angle
+            is too large.
     """
     if motion.joint_names != body.joint_names:
         strangers = [name for name in motion.joint_names if name not in body.joint_names]
@@ -111,6 +113,10 @@ def pose_body(
         rotations, translations = rotations[:num_frames], translations[:num_frames]
     if arm_abduction is None:
         arm_abduction = motion.arm_abduction
+    if not -_MAX_ABDUCTION <= arm_abduction <= _MAX_ABDUCTION:
+        raise MotionError(
+            f"arms can't be lifted by {arm_abduction:g} degrees; give {-_MAX_ABDUCTION:g} to {_MAX_ABDUCTION:g}"
+        )
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)

@@ -8,7 +8,7 @@ from typing import Any
 from eslr_jax.cli.options import Options
 from eslr_jax.errors import ConfigError
 
-_FPS = 30.0  # of the simulation
+FPS = 30.0  # of the simulation
 
 
 def load_actor(options: Options) -> tuple[Any, Any, str]:
@@ -37,9 +37,9 @@ def load_actor(options: Options) -> tuple[Any, Any, str]:
     changes = None if options.joint_map is None else read_joint_map(options.joint_map)
     clip = load_motion(motion, body=rig, joint_map=changes, up=options.motion_up)
     if options.start is not None:
-        clip = cut_start(clip, parse_seconds(options.start, _FPS, option="--start"))
+        clip = cut_start(clip, parse_seconds(options.start, FPS, option="--start"))
     if options.loop is not None:
-        clip = loop_motion(clip, parse_seconds(options.loop, _FPS, option="--loop"))
+        clip = loop_motion(clip, parse_seconds(options.loop, FPS, option="--loop"))
     return rig, pose_body(rig, clip, num_frames=options.frames, arm_abduction=options.arm_abduction), motion
 
 

@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from eslr_jax.cli.actor import FPS
 from eslr_jax.cli.console import app, stderr, use_compile_cache
 from eslr_jax.errors import AssetError
 
@@ -46,13 +47,25 @@ def assets(
         damaged = [asset.file for asset in chosen if not is_intact(asset)]
         if damaged:
             raise AssetError(f"damaged: {', '.join(sorted(set(damaged)))}; install the package again")
+    frames = _simulated_frames([asset.name for asset in chosen if asset.kind == "motion"])
     if json_:
-        print(json.dumps([dataclasses.asdict(asset) for asset in chosen], indent=2))
+        rows = [{**dataclasses.asdict(asset), "frames": frames.get(asset.name)} for asset in chosen]
+        print(json.dumps(rows, indent=2))
         return
-    table = Table("kind", "name", "what", "licence", box=None)
+    table = Table("kind", "name", "what", "simulated as", "licence", box=None)
     for asset in chosen:
-        table.add_row(asset.kind, asset.name, asset.description, asset.licence)
+        count = frames.get(asset.name)
+        length = "" if count is None else f"{count} frames, {(count - 1) / FPS:.1f} s"
+        table.add_row(asset.kind, asset.name, asset.description, length, asset.licence)
     Console().print(table, markup=False)
+
+
+def _simulated_frames(names: list[str]) -> dict[str, int]:
+    """Return how many frames bundled motions have as they are simulated."""
+    from eslr_jax.assets import load_motion
+    from eslr_jax.body.timing import num_simulated_frames
+
+    return {name: num_simulated_frames(load_motion(name), FPS) for name in names}
 
 
 def _export_body(path: Path, name: str) -> None:

@@ -31,14 +31,17 @@ def leave_at_once() -> Iterator[None]:
     is_over = threading.Event()
 
     def watch() -> None:
-        while (number := receiver.recv(1)) and not is_over.is_set():
-            if number[0] != signal.SIGINT or signal.getsignal(signal.SIGINT) != signal.default_int_handler:
-                continue
-            if not is_over.wait(_PATIENCE):
-                say("eslr: interrupted")
-                os._exit(EXIT_CODE)
+        with receiver:
+            while (number := receiver.recv(1)) and not is_over.is_set():
+                handler = signal.getsignal(signal.SIGINT)
+                if number[0] != signal.SIGINT or handler != signal.default_int_handler:
+                    continue
+                if not is_over.wait(_PATIENCE):
+                    say("eslr: interrupted")
+                    os._exit(EXIT_CODE)
 
-    threading.Thread(target=watch, daemon=True).start()
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
     before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
     try:
         yield
@@ -46,6 +49,7 @@ def leave_at_once() -> Iterator[None]:
         is_over.set()
         signal.set_wakeup_fd(before)
         sender.close()
+        watcher.join()
 
 
 class Interruption:

@@ -40,6 +40,7 @@ class Options:
     loop: str | None
     settle: int
     self_contact: bool
+    ground: Literal["auto", "on", "off"] = "auto"
     integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
 
 

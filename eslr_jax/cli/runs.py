@@ -92,8 +92,9 @@ def render(
     is_film = out.suffix.lower() == ".mp4"
     if not is_film and out.suffix.lower() != ".png":
         raise AssetError(f"--out {out}: give a film, .mp4, or a picture, .png")
-    if frames is not None and frames < 1:
-        raise ConfigError(f"--frames {frames}: give 1 or more")
+    for option, value in (("--frames", frames), ("--width", width), ("--samples", samples)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{option} {value}: give 1 or more")
     if at is not None and (is_film or frames is not None):
         raise ConfigError("--at is one picture: give a .png, and no --frames")
     content = read_run(run)

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.cli.actor import check_skin, load_actor
-from eslr_jax.cli.budget import parse_request
+from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
 from eslr_jax.cli.options import Options, check_same_scene, interrupted_record, read_interrupted
@@ -55,6 +55,7 @@ def simulate(
     settle: int = 0,
     integrator: Literal["euler", "bdf2"] | None = None,
     self_contact: bool = False,
+    ground: Literal["auto", "on", "off"] = "auto",
     out: Path = Path("out"),
     resume: bool = False,
     pictures: bool = True,
@@ -99,6 +100,7 @@ def simulate(
         integrator: How time is stepped: bdf2 keeps swinging cloth in motion; euler, the paper's, loses two thirds
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
         self_contact: Keep layers of cloth apart.
+        ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
         out: Folder to write to.
         resume: Go on with the simulation that was interrupted in this folder, with its own options.
         pictures: Render the contact sheet.
@@ -146,6 +148,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         raise AssetError(f"--frames {options.frames}: a simulation needs two frames or more")
     if options.settle < 0:
         raise ConfigError(f"--settle {options.settle}: give a number of frames, 0 or more")
+    if options.iterations is not None and options.iterations < 0:
+        raise ConfigError(f"--iterations {options.iterations}: give a number, 0 or more")
 
     import numpy as np
 
@@ -153,7 +157,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
-    from eslr_jax.fit.report import describe_fit
+    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
     from eslr_jax.io.garment import write_garment_npz
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
     from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
@@ -161,15 +165,24 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     request = _read_request(options)
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)
-        stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
-        method = _choose_method(options, request, len(stored.rest_positions), choice)
+        stored = load_garment_file(
+            options.garment,
+            vertices=options.vertices,
+            body=rig,
+            on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
+        )
+        num_vertices = len(stored.rest_positions)
+        method = _choose_method(options, request, num_vertices, choice)
         cloth = prepare_stored(stored, name=Path(options.garment).name, **_embedding(method.config.model))
         material = garment_material(options.fabric, cloth, stored)
         check_skin(options.garment, cloth, rig, options.body)
         settling = with_settling(poses, options.settle)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
         modelled = SceneOptions(
-            self_contact=options.self_contact, has_skin=method.config.iterations > 0, integrator=integrator
+            self_contact=options.self_contact,
+            ground=options.ground,
+            has_skin=method.config.iterations > 0,
+            integrator=integrator,
         )
         scene = prepare_scene(cloth, settling, material=material, options=modelled)
         if scene.body is not None:
@@ -183,6 +196,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     if "fit" in stored.metadata:
         say(describe_fit(stored.metadata["fit"]))
+    if num_vertices >= LARGE:
+        say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
     whole, timing, scene = _run(method, scene, done)
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
     count = kept.num_frames - options.settle
@@ -215,6 +230,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "motion": motion,
             "self_contact": options.self_contact,
             "integrator": integrator,
+            "ground_m": None if scene.ground is None else float(scene.ground),
             "interrupted_at": last if is_unfinished else None,
             "error": error,
             **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
@@ -324,7 +340,7 @@ def _measure(
     return {
         "simulator": method.simulator,
         "model": method.model,
-        **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names)),
+        **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
         **wear_report(trajectory.positions, scene.garment, skinned, poses),
         "choice": None if method.choice is None else dataclasses.asdict(method.choice),
         "tolerance": method.tolerance,
@@ -333,6 +349,21 @@ def _measure(
         "compile_s": timing.compile_s,
         **environment(),
     }
+
+
+def _expected_ms(method: _Method, num_vertices: int) -> float:
+    """Return what a frame is expected to take on this machine [ms]."""
+    from eslr_jax.simulation.budget import SOLVER, expected_ms, read_calibration
+
+    if method.choice is not None:
+        return method.choice.expected_ms
+    return expected_ms(read_calibration(), num_vertices, method.model or SOLVER, method.config.iterations)
+
+
+def _say_if_any(text: str | None) -> None:
+    """Print a line on stderr, if there is one."""
+    if text:
+        say(text)
 
 
 def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
@@ -373,6 +404,7 @@ def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
         timestep=float(poses.timestep),
         body=body,
         friction_loads=np.asarray(trajectory.friction_loads),
+        ground=None if scene.ground is None else float(scene.ground),
         material=jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scene.material),
     )
     write_trajectory(out / "trajectory.npz", file)
@@ -412,12 +444,12 @@ def _print_report(report: dict[str, Any], out: Path) -> None:
     for text in words.warnings:
         print(f"warning: {text}")
     table = Table(show_header=False, box=None)
-    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items())
+    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
     rows = {
         "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
         "time": f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation",
         "energy": f"{report['total']:.4f} J a frame ({terms})",
-        "stretch": f"{report['max_principal_stretch']:.3f} at most",
+        "stretch": f"{report['p99_principal_stretch']:.3f} (99 %), {report['max_principal_stretch']:.3f} at most",
     }
     if report["penetration_max_mm"] is not None:
         rows["penetration"] = (

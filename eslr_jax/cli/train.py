@@ -18,16 +18,25 @@ from rich.progress import (
 )
 
 from eslr_jax.cli.console import app, say, stderr, use_compile_cache
+from eslr_jax.config import ModelConfig, TrainConfig, describe_keys
 from eslr_jax.errors import ConfigError
 from eslr_jax.extras import require
 from eslr_jax.io.parsing import one_line
+
+_KEYS = "\n".join([*describe_keys(TrainConfig), *describe_keys(ModelConfig, "model.")])
+_CHANGES = (
+    "Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4. "
+    f"The keys of a configuration and their defaults:\n{_KEYS}\n"
+)
 
 
 @app.command
 def train(
     out: Path,
     config: Path | None = None,
-    set_: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set")] = (),
+    set_: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", help=_CHANGES)
+    ] = (),
     resume: bool = False,
     start_from: str | None = None,
     tensorboard: bool = False,
@@ -43,7 +52,7 @@ def train(
     Args:
         out: Folder of metrics, checkpoints and the exported model.
         config: TOML file of a training configuration; not needed with --resume.
-        set_: Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4.
+        set_: Changes to the configuration, as key=value.
         resume: Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
         start_from: Name of a bundled network or an exported file whose weights to start from.
         tensorboard: Write event files for TensorBoard too.
@@ -52,7 +61,7 @@ def train(
         process_id: Number of this process, from 0; not needed with "auto".
     """
     from eslr_jax.assets import load_model
-    from eslr_jax.config import TrainConfig, from_dict, parse_override, to_dict
+    from eslr_jax.config import from_dict, parse_override, to_dict
     from eslr_jax.models.registry import check_params
     from eslr_jax.training.checkpoint import read_run_config
     from eslr_jax.training.loop import is_first_process

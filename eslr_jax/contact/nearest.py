@@ -19,7 +19,7 @@ _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
-CLEARANCE = 2e-3  # [m] at which they leave it; the collision thickness
+CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 
 

@@ -74,9 +74,7 @@ def find_skin_contacts(
     )
 
 
-def skin_heights(
-    position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts
-) -> Float[Array, " rows"]:
+def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts) -> Float[Array, " rows"]:
     """Return how high the places of the cloth are over the body vertices at t + 1 [m]."""
     x = components(position)
     place = tuple(sum(skin.weights[:, k] * axis[skin.corners[:, k]] for k in range(3)) for axis in x)

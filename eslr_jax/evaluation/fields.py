@@ -37,7 +37,8 @@ from eslr_jax.types import (
     SceneBody,
 )
 
-FIELDS = ("stretch", *(f"{term}-energy" for term in PotentialTerms._fields), "gap", "distance")
+_TERMS = tuple(term for term in PotentialTerms._fields if term != "own")  # no file holds functions
+FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
 _CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
 _ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
@@ -139,6 +140,7 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
         pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
         num_frames=trajectory.num_frames,
         self_contact=default_capacity(positions.shape[1]) if has_layers else None,
+        ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
     )
 
 
@@ -204,6 +206,9 @@ def energy_shares(
         if problem.body is not None:
             load = problem.body.friction_load * factors
             scaled = scaled.replace(body=problem.body.replace(friction_load=load))
+        if problem.ground is not None:
+            load = problem.ground.friction_load * factors
+            scaled = scaled.replace(ground=problem.ground.replace(friction_load=load))
         if problem.layers is not None:
             pairs = problem.layers.pairs
             on_pairs = 0.25 * (factors[pairs.vertices] + factors[pairs.corners].sum(axis=1))

@@ -11,9 +11,12 @@ import jax
 import numpy as np
 
 from eslr_jax.evaluation.metrics import FrameMeasures, measure_frames
+from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import BodyMotion, Scene, Trajectory
 
+_DEEP = 1e-3  # [m] inside the body, from which a depth is measured again
 _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
 
 
@@ -21,13 +24,16 @@ Parts = tuple[np.ndarray | None, tuple[str, ...]]
 """Number of the part of every face, shape [faces], and the names of the parts; see `GarmentFile`."""
 
 
-def trajectory_report(trajectory: Trajectory, scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any]:
+def trajectory_report(
+    trajectory: Trajectory, scene: Scene, *, parts: Parts = (None, ()), poses: BodyMotion | None = None
+) -> dict[str, Any]:
     """Measure a trajectory.
 
     Args:
         trajectory: What to measure.
         scene: Its scene.
         parts: Parts of the garment, which the worst places are named by.
+        poses: The whole body: what seems to be deep in the part that was searched for contacts is measured again.
 
     Returns:
         Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
@@ -45,6 +51,7 @@ def trajectory_report(trajectory: Trajectory, scene: Scene, *, parts: Parts = (N
         "terms": terms,
         "total": sum(terms.values()),
         "max_principal_stretch": float(measures.max_stretch.max()),
+        "p99_principal_stretch": float(measures.p99_stretch.max()),
         "start_principal_stretch": float(
             np.max(principal_stretches(trajectory.positions[0], scene.garment)[0])
         ),
@@ -59,6 +66,8 @@ def trajectory_report(trajectory: Trajectory, scene: Scene, *, parts: Parts = (N
     }
     if measures.distances is not None:
         depth = -measures.distances[:, is_real]
+        if poses is not None:
+            depth = _measured_again(depth, positions[1:], poses)
         report["penetration_p999_mm"] = float(max(np.quantile(depth, 0.999), 0.0) * 1e3)
         report["penetration_max_mm"] = float(max(depth.max(), 0.0) * 1e3)
         report["penetrating_share"] = float((depth > 0).mean())
@@ -67,6 +76,27 @@ def trajectory_report(trajectory: Trajectory, scene: Scene, *, parts: Parts = (N
             vertex = int(np.flatnonzero(is_real)[column])
             report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
     return report
+
+
+def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion) -> np.ndarray:
+    """Return depths [m], shape [frames, vertices], with the large ones as they are in the whole body.
+
+    Contacts are searched among the faces in reach, approximately. Where that part ends, they may be far off.
+
+    Args:
+        depth: Depths as the contacts have them.
+        positions: Vertices of the same frames [m], shape [frames, vertices, 3].
+        poses: The body; one frame more, the first.
+    """
+    faces, depth = np.asarray(poses.faces), np.array(depth)
+    for frame in np.flatnonzero((depth > _DEEP).any(axis=1)):
+        body, deep = np.asarray(poses.positions[frame + 1]), np.flatnonzero(depth[frame] > _DEEP)
+        nearest, weights = closest_points(positions[frame, deep], body, faces)
+        corners = faces[nearest]
+        away = positions[frame, deep] - np.einsum("pk,pkx->px", weights, body[corners])
+        outward = np.einsum("pk,pkx->px", weights, vertex_normals(body, faces)[corners])
+        depth[frame, deep] = -np.sign(np.sum(away * outward, axis=1)) * np.linalg.norm(away, axis=1)
+    return depth
 
 
 def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:

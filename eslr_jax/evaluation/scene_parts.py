@@ -60,6 +60,10 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         left_out["other body faces"] = f"{total - faces} that the garment does not reach"
     pinned = int(np.sum(scene.garment.is_pinned))
     sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
+    has_ground = scene.ground is not None
+    sort("ground", has_ground, f"at {float(scene.ground):.2f} m" if has_ground else "", "out of reach")
+    if scene.energies:
+        modelled["own terms"] = f"{len(scene.energies)}"
     sort("self-contact", scene.self_contact is not None, "layers of cloth keep apart", "not asked for")
     varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")

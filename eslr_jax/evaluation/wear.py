@@ -15,6 +15,7 @@ from eslr_jax.types import BodyMotion, Garment
 _EVERY = 10  # frames
 _COVER = 0.03  # [m] under cloth up to which skin counts as covered
 _NEAR = 0.1  # [m] from cloth up to which skin stays covered
+_OWN = 0.05  # [m] from skin in the rest pose up to which cloth is its own; other cloth there is a fold
 _POKING = 0.015  # [m] in front of cloth up to which skin pokes through it; farther off it is another limb
 _VISIBLE = 1e-3  # [m] in front of the cloth from which skin counts as showing
 
@@ -29,8 +30,8 @@ def wear_report(
 
     Skin is covered where a face of the cloth lies in front of it in the rest pose, at most 3 cm away. It shows
     through where it is later in front of the nearest face. Faces at a hem don't count, since skin passes
-    under them, nor do faces turned towards the skin, which cover another limb. Every tenth frame and the last
-    are looked at.
+    under them, nor do faces turned towards the skin or far from it in the rest pose, which cover other skin.
+    Every tenth frame and the last are looked at.
 
     Args:
         positions: Simulated vertex positions [m], shape [frames, vertices, 3].
@@ -68,7 +69,7 @@ def wear_report(
         hem[loop] = True
     rest = np.asarray(garment.rest_positions)[is_real]
     unposed = np.asarray(poses.rest_positions)
-    side, distance = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
+    side, distance, _ = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
     covered = skin[(side < 0) & (distance < _COVER)]
     if not len(covered):
         return result
@@ -76,8 +77,9 @@ def wear_report(
     through, shares = [], []
     for frame in frames:
         outward = vertex_normals(body[frame], skin_faces)[covered]
-        side, distance = _sides(body[frame, covered], outward, cloth[frame], faces, hem)
-        through.append(np.where(distance < _POKING, np.maximum(side, 0.0), 0.0))
+        side, distance, nearest = _sides(body[frame, covered], outward, cloth[frame], faces, hem)
+        is_own = np.linalg.norm(rest[faces[nearest]].mean(axis=1) - unposed[covered], axis=1) < _OWN
+        through.append(np.where(is_own & (distance < _POKING), np.maximum(side, 0.0), 0.0))
         shares.append(float(np.mean(distance < _NEAR)))
     depth = np.stack(through)
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
@@ -97,8 +99,8 @@ def wear_report(
 
 def _sides(
     points: NDArray, outward: NDArray, positions: NDArray, faces: Int[np.ndarray, "faces 3"], hem: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Return how far skin is in front of cloth [m], negative behind it, and how far off it is [m].
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return how far skin is in front of cloth [m], negative behind it, how far off it is [m], and the face.
 
     The first is zero at a hem, and where the two face each other: there the cloth is another limb's.
     """
@@ -109,4 +111,4 @@ def _sides(
     distance = np.linalg.norm(offset, axis=1)
     is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= 0)
     sign = np.sign(np.einsum("px,px->p", offset, normals))
-    return np.where(is_other, 0.0, sign * distance), distance
+    return np.where(is_other, 0.0, sign * distance), distance, nearest

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-_STRETCH = 1.5  # of a face, from which cloth looks torn
+_STRETCH = 1.5  # of one face in a hundred, from which cloth looks stretched
+_TORN = 2.0  # of a single face, from which it looks torn
 _PENETRATION_MM = 5.0
 _THROUGH_MM = 1.0  # of skin in front of cloth
 _SLID_M = 0.25
@@ -32,9 +33,9 @@ def describe_report(report: dict[str, Any]) -> Words:
         _describe_tolerance(report, words)
     _describe_penetration(report, words)
     _describe_place(report, words)
-    stretch = report["max_principal_stretch"]
-    text = f"cloth is stretched by {100 * (stretch - 1):.0f} % at most"
-    if stretch > _STRETCH:
+    stretch, most = report["max_principal_stretch"], report["p99_principal_stretch"]
+    text = f"cloth is stretched by {100 * (most - 1):.0f} % (99 % of it), {100 * (stretch - 1):.0f} % at most"
+    if most > _STRETCH or stretch > _TORN:
         words.warnings.append(f"{text}, {_where(report['worst_stretch'])}")
     else:
         words.good.append(text)

@@ -62,6 +62,9 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
         raise MeshError(
             f"{name}: coordinates up to {largest:.3g} are too large for a garment; check the file"
         )
+    for option, value in (("weld", options.weld), ("join_gap", options.join_gap)):
+        if not 0 <= value < np.inf:
+            raise ConfigError(f"{option} = {value:g} is no distance; give 0 or more")
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(body) if options.arms == "auto" else [rest_posture(body)]
     placement = find_placement(

@@ -16,7 +16,7 @@ from eslr_jax.types import Body
 ARM_ANGLES = (0.0, 25.0, 45.0, 65.0)  # degrees below the horizontal that are tried; 0 is the T-pose
 _OFF_AXIS = 0.04  # of the body's height: joints farther from the middle belong to a limb
 _LIMB = 0.11  # of the body's height: length from which a bone is that of an arm or leg
-_SHOULDERS = 0.8  # of the body's height, for a body without arms
+SHOULDERS = 0.8  # of the body's height, for a body without arms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +122,7 @@ def shoulder_height(body: Body) -> float:
     arms = find_arms(body)
     if arms is None:
         heights = np.asarray(body.rest_positions)[:, 1]
-        return float(heights.min() + _SHOULDERS * np.ptp(heights))
+        return float(heights.min() + SHOULDERS * np.ptp(heights))
     return float(np.mean(np.asarray(body.joint_rest_positions)[[joint for joint, _ in arms], 1]))
 
 

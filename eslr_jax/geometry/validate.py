@@ -93,7 +93,7 @@ def check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
         face = int(np.argmax(is_bad))
         raise MeshError(
             f"{name}: face {face} {_ids(faces[face])} names a vertex outside 0..{len(positions) - 1}; "
-            "export the mesh again, with 0-based indices"
+            "export the mesh again"
         )
 
 

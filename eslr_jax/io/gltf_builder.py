@@ -9,6 +9,7 @@ from eslr_jax.io.color import srgb_to_linear
 
 _COMPONENT_TYPES = {
     np.dtype(np.float32): gltf.FLOAT,
+    np.dtype(np.int16): gltf.SHORT,
     np.dtype(np.uint8): gltf.UNSIGNED_BYTE,
     np.dtype(np.uint16): gltf.UNSIGNED_SHORT,
     np.dtype(np.uint32): gltf.UNSIGNED_INT,
@@ -55,6 +56,23 @@ class GlbBuilder:
     def add_points(self, points: np.ndarray) -> int:
         """Add positions, or differences of positions, with the bounds that glTF asks of them."""
         return self.add_accessor(points, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
+
+    def add_small_points(self, points: np.ndarray) -> int:
+        """Add differences of positions between -1 and 1 as 16-bit integers: a third of the size."""
+        steps = np.iinfo(np.int16).max
+        rounded = np.zeros((len(points), 4), np.int16)  # vertices start at multiples of four bytes
+        rounded[:, :3] = np.round(points * steps)
+        index = self.add_accessor(rounded, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
+        accessor = self.document.accessors[index]
+        accessor.normalized, accessor.min, accessor.max = True, accessor.min[:3], accessor.max[:3]
+        self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
+        self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
+        return index
+
+    def add_zeros(self, num_vertices: int) -> int:
+        """Add vectors of zeros, which take no room."""
+        accessor = gltf.Accessor(componentType=gltf.FLOAT, count=num_vertices, type=gltf.VEC3)
+        return append(self.document.accessors, accessor)
 
     def add_vertices(self, values: np.ndarray, kind: str) -> int:
         """Add other values per vertex, such as normals."""

@@ -4,6 +4,7 @@ Layout, in SI units, Y up, float32: `format`, `metadata` (JSON text), `timestep`
 [frames, vertices, 3] and `faces` [faces, 3]. Optional parts, whole or absent:
 
 - `friction_loads` [frames, vertices];
+- `ground`, the height of a level ground;
 - the fabric: `material_density`, `material_lame_mu`, ..., each a scalar or one value per element;
 - the body: `body_positions` [frames, body_vertices, 3], `body_faces`, `body_rest_positions`, `contact_faces` and
   `contact_boundary`;
@@ -43,6 +44,7 @@ _LAYOUT = {
     "velocities": ("f", "frames vertices 3"),
     "faces": ("iu", "faces 3", "vertices"),
     "friction_loads": ("f", "frames vertices"),
+    "ground": ("f", ""),
     "body_positions": ("f", "frames body_vertices 3"),
     "body_faces": ("iu", "body_faces 3", "body_vertices"),
     "body_rest_positions": ("f", "body_vertices 3"),
@@ -82,6 +84,7 @@ class TrajectoryFile:
     body: BodyTrack | None = None
     friction_loads: np.ndarray | None = None  # [frames, vertices], normal force that friction acts with [N]
     material: Material | None = None  # NumPy leaves
+    ground: float | None = None  # height of a level ground [m]
 
     @property
     def num_frames(self) -> int:
@@ -115,6 +118,8 @@ def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
     }
     if trajectory.friction_loads is not None:
         arrays["friction_loads"] = trajectory.friction_loads
+    if trajectory.ground is not None:
+        arrays["ground"] = np.float64(trajectory.ground)
     body = trajectory.body
     for part, names in (
         (trajectory.material, _MATERIAL),
@@ -178,6 +183,7 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         body,
         arrays.get("friction_loads"),
         material,
+        float(arrays["ground"]) if "ground" in arrays else None,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.contact.self_contact import FacePairs
-from eslr_jax.physics.problem import BodyContact, FrameProblem
+from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.types import Contacts, Garment, Material
 
 
@@ -125,11 +125,17 @@ def vertex_blocks(
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return the Hessian of inertia, collision and friction per vertex [N/m]; all positive semi-definite."""
     blocks = (float64_masses(problem) / float(problem.inertial_timestep) ** 2)[:, None, None] * np.eye(3)
-    if problem.body is None:
-        return blocks
-    for contacts in (problem.body.nearest, problem.body.opposing):
-        blocks = blocks + _collision_blocks(position, contacts, problem.body.thickness, problem)
-    return blocks + _friction_blocks(position, problem.body, problem)
+    if problem.body is not None:
+        for contacts in (problem.body.nearest, problem.body.opposing):
+            blocks = blocks + _collision_blocks(position, contacts, problem.body.thickness, problem)
+        blocks = blocks + _friction_blocks(
+            position, problem.body.nearest, problem.body.friction_load, problem
+        )
+    if problem.ground is not None:
+        contacts = problem.ground.contacts
+        blocks = blocks + _collision_blocks(position, contacts, problem.ground.thickness, problem)
+        blocks = blocks + _friction_blocks(position, contacts, problem.ground.friction_load, problem)
+    return blocks
 
 
 def float64_masses(problem: FrameProblem) -> Float[np.ndarray, " vertices"]:
@@ -151,10 +157,10 @@ def _collision_blocks(
 
 
 def _friction_blocks(
-    position: np.ndarray, body: BodyContact, problem: FrameProblem
+    position: np.ndarray, contacts: Contacts, loads: Any, problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return mu N (I - n n^T - u u^T / l^2) / l per vertex, with l = sqrt(|u|^2 + s^2)."""
-    contacts, constants = body.nearest, problem.constants
+    constants = problem.constants
     normal = np.asarray(contacts.next_normals, np.float64)
     motion = (position - problem.position) - (contacts.next_points - contacts.points)
     tangential = motion - np.sum(motion * normal, axis=1, keepdims=True) * normal
@@ -164,7 +170,7 @@ def _friction_blocks(
     # Unit normals are so up to float32 rounding, or zero off the body: I - n n^T is semi-definite.
     outer = [vector[:, :, None] * vector[:, None, :] for vector in (normal, direction)]
     curvature = np.eye(3) - outer[0] - outer[1]
-    load = float(constants.friction_coefficient) * np.asarray(body.friction_load, np.float64)
+    load = float(constants.friction_coefficient) * np.asarray(loads, np.float64)
     return (load / length)[:, None, None] * curvature
 
 

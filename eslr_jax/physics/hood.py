@@ -209,7 +209,7 @@ def criterion_depths(
 def hood_terms(
     position: Float[Array, "vertices 3"], problem: HoodProblem, *, criterion: Criterion = "postcvpr"
 ) -> PotentialTerms:
-    """Return HOOD's six losses [J] of one step; repulsion, which HOOD lacks, is zero.
+    """Return HOOD's six losses [J] of one step; what HOOD lacks is zero.
 
     Sums go over vertices, faces and edges, without means; gravity counts from the world's origin. In the two
     training criteria pinned vertices have already moved when the losses are taken: they add a constant to
@@ -240,4 +240,5 @@ def hood_terms(
         collision=parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask),
         friction=hood_friction_energy(position, problem, criterion),
         repulsion=jnp.zeros((), position.dtype),
+        own=jnp.zeros((), position.dtype),
     )

@@ -18,6 +18,8 @@ published losses for its tables. Side by side, from x_t to x_{t+1}:
 |           | at t, u in the tangent plane                  | contact force; s a slope against the z axis |
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
 | repulsion | between layers of cloth, where they can meet  | none                                        |
+| ground    | collision and friction as with the body       | none                                        |
+| own       | terms that the scene was given                | none                                        |
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import BodyContact, FrameProblem, mean_vertex_area, pin
+from eslr_jax.physics.problem import BodyContact, FrameProblem, GroundContact, mean_vertex_area, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import PotentialTerms
 
@@ -56,15 +58,22 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
             so that the gradient vanishes there.
         problem: The frame's problem.
     """
-    # Split once: the gradients of all terms are then summed by components, and joined once.
-    position = components(pin(problem, position))
+    whole = pin(problem, position)
+    position = components(
+        whole
+    )  # once: gradients of all terms are then summed by components, and joined once
     garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = jnp.zeros((), position[0].dtype)
+    collision = friction = repulsion = own = jnp.zeros((), position[0].dtype)
     if problem.body is not None:
         collision, friction = _body_energies(position, problem, problem.body)
+    if problem.ground is not None:
+        on_ground = _ground_energies(position, problem, problem.ground)
+        collision, friction = collision + on_ground[0], friction + on_ground[1]
     if problem.layers is not None:
         layers = problem.layers
         repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+    for energy in problem.energies:
+        own = own + energy(whole, problem)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
@@ -73,6 +82,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         collision=collision,
         friction=friction,
         repulsion=repulsion,
+        own=own,
     )
 
 
@@ -106,6 +116,25 @@ def _body_energies(
         constants.friction_speed * problem.timestep,
     )
     return jnp.asarray(collision), friction
+
+
+def _ground_energies(
+    position: Vector3, problem: FrameProblem, ground: GroundContact
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the collision and the friction energy of a frame with a ground [J]."""
+    constants = problem.constants
+    collision = collision_energy(
+        position, ground.contacts, problem.garment, constants.collision_stiffness, ground.thickness
+    )
+    friction = friction_energy(
+        position,
+        problem.position,
+        ground.contacts,
+        ground.friction_load,
+        constants.friction_coefficient,
+        constants.friction_speed * problem.timestep,
+    )
+    return collision, friction
 
 
 def potential(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:

@@ -74,6 +74,11 @@ def hessian_diagonal(
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + constants.friction_coefficient * body.friction_load / (3.0 * slip)
+    if problem.ground is not None:
+        depth = penetration(position, problem.ground.contacts, problem.ground.thickness)
+        slip = constants.friction_speed * problem.timestep
+        diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
+        diagonal = diagonal + constants.friction_coefficient * problem.ground.friction_load / (3.0 * slip)
     if problem.layers is not None:
         diagonal = diagonal + repulsion_diagonal(
             position, problem.layers.pairs, constants.repulsion_stiffness, problem.layers.thickness

@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
+from eslr_jax.physics.collision import penetration
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.repulsion import push_apart
 from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
@@ -36,6 +38,15 @@ class BodyContact:
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
     skin: SkinContacts | None = None  # None: skin may show between vertices
     tips: TipContact | None = None  # None: a tip may pass between vertices
+
+
+@struct.dataclass
+class GroundContact:
+    """Contact of the cloth's vertices with a level ground."""
+
+    contacts: Contacts  # the points of the ground under the vertices
+    friction_load: Float[Array, " vertices"]  # normal force at t [N]
+    thickness: Float[Array, ""] | float  # distance kept [m]
 
 
 @struct.dataclass
@@ -66,7 +77,9 @@ class FrameProblem:
         Array, "vertices 3"
     ]  # where inertia alone takes the cloth [m], see `simulation.frame`
     body: BodyContact | None = None
+    ground: GroundContact | None = None
     layers: SelfContact | None = None
+    energies: tuple[Partial, ...] = ()  # of positions and this problem to joules
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
     bdf2: SecondOrder | None = None  # None: implicit Euler
 
@@ -113,20 +126,26 @@ def pin(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Ar
 
 
 def push_out(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with vertices inside the body lifted onto its surface.
+    """Return positions [m], shape [vertices, 3], with vertices inside the body or the ground lifted out of it.
 
     A vertex goes to the tangent plane of its nearest body point, offset by the contact thickness. The cubic
     collision energy has no curvature at first touch, so a minimiser that begins deep inside only halves the
     depth per iteration. This projection costs little and ends 30 to 2000 times lower in energy.
     """
     position = pin(problem, position)
-    if problem.body is None:
-        return position
-    contacts = problem.body.nearest
-    height = jnp.sum((position - contacts.next_points) * contacts.next_normals, axis=-1)
-    lift = jnp.maximum(problem.body.thickness - height, 0.0)
-    lift = jnp.where(contacts.is_near, lift, 0.0)
-    return pin(problem, position + lift[:, None] * contacts.next_normals)
+    if problem.body is not None:
+        position = _lifted(position, problem.body.nearest, problem.body.thickness)
+    if problem.ground is not None:
+        position = _lifted(position, problem.ground.contacts, problem.ground.thickness)
+    return pin(problem, position)
+
+
+def _lifted(
+    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
+) -> Float[Array, "vertices 3"]:
+    """Return positions [m], shape [vertices, 3], a thickness [m] or more above their tangent planes."""
+    lift = penetration(position, contacts, thickness)
+    return position + lift[:, None] * contacts.next_normals
 
 
 def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:

@@ -6,9 +6,11 @@ from typing import Literal
 
 import jax.numpy as jnp
 from flax import struct
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.body import lbs
+from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.types import (
@@ -41,12 +43,14 @@ class ScenePlan:
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
     has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
+    ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
+    energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
 
 
 def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: ScenePlan) -> Scene:
     """Return the scene of a garment on a moving body.
 
-    Frame 0 is the garment skinned to the first pose and pushed out of the body.
+    Frame 0 is the garment skinned to the first pose, pushed out of the body and lifted off the ground.
 
     Args:
         garment: A prepared garment.
@@ -61,6 +65,8 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         position = clear_of_body(position, body.positions[0], plan.surface, garment)
         if plan.has_skin:
             position = lift_off_skin(position, body.positions[0], plan.surface, garment)
+    if plan.ground is not None:
+        position = clear_of_ground(position, plan.ground, garment.is_pinned)
     velocity = (skinned[1] - skinned[0]) / poses.timestep
     if plan.starts_at_rest:
         velocity = jnp.zeros_like(velocity)
@@ -74,6 +80,8 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         pin_targets=skinned if plan.has_pins else None,
         num_frames=skinned.shape[0],
         self_contact=plan.self_contact,
+        ground=plan.ground,
+        energies=plan.energies,
     )
 
 

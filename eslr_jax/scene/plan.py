@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import MotionError
+from eslr_jax.fit.postures import SHOULDERS
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
@@ -36,6 +42,11 @@ class SceneOptions:
     self_contact: bool = False  # keep layers of cloth apart
     has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
     integrator: Integrator = "euler"
+    # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
+    ground: Literal["auto", "on", "off"] = "auto"
+    # Terms of one's own: functions of positions [m], shape [vertices, 3], and the frame's `FrameProblem` to an
+    # energy [J]. The arguments that a `jax.tree_util.Partial` binds are traced, for jit, vmap and grad.
+    energies: tuple[Callable[..., Array], ...] = ()
 
 
 def plan_scene(
@@ -63,11 +74,18 @@ def plan_scene(
     num_frames = poses.joint_transforms.shape[0]
     if num_frames < 2:
         raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
+    skinned, radii = np.empty(0), np.empty(0)
+    needs_surface = options.has_body and surface is None
+    if needs_surface or (options.has_body and options.ground == "auto"):
+        skinned = np.asarray(_skin(garment, poses.joint_transforms))
+        radii = options.reach + _looseness(garment, poses)
     if not options.has_body:
         surface = None
     elif surface is None:
-        skinned = np.asarray(_skin(garment, poses.joint_transforms))
-        surface = _surface_near(reachable_vertices(garment, skinned, poses, options.reach), poses)
+        surface = _surface_near(reachable_vertices(garment, skinned, poses, radii), poses)
+    has_ground = options.ground == "on"
+    if options.has_body and options.ground == "auto":
+        has_ground = _could_fall(garment, poses) or _reaches_ground(garment, skinned, poses, radii)
     return ScenePlan(
         surface=surface,
         constants=constants or PhysicsConstants(),
@@ -76,6 +94,8 @@ def plan_scene(
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
+        ground=ground_height(poses) if has_ground else None,
+        energies=tuple(Partial(energy) for energy in options.energies),
     )
 
 
@@ -117,8 +137,8 @@ def prepare_scenes(
 ) -> list[Scene]:
     """Return scenes that can be stacked: padded to one bucket, over one part of the body.
 
-    What one of them needs, all of them model: pins, and the body faces near any garment at rest, whatever the
-    motion. Other motions of the same garments then run the same compiled rollout.
+    What one of them needs, all of them model: pins, a ground, and the body faces near any garment at rest,
+    whatever the motion. Other motions of the same garments then run the same compiled rollout.
 
     Args:
         garments: Unpadded garments of like sizes.
@@ -138,6 +158,10 @@ def prepare_scenes(
         for garment, motion in zip(padded, poses, strict=True)
     ]
     has_pins = any(plan.has_pins for plan in plans)
+    if any(plan.ground is not None for plan in plans):
+        plans = [
+            plan.replace(ground=ground_height(motion)) for plan, motion in zip(plans, poses, strict=True)
+        ]
     return [
         _build(garment, motion, material, plan.replace(has_pins=has_pins))
         for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
@@ -150,16 +174,45 @@ def first_frames(scene: Scene, num_frames: int) -> Scene:
     return slice_tracks(scene, slice(num_frames)).replace(num_frames=num_frames)
 
 
-def reachable_vertices(garment: Garment, skinned: np.ndarray, poses: BodyMotion, reach: float) -> np.ndarray:
+def ground_height(poses: BodyMotion) -> Float[Array, ""]:
+    """Return the height of the ground that a body moves on [m]: that of its lowest point."""
+    return jnp.min(poses.positions[..., 1])
+
+
+def _could_fall(garment: Garment, poses: BodyMotion) -> bool:
+    """Tell whether a part of a garment has no pin, and no cloth above the shoulders that it could hang from."""
+    rest, body = np.asarray(garment.rest_positions), np.asarray(poses.rest_positions)[:, 1]
+    shoulders = body.min() + SHOULDERS * np.ptp(body)
+    is_real, is_pinned = np.asarray(garment.vertex_mask), np.asarray(garment.is_pinned)
+    faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
+    _, part = vertex_components(faces, len(rest))
+    is_held = is_pinned | (rest[:, 1] > shoulders)
+    return bool(np.setdiff1d(part[is_real], part[is_held]).size)
+
+
+def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray) -> bool:
+    """Tell whether a free vertex comes as near to the ground as it may stray, in a sample of frames."""
+    is_real = np.asarray(garment.vertex_mask)
+    lowest = skinned[_sampled(len(skinned))][:, is_real, 1].min(axis=0) - radii
+    is_free = ~np.asarray(garment.is_pinned)[is_real]
+    return bool((lowest[is_free] < float(ground_height(poses))).any())
+
+
+def _sampled(num_frames: int) -> np.ndarray:
+    """Return the frames that are looked at to decide what is modelled."""
+    return np.unique(np.linspace(0, num_frames - 1, _SAMPLED_FRAMES).astype(int))
+
+
+def reachable_vertices(
+    garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray
+) -> np.ndarray:
     """Return which body vertices the skinned garment can reach in a sample of frames.
 
-    A T-shirt's scene then searches no legs, no head and no feet.
+    A T-shirt's scene then searches no legs, no head and no feet. `radii` say how far each real vertex strays [m].
     """
-    frames = np.unique(np.linspace(0, len(skinned) - 1, _SAMPLED_FRAMES).astype(int))
     is_real = np.asarray(garment.vertex_mask)
-    radii = reach + _looseness(garment, poses)
     is_near = np.zeros(poses.positions.shape[1], bool)
-    for frame in frames:
+    for frame in _sampled(len(skinned)):
         far = np.flatnonzero(~is_near)  # once is enough
         points = np.asarray(poses.positions[frame])[far]
         is_near[far] = _within(radii, np.asarray(skinned[frame])[is_real], points)

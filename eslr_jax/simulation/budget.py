@@ -87,6 +87,20 @@ def choose(
     raise ConfigError("give either a budget or a tolerance")
 
 
+def expected_ms(calibration: Calibration, num_vertices: int, name: str, iterations: int) -> float:
+    """Return how long a frame takes on this device [ms]; of a network not measured, the solver's part.
+
+    Args:
+        calibration: Of this device.
+        num_vertices: Of the garment.
+        name: `SOLVER`, or the name of a network.
+        iterations: Of the solver.
+    """
+    methods = {method.name: method for method in methods_at(calibration, num_vertices)}
+    method = methods.get(name, methods[SOLVER])
+    return method.fixed_ms + iterations * method.iteration_ms
+
+
 def methods_at(calibration: Calibration, num_vertices: int) -> list[Method]:
     """Return the methods of the size measured nearest by, their costs scaled to a number of vertices."""
     nearest = min({m.vertices for m in calibration.methods}, key=lambda v: abs(np.log(v / num_vertices)))

@@ -8,12 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.contact.ground import ground_contacts
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
+from eslr_jax.physics.collision import contact_forces
 from eslr_jax.physics.problem import (
     BodyContact,
     FrameProblem,
+    GroundContact,
     SecondOrder,
     SelfContact,
     TipContact,
@@ -67,17 +70,26 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         position=state.position,
         inertial_guess=state.position + scene.timestep * state.velocity,
         pin_targets=inputs.pin_targets,
+        energies=scene.energies,
     )
     if state.past is not None:
         problem = _second_order(problem, state, state.past)
     if scene.body is not None and inputs.body is not None:
         body = _body_contact(problem, scene.body, inputs.body, state.friction_load)
         problem = problem.replace(body=body)
+    if scene.ground is not None:
+        problem = problem.replace(ground=_ground_contact(scene, state, scene.ground))
     if scene.self_contact is not None:
         pairs = find_self_contacts(state.position, problem.inertial_guess, scene.garment, scene.self_contact)
         thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)
         problem = problem.replace(layers=SelfContact(pairs, thickness))
     return problem
+
+
+def first_problem(scene: Scene) -> FrameProblem:
+    """Return the problem of a scene's first frame, such as to initialise a network of one's own on."""
+    first = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    return frame_problem(scene, scene.initial_state, first)
 
 
 def _second_order(problem: FrameProblem, state: ClothState, past: PastState) -> FrameProblem:
@@ -121,3 +133,14 @@ def _body_contact(
         skin=skin,
         tips=tips,
     )
+
+
+def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:
+    """Return the contact of a frame with the ground.
+
+    The ground is flat and stands still: no edge dips into it, and where the cloth is tells how hard it presses.
+    """
+    constants, contacts = scene.constants, ground_contacts(state.position, height)
+    thickness = constants.collision_thickness
+    load = contact_forces(state.position, contacts, scene.garment, constants.collision_stiffness, thickness)
+    return GroundContact(contacts, load, thickness)

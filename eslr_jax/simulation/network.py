@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import ModelConfig, Predictor
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
 from eslr_jax.graph.inputs import GraphInputs, next_refinement, required
 from eslr_jax.models.registry import apply_model, apply_refinement, encode_frame, scale_output
@@ -37,15 +37,19 @@ class Refinement(NamedTuple):
     positions: Float[Array, "steps vertices 3"]  # after every step [m]
 
 
-def predict(params: Any, problem: FrameProblem, state: ClothState, config: ModelConfig) -> Prediction:
+def predict(
+    params: Any, problem: FrameProblem, state: ClothState, config: ModelConfig | Predictor
+) -> Prediction:
     """Return the network's prediction for a frame.
 
     Args:
         params: Weights of the network.
         problem: The frame's problem.
         state: Cloth at t.
-        config: Architecture; static.
+        config: Architecture, or a network of one's own; static.
     """
+    if not isinstance(config, ModelConfig):
+        return Prediction(pin(problem, config.apply(params, problem, state)))
     if config.output == "acceleration":
         return Prediction(predict_acceleration(params, problem, state, config))
     guess, starts, positions = refine(params, problem, state, config)

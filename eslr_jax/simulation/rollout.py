@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.config import SimConfig
+from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
@@ -71,7 +71,8 @@ def check_network(params: Any, config: SimConfig) -> None:
         return
     if params is None:
         raise ConfigError("config.model is given without weights; get both from load_model")
-    check_params(config.model, params)
+    if isinstance(config.model, ModelConfig):
+        check_params(config.model, params)
 
 
 @partial(jax.jit, static_argnames="config")

@@ -167,13 +167,13 @@ def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory)
 def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothState:
     """Return the state of the cloth at a frame of a trajectory without an error, the last by default."""
     frame = range(trajectory.num_frames)[frame]
+    position, velocity = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)  # or a file's
     past = scene.initial_state.past
     if past is not None and frame > 0:
-        past = PastState(
-            trajectory.positions[frame - 1], trajectory.velocities[frame - 1], jnp.ones((), bool)
-        )
-    state = initial_state(trajectory.positions[frame], trajectory.velocities[frame])
-    return state.replace(friction_load=trajectory.friction_loads[frame], frame=jnp.int32(frame), past=past)
+        past = PastState(position[frame - 1], velocity[frame - 1], jnp.ones((), bool))
+    state = initial_state(position[frame], velocity[frame])
+    load = jnp.asarray(trajectory.friction_loads[frame])
+    return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)
 
 
 def _scan(

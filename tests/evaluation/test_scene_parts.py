@@ -10,7 +10,7 @@ from eslr_jax.scene.plan import SceneOptions, prepare_scene
 def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene, small_config):
     parts = describe_scene(small_scene, small_poses, small_config)
     assert set(parts.modelled) == {"stretch", "bending", "inertia and gravity", "collision and friction"}
-    assert set(parts.left_out) == {"pins", "self-contact", "fabric by part", "network"}
+    assert set(parts.left_out) == {"pins", "ground", "self-contact", "fabric by part", "network"}
     assert parts.modelled["stretch"] == "100 faces"
     options = SceneOptions(has_body=False, self_contact=True)
     bare = describe_scene(

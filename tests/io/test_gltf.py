@@ -18,6 +18,7 @@ from eslr_jax.io.skin import Skin
 TIMESTEP = 1 / 30
 TOLERANCE = 1e-6  # [m]: float32 positions within two metres of the origin, skinned through a few joints
 _TYPES = {
+    gltf.SHORT: np.int16,
     gltf.FLOAT: np.float32,
     gltf.UNSIGNED_BYTE: np.uint8,
     gltf.UNSIGNED_SHORT: np.uint16,
@@ -35,10 +36,16 @@ class Player:
 
     def read(self, index):
         accessor = self.document.accessors[index]
-        offset = self.document.bufferViews[accessor.bufferView].byteOffset
-        width = _WIDTHS[accessor.type]
-        values = np.frombuffer(self.blob, _TYPES[accessor.componentType], accessor.count * width, offset)
-        return values.reshape(-1, width) if width > 1 else values
+        dtype, width = np.dtype(_TYPES[accessor.componentType]), _WIDTHS[accessor.type]
+        if accessor.bufferView is None:
+            return np.zeros((accessor.count, width))
+        view = self.document.bufferViews[accessor.bufferView]
+        columns = (view.byteStride or width * dtype.itemsize) // dtype.itemsize
+        values = np.frombuffer(self.blob, dtype, accessor.count * columns, view.byteOffset)
+        values = values.reshape(-1, columns)[:, :width]
+        if accessor.normalized:
+            values = values / np.iinfo(dtype).max
+        return values if width > 1 else values[:, 0]
 
     def sample(self, time, node, path):
         """The animated value of a node's property, or None."""
@@ -199,6 +206,22 @@ def test_principal_shapes_are_few_and_keep_the_tolerance():
     still, none = principal_shapes(np.zeros((5, 4, 3)), 1e-4)
     assert still.shape == (5, 0)
     assert none.shape == (0, 4, 3)
+
+
+def test_small_shapes_take_16_bits_and_keep_the_tolerance(tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    positions = sphere.vertices + 0.03 * smooth_motion(40, len(sphere.vertices))
+    cloth = AnimatedMesh("cloth", positions.astype(np.float32), np.asarray(sphere.faces))
+    write_animated_glb(tmp_path / "a.glb", [cloth], TIMESTEP)
+    player = Player(tmp_path / "a.glb")
+    assert player.document.extensionsRequired == ["KHR_mesh_quantization"]
+    targets = player.document.meshes[0].primitives[0].targets
+    accessors = [player.document.accessors[target["POSITION"]] for target in targets]
+    assert {accessor.componentType for accessor in accessors} == {gltf.SHORT}
+    assert all(low >= -32767 for accessor in accessors for low in accessor.min)
+    for frame in range(40):
+        away = player.positions("cloth", frame * TIMESTEP) - cloth.positions[frame]
+        assert np.linalg.norm(away, axis=1).max() < TARGET_TOLERANCE
 
 
 @pytest.mark.slow

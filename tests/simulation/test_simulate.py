@@ -11,6 +11,7 @@ from draped_ball import drifting_ball, square
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
 from eslr_jax.evaluation.gap import GapOptions, measure_gap
+from eslr_jax.io.unfinished import read_unfinished, write_unfinished
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
@@ -58,6 +59,26 @@ def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
     assert told == [(13, 13)]
     for ours, theirs in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.slow
+def test_interrupted_at_any_of_ten_points_it_ends_bit_by_bit_as_the_whole(tmp_path):
+    scene = prepare_scene(square(), drifting_ball(115))
+    whole = simulate(None, scene, config=SOLVER).trajectory
+    for point in range(1, 11):
+        done = []
+        part = simulate(
+            None,
+            scene,
+            config=SOLVER,
+            on_frames=lambda count, total, done=done: done.append(count),
+            is_stopping=lambda done=done, point=point: len(done) == point,
+        ).trajectory
+        assert part.num_frames == 10 * point + 1
+        write_unfinished(tmp_path, part, {})
+        kept, _ = read_unfinished(tmp_path)
+        resumed = simulate(None, scene, config=SOLVER, done=kept).trajectory
+        jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
 def test_frames_before_a_bad_one_are_good(whole):

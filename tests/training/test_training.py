@@ -82,6 +82,26 @@ def test_interrupted_run_resumes_bit_by_bit(finished, config, small_data, tmp_pa
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
+@pytest.mark.slow
+def test_interrupted_at_ten_points_it_ends_bit_by_bit_as_the_whole(config, small_data, tmp_path):
+    config = dataclasses.replace(config, steps=12, log_every=1, checkpoint_every=4)
+    whole = train(config, tmp_path / "whole", datasets=(small_data,))
+    points = []
+
+    def interrupt(done, total, metrics):
+        points.append(done)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    for point in range(1, 11):
+        part = train(
+            config, tmp_path / "part", datasets=(small_data,), resume=point > 1, on_progress=interrupt
+        )
+        assert int(part.step) == point
+    assert points == list(range(1, 11))
+    resumed = train(config, tmp_path / "part", datasets=(small_data,), resume=True)
+    jax.tree.map(np.testing.assert_array_equal, resumed, whole)
+
+
 def test_a_folder_in_use_is_not_overwritten(finished, config):
     _, folder = finished
     before = (folder / "metrics.jsonl").read_text()

@@ -1,0 +1,145 @@
+"""Garments and motions that nobody here has seen: worn, pictured, and taken to other programs."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from formats import smpl_parameters, write_amass, write_hood
+from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
+from PIL import Image
+
+from eslr_jax.assets import load_motion
+from eslr_jax.body.rig import skeleton_motion
+from eslr_jax.config import TrainConfig
+from eslr_jax.evaluation.words import describe_report
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+
+
+@pytest.fixture(scope="module")
+def motions(tmp_path_factory, body):
+    """Four motions: two BVH files of other programs, and a walk as AMASS and HOOD store one."""
+    folder = tmp_path_factory.mktemp("motions")
+    for name in ("cmu_01_01.bvh", "makehuman_walk1.bvh"):
+        shutil.copy(FIXTURES / name, folder / name)
+    rotations, pelvis = smpl_parameters(skeleton_motion(load_motion("cmu_047_01"), body))
+    write_amass(folder / "amass.npz", rotations, pelvis, 30.0)
+    write_hood(folder / "hood.pkl", rotations, pelvis)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("shape", "motion"),
+    [
+        (skirt, "amass.npz"),
+        (shorts, "makehuman_walk1.bvh"),
+        (trousers, "cmu_01_01.bvh"),
+        (tube_dress, "hood.pkl"),
+        (poncho, "cmu_01_01.bvh"),
+        (cape, "amass.npz"),
+    ],
+)
+def test_a_foreign_garment_is_worn_on_a_foreign_motion(tmp_path, worn, slip, motions, shape, motion):
+    path = write_obj(tmp_path / "garment.obj", shape())
+    loop = ("--loop", 40) if motion.startswith("makehuman") else ()  # it has 17 frames
+    report, run = worn(path, tmp_path / "run", "--motion", motions / motion, *loop, frames=40)
+    cloth, wearer = run["positions"], run["body_positions"]
+    assert abs(slip(run)) < 0.05, "it falls off"
+    assert np.ptp(wearer[0, :, 1]) * 0.9 > cloth[0, :, 1].max() - wearer[0, :, 1].min(), "it is on the head"
+    assert np.linalg.norm(np.diff(cloth, axis=0), axis=-1).max() < 0.3, "it jumps"
+    warnings = " ".join(describe_report(report).warnings)
+    assert report["p99_principal_stretch"] < 1.5 or "stretched" in warnings
+    assert report["penetration_max_mm"] < 5.0 or "inside the body, frame" in warnings
+
+
+@pytest.fixture(scope="module")
+def fallen(tmp_path_factory, eslr):
+    """A skirt that nothing holds, after two seconds: its folder and its trajectory."""
+    folder = tmp_path_factory.mktemp("fallen")
+    path = write_obj(folder / "skirt.obj", skirt())
+    fit = eslr("fit", path, "--pin", "none", "--out", folder / "skirt.npz", "--no-picture")
+    assert fit.returncode == 0, fit.stderr
+    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--no-pictures")
+    done = eslr("simulate", "--garment", folder / "skirt.npz", *words, "--out", folder / "run")
+    assert done.returncode == 0, done.stderr
+    with np.load(folder / "run" / "trajectory.npz") as arrays:
+        return folder / "run", dict(arrays), done.stdout
+
+
+def test_a_skirt_that_nothing_holds_ends_on_the_ground_and_is_told(fallen):
+    folder, run, text = fallen
+    report = json.loads((folder / "report.json").read_text())
+    ground = float(run["body_positions"][..., 1].min())
+    assert report["ground_m"] == pytest.approx(ground, abs=1e-6)
+    heights = run["positions"][..., 1]
+    assert heights.min() > ground
+    assert heights[-1].min() < ground + 0.005
+    assert "warning: the garment slid or fell: its centre is" in text
+    assert "frame 6" in text
+
+
+def test_a_moment_of_a_run_becomes_a_picture(fallen, eslr, tmp_path):
+    folder, _, _ = fallen
+    pictures = []
+    for moment in ("0", "2s"):
+        out = tmp_path / f"{moment}.png"
+        result = eslr("render", folder, "--out", out, "--at", moment, "--samples", 2, "--width", 120)
+        assert result.returncode == 0, result.stderr
+        pictures.append(np.asarray(Image.open(out).convert("RGB"), float))
+    assert pictures[0].shape == (160, 120, 3)
+    # The label stands above, in the first forty rows.
+    blue = [(picture[..., 2] > 1.2 * picture[..., 0])[40:] for picture in pictures]
+    rows = [np.flatnonzero(part.any(axis=1)).mean() for part in blue]
+    assert rows[1] > rows[0] + 15, "the skirt has fallen"
+
+
+def test_a_run_goes_to_other_programs(fallen, eslr, tmp_path):
+    folder, run, _ = fallen
+    for out, words in (("run.glb", ()), ("frames", ("--format", "obj")), ("cache.pc2", ())):
+        result = eslr("export", folder, "--out", tmp_path / out, *words)
+        assert result.returncode == 0, result.stderr
+    frame = trimesh.load(sorted((tmp_path / "frames").glob("*.obj"))[30], process=False)
+    np.testing.assert_allclose(frame.vertices, run["positions"][30], atol=1e-5)
+    scene = trimesh.load(tmp_path / "run.glb", process=False)
+    cloth = min(scene.geometry.values(), key=lambda mesh: len(mesh.vertices))
+    np.testing.assert_allclose(cloth.vertices, run["positions"][0], atol=1e-5)
+    cache = (tmp_path / "cache.pc2").read_bytes()
+    points = np.frombuffer(cache[32:], "<f4").reshape(61, -1, 3)
+    np.testing.assert_allclose(points, run["positions"], atol=1e-6)
+
+
+def test_a_run_without_ground_falls_below_the_feet(fallen, eslr, tmp_path):
+    folder, _, _ = fallen
+    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--no-pictures", "--json")
+    garment = ("--garment", folder.parent / "skirt.npz", "--ground", "off")
+    result = eslr("simulate", *garment, *words, "--out", tmp_path)
+    report = json.loads(result.stdout)
+    assert report["ground_m"] is None
+    with np.load(tmp_path / "trajectory.npz") as arrays:
+        assert arrays["positions"][-1, :, 1].min() < arrays["body_positions"][-1, :, 1].min() - 0.02
+
+
+def test_lengths_that_are_listed_are_accepted(eslr, tmp_path):
+    listed = {
+        asset["name"]: asset for asset in json.loads(eslr("assets", "--kind", "motion", "--json").stdout)
+    }
+    count = listed["cmu_016_22"]["frames"]
+    words = ("--motion", "cmu_016_22", "--simulator", "physics", "--iterations", 0, "--no-pictures")
+    refused = eslr("simulate", *words, "--frames", count + 1, "--out", tmp_path / "out")
+    assert refused.returncode == 2
+    assert f"{count} frames" in refused.stderr
+    done = eslr("simulate", *words, "--frames", count, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["num_frames"] == count
+
+
+def test_the_help_of_training_lists_every_key(eslr):
+    text = " ".join(eslr("train", "--help").stdout.replace("│", " ").split())
+    for field in dataclasses.fields(TrainConfig):
+        assert f"{field.name}" in text
+    assert "learning_rate = 0.001: peak" in text
+    assert "model.latent_size = 128" in text

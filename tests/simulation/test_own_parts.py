@@ -1,0 +1,70 @@
+"""An energy and a network of one's own go through the public doors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+from flax import linen as nn
+from jax.tree_util import Partial
+
+from eslr_jax import SceneOptions, SimConfig, plan_scene, prepare_scene, rollout, simulate
+from eslr_jax.errors import ConfigError
+from eslr_jax.evaluation.report import trajectory_report
+from eslr_jax.physics.guess import initial_guess
+from eslr_jax.simulation.frame import first_problem
+
+DENSITY = 0.20022  # [kg/m2] of cotton
+
+
+def wind_energy(pressure, position, problem):
+    """A steady push along x [J]."""
+    moved = position[:, 0] - problem.position[:, 0]
+    return -pressure * jnp.sum(problem.garment.vertex_areas * moved)
+
+
+class Nudge(nn.Module):
+    """Moves the solver's own guess by a learned step."""
+
+    @nn.compact
+    def __call__(self, problem, state):
+        step = self.param("step", nn.initializers.zeros, (3,))
+        return initial_guess(problem).position + jnp.broadcast_to(step, state.position.shape)
+
+
+def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiated():
+    garment, poses = square(), drifting_ball(4, speed=0.0)
+
+    options = SceneOptions(energies=(Partial(wind_energy, 1.0),), has_body=False)
+    plan = plan_scene(garment, poses, options=options)
+
+    def last(pressure):
+        windy = plan.replace(energies=(Partial(wind_energy, pressure),))
+        trajectory = rollout(None, garment, poses, config=SimConfig(iterations=30), plan=windy)
+        return trajectory.positions[-1, :, 0].mean(), trajectory
+
+    slope, trajectory = jax.jit(jax.grad(last, has_aux=True))(jnp.float32(5.0))
+    way = np.asarray(trajectory.positions[..., 0]).mean(axis=1)
+    # Implicit Euler under a constant force: the speed grows by a dt each frame, and the place by v dt.
+    known = np.array([0, 1, 3, 6]) / DENSITY / 30**2
+    np.testing.assert_allclose(way - way[0], 5.0 * known, rtol=1e-3, atol=1e-6)
+    assert float(slope) == pytest.approx(known[-1], rel=1e-2)
+    scene = prepare_scene(garment, poses, options=SceneOptions(has_body=False))
+    own = trajectory_report(trajectory, scene)["terms"]["own"]
+    area = float(garment.vertex_areas.sum())
+    assert own == pytest.approx(-5.0 * area * 5.0 * known[-1] / 3, rel=1e-3)
+
+
+def test_an_own_network_goes_through_both_doors():
+    garment, poses, network = square(), drifting_ball(4), Nudge()
+    options = SceneOptions(has_body=False)
+    scene, plan = prepare_scene(garment, poses, options=options), plan_scene(garment, poses, options=options)
+    params = network.init(jax.random.key(0), jax.jit(first_problem)(scene), scene.initial_state)
+    config = SimConfig(model=network, iterations=0)
+    still = simulate(params, scene, config=config).trajectory
+    params = {"params": {"step": jnp.array([1e-3, 0.0, 0.0])}}
+    moved = rollout(params, garment, poses, config=config, plan=plan)
+    way = np.asarray(moved.positions[1] - still.positions[1])
+    np.testing.assert_allclose(way, np.broadcast_to([1e-3, 0.0, 0.0], way.shape), atol=1e-6)
+    with pytest.raises(ConfigError, match="without weights"):
+        rollout(None, garment, poses, config=config)
