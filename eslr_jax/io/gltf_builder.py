@@ -64,7 +64,8 @@ class GlbBuilder:
         rounded[:, :3] = np.round(points * steps)
         index = self.add_accessor(rounded, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
         accessor = self.document.accessors[index]
-        accessor.normalized, accessor.min, accessor.max = True, accessor.min[:3], accessor.max[:3]
+        accessor.normalized = True
+        accessor.min, accessor.max = rounded[:, :3].min(axis=0).tolist(), rounded[:, :3].max(axis=0).tolist()
         self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
         self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
         return index

@@ -18,7 +18,7 @@ def inertia_energy(
     position: Float[Array, "vertices 3"] | Vector3,
     inertial_guess: Float[Array, "vertices 3"],
     masses: Float[Array, " vertices"],
-    timestep: Float[Array, ""],
+    timestep: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Return sum_v m_v |x_v - (x_t + dt v_t)|^2 / (2 dt^2) [J].
 

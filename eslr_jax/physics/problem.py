@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
@@ -84,7 +84,7 @@ class FrameProblem:
     bdf2: SecondOrder | None = None  # None: implicit Euler
 
     @property
-    def inertial_timestep(self) -> Float[Array, ""]:
+    def inertial_timestep(self) -> Any:  # NumPy in float64 references
         """Time for which a frame's acceleration acts [s]."""
         return self.timestep if self.bdf2 is None else self.bdf2.timestep
 
