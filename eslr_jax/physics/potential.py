@@ -56,43 +56,39 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         problem: The frame's problem.
     """
     position = pin(problem, position)
-    garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = jnp.zeros((), position.dtype)
-    if problem.body is not None:
-        collision, friction = _body_energies(position, problem)
-    if problem.layers is not None:
-        layers = problem.layers
-        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
-    return PotentialTerms(
-        stretch=stretch_energy(position, garment, material),
-        bending=bending_energy(position, garment, material),
-        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.timestep),
-        gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
-        collision=collision,
-        friction=friction,
+    local, tips, repulsion = vertex_terms(position, problem), *pair_energies(position, problem)
+    return local._replace(
+        stretch=stretch_energy(position, problem.garment, problem.material),
+        bending=bending_energy(position, problem.garment, problem.material),
+        collision=local.collision + tips,
         repulsion=repulsion,
     )
 
 
-def _body_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the collision and the friction energy of a frame with a body [J]."""
-    body, constants = problem.body, problem.constants
+def vertex_terms(position: Float[Array, "vertices 3"], problem: FrameProblem) -> PotentialTerms:
+    """Return the energies that are sums over single vertices [J]; the others are zero.
+
+    Args:
+        position: Candidate positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem.
+    """
+    constants, body = problem.constants, problem.body
+    zero = jnp.zeros((), position.dtype)
+    terms = PotentialTerms(
+        stretch=zero,
+        bending=zero,
+        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.timestep),
+        gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
+        collision=zero,
+        friction=zero,
+        repulsion=zero,
+    )
     if body is None:
-        raise ValueError("a frame without a body has no energies of contact with it")
+        return terms
     collision = sum(
         collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
         for contacts in (body.nearest, body.opposing)
     )
-    if body.tips is not None:
-        collision = collision + repulsion_energy(
-            position,
-            body.tips.pairs,
-            constants.collision_stiffness,
-            constants.collision_thickness,
-            body.tips.next_body,
-        )
     friction = friction_energy(
         position,
         problem.position,
@@ -101,7 +97,26 @@ def _body_energies(
         constants.friction_coefficient,
         constants.friction_speed * problem.timestep,
     )
-    return jnp.asarray(collision), friction
+    return terms._replace(collision=jnp.asarray(collision), friction=friction)
+
+
+def pair_energies(
+    position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the energies of cloth against the body's tips and against cloth [J].
+
+    Args:
+        position: Candidate positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem.
+    """
+    constants, body, layers = problem.constants, problem.body, problem.layers
+    tips = repulsion = jnp.zeros((), position.dtype)
+    if body is not None and body.tips is not None:
+        stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
+        tips = repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)
+    if layers is not None:
+        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+    return tips, repulsion
 
 
 def potential(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:

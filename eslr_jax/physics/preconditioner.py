@@ -60,22 +60,24 @@ def hessian_diagonal(
         depth = penetration(position, body.nearest, body.thickness)
         depth = depth + penetration(position, body.opposing, body.thickness)
         slip = constants.friction_speed * problem.timestep
-        if body.tips is not None:
-            diagonal = diagonal + repulsion_diagonal(
-                position,
-                body.tips.pairs,
-                constants.collision_stiffness,
-                constants.collision_thickness,
-                body.tips.next_body,
-            )
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + constants.friction_coefficient * body.friction_load / (3.0 * slip)
-    if problem.layers is not None:
-        diagonal = diagonal + repulsion_diagonal(
-            position, problem.layers.pairs, constants.repulsion_stiffness, problem.layers.thickness
-        )
+    diagonal = diagonal + pair_diagonal(problem, position)
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
+
+
+def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
+    """Return the stiffness per vertex [N/m] of contact between faces and points, at positions [m]."""
+    constants, diagonal = problem.constants, jnp.zeros(position.shape[0], position.dtype)
+    tips = None if problem.body is None else problem.body.tips
+    if tips is not None:
+        stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
+        diagonal = repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
+    if problem.layers is not None:
+        stiffness, thickness = constants.repulsion_stiffness, problem.layers.thickness
+        diagonal = diagonal + repulsion_diagonal(position, problem.layers.pairs, stiffness, thickness)
+    return diagonal
 
 
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
