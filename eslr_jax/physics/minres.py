@@ -52,7 +52,8 @@ def solve_symmetric(
 ) -> LinearSolution:
     """Solve H v = force by preconditioned MINRES.
 
-    Its residual never grows, also where H is indefinite; conjugate gradients would divide by curvatures near zero.
+    Its residual never grows, also where H is indefinite. Conjugate gradients divide by curvatures, and in float32
+    they stall where one is near zero.
 
     Args:
         apply: Product with H, symmetric.

@@ -1,8 +1,9 @@
 """The tangent stiffness: the potential's exact Hessian at one position, as an assembled sparse matrix.
 
 Faces, hinges and vertices give small blocks, the automatic derivatives of their energies; a vertex's row holds
-one block for each vertex that it shares a face or a hinge with. At 1k vertices a product takes a tenth of the
-time of one gradient, and the blocks on the diagonal are there to precondition with.
+one block for each vertex that it shares a face or a hinge with. At 1k vertices a product takes a quarter of the
+time of one gradient, and a tenth of a product by automatic differentiation. The blocks on the diagonal
+precondition a solver.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from eslr_jax.physics.bending import hinge_energies
 from eslr_jax.physics.membrane import face_energies
 from eslr_jax.physics.potential import pair_energies, vertex_terms
 from eslr_jax.physics.preconditioner import hessian_diagonal, pair_diagonal
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.problem import FrameProblem, pin
 from eslr_jax.types import Garment
 
 _LEFT, _RIGHT = 2, 3  # the corners of a hinge that no edge joins
@@ -44,6 +45,7 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
         position: Where it is taken [m], shape [vertices, 3].
     """
     garment, material = problem.garment, problem.material
+    position = pin(problem, position)
     is_free = garment.vertex_mask
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
@@ -123,7 +125,7 @@ def _pattern(garment: Garment) -> tuple[Int[Array, "slots vertices"], Int[Array,
 
 def _find(rows: Int[Array, "items width"], values: Int[Array, " items"]) -> Int[Array, " items"]:
     """Return where in its row every value is."""
-    return sum(place * (rows[:, place] == values) for place in range(rows.shape[1]))  # type: ignore[return-value]
+    return sum(jnp.where(rows[:, place] == values, place, 0) for place in range(rows.shape[1]))  # type: ignore[return-value]
 
 
 def apply(matrix: Tangent, move: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
@@ -156,7 +158,7 @@ def precondition(inverse: Float[Array, "3 3 vertices"], force: Float[Array, "ver
 def inverse_diagonal(
     matrix: Tangent, problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, "3 3 vertices"]:
-    """Return the inverses of the blocks on the diagonal [m/N]; of an estimate where one is not positive definite."""
+    """Return the inverses of the blocks on the diagonal [m/N]; of an estimate where one is indefinite."""
     unit = jnp.eye(3, dtype=position.dtype)[:, :, None]
     blocks = matrix.blocks[0] + unit * pair_diagonal(problem, position)[None, None]
     a, b, c, d, e, f = (blocks[i, j] for i in range(3) for j in range(i, 3))
