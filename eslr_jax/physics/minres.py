@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-Operator = Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]]
+Operator = Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]]
 
 
 class LinearSolution(NamedTuple):
     """What became of a linear system H v = b."""
 
-    displacement: Float[Array, "vertices 3"]  # v [m]
+    displacement: Float[Array, "*shape"]  # v [m]
     residual: Float[Array, ""]  # relative to b, in the preconditioner's norm
     iterations: Int[Array, ""]
     is_indefinite: Bool[Array, ""]  # a direction of negative curvature was met
@@ -45,7 +45,7 @@ class _State(NamedTuple):
 def solve_symmetric(
     apply: Operator,
     precondition: Operator,
-    force: Float[Array, "vertices 3"],
+    force: Float[Array, "*shape"],
     *,
     tolerance: float,
     iterations: int,

@@ -34,7 +34,7 @@ class Tangent(NamedTuple):
     pairs: (
         Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]] | None
     )  # of contact between faces
-    is_free: Bool[Array, "vertices 1"]
+    is_free: Bool[Array, "1 vertices"]
 
 
 def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tangent:
@@ -65,7 +65,7 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
     num_slots, num_vertices = columns.shape
     rows = segment_sum(values, slots, num_slots * num_vertices)
     blocks = rows.reshape(num_vertices, num_slots, 3, 3).transpose(1, 2, 3, 0)
-    return Tangent(columns, blocks.at[0].add(vertices), pairs, is_free[:, None])
+    return Tangent(columns, blocks.at[0].add(vertices), pairs, is_free[None])
 
 
 def _element_blocks(energy: Callable, corners: tuple[Vector3, ...]) -> Float[Array, "size size items"]:
@@ -105,8 +105,12 @@ def _pattern(garment: Garment) -> tuple[Int[Array, "slots vertices"], Int[Array,
     corner, hinge = garment.hinge_incidence // num_hinges, garment.hinge_incidence % num_hinges
     is_outer = (corner == _LEFT) | (corner == _RIGHT)
     across = garment.hinges[hinge, jnp.where(is_outer, _LEFT + _RIGHT - corner, 0)]
+    # A vertex is an outer corner of at most as many hinges as it has faces: those come first.
+    first = jnp.argsort(~is_outer, axis=1)[:, : garment.face_incidence.shape[1]]
     own = jnp.arange(num_vertices, dtype=across.dtype)[:, None]
-    columns = jnp.concatenate([own, garment.neighbors, jnp.where(is_outer, across, own)], axis=1)
+    across = jnp.take_along_axis(jnp.where(is_outer, across, own), first, axis=1)
+    places = jnp.take_along_axis(garment.hinge_incidence, first, axis=1)
+    columns = jnp.concatenate([own, garment.neighbors, across], axis=1)
 
     slots = []
     for items in (garment.faces, garment.hinges):
@@ -116,7 +120,7 @@ def _pattern(garment: Garment) -> tuple[Int[Array, "slots vertices"], Int[Array,
                 slot = jnp.zeros_like(vertex)
             elif {row, column} == {_LEFT, _RIGHT}:
                 place = row * num_hinges + jnp.arange(num_hinges, dtype=vertex.dtype)
-                slot = 1 + degree + _find(garment.hinge_incidence[vertex], place)
+                slot = 1 + degree + _find(places[vertex], place)
             else:
                 slot = 1 + _find(garment.neighbors[vertex], items[:, column])
             slots.append(vertex * columns.shape[1] + slot)
@@ -128,31 +132,26 @@ def _find(rows: Int[Array, "items width"], values: Int[Array, " items"]) -> Int[
     return sum(jnp.where(rows[:, place] == values, place, 0) for place in range(rows.shape[1]))  # type: ignore[return-value]
 
 
-def apply(matrix: Tangent, move: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return the forces [N] that a displacement [m] raises, both of shape [vertices, 3]."""
+def apply(matrix: Tangent, move: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+    """Return the forces [N] that a displacement [m] raises, both by components."""
     free = jnp.where(matrix.is_free, move, 0.0)
-    x = components(free)
-
-    def add(slot: Array, total: Vector3) -> Vector3:
-        other = [part[matrix.columns[slot]] for part in x]
-        block = matrix.blocks[slot]
-        return tuple(  # type: ignore[return-value]
-            total[row] + sum(block[row, column] * other[column] for column in range(3)) for row in range(3)
-        )
-
-    # A loop, although its length is fixed: unrolled, it takes twice as long on a CPU.
-    zero = jnp.zeros_like(x[0])
-    force = jnp.stack(jax.lax.fori_loop(0, matrix.columns.shape[0], add, (zero, zero, zero)), axis=-1)
+    # Gathered at once, and the sum written out: a loop over the slots takes four times as long on a CPU.
+    others = jax.lax.optimization_barrier(free.T[matrix.columns])
+    couples = [(slot, column) for slot in range(len(matrix.columns)) for column in range(3)]
+    rows = [
+        sum(matrix.blocks[slot, row, column] * others[slot, :, column] for slot, column in couples)
+        for row in range(3)
+    ]
+    force = jnp.stack(rows)  # type: ignore[arg-type]
     if matrix.pairs is not None:
-        force = force + matrix.pairs(free)
+        force = force + matrix.pairs(free.T).T
     return jnp.where(matrix.is_free, force, move)
 
 
-def precondition(inverse: Float[Array, "3 3 vertices"], force: Float[Array, "vertices 3"]) -> Array:
-    """Return displacements [m], shape [vertices, 3], from inverse blocks and forces [N]."""
-    x = components(force)
+def precondition(inverse: Float[Array, "3 3 vertices"], force: Float[Array, "3 vertices"]) -> Array:
+    """Return displacements [m] from inverse blocks and forces [N], both by components."""
     # Written out: XLA does not vectorise the sum over an axis in front on a CPU.
-    return jnp.stack([sum(inverse[row, column] * x[column] for column in range(3)) for row in range(3)], -1)
+    return jnp.stack([sum(inverse[row, column] * force[column] for column in range(3)) for row in range(3)])
 
 
 def inverse_diagonal(
@@ -164,7 +163,7 @@ def inverse_diagonal(
     a, b, c, d, e, f = (blocks[i, j] for i in range(3) for j in range(i, 3))
     cofactors = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
     determinant = a * cofactors[0] + b * cofactors[1] + c * cofactors[2]
-    is_free = matrix.is_free[:, 0]
+    is_free = matrix.is_free[0]
     is_positive = (a > 0) & (cofactors[5] > 0) & (determinant > 0) & is_free
     order = jnp.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     inverse = jnp.stack(cofactors)[order] / jnp.where(is_positive, determinant, 1.0)[None, None]
