@@ -18,8 +18,15 @@ def dihedral_angles(
     theta = atan2(e_hat . (n_a x n_b), n_a . n_b); the two area factors of the unnormalised normals cancel.
     A collapsed hinge has a zero gradient.
     """
+    return _angles(_hinge_corners(position, garment))
+
+
+def _hinge_corners(position: Float[Array, "vertices 3"], garment: Garment) -> tuple[Vector3, ...]:
     # Gathered once: XLA would repeat the gathers in every one of the twelve components of the gradient.
-    corners = jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
+    return jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
+
+
+def _angles(corners: tuple[Vector3, ...]) -> tuple[Float[Array, " hinges"], Float[Array, " hinges"]]:
     edge = sub3(corners[1], corners[0])
     return _corner_angles(*corners), dot3(edge, edge)
 
@@ -86,20 +93,39 @@ def bending_energy(
     use_rest_angles: bool = False,
     use_current_length: bool = False,
 ) -> Float[Array, ""]:
-    """Return the bending energy [J].
+    """Return the bending energy [J], the sum of `hinge_energies` at positions [m], shape [vertices, 3]."""
+    energies = hinge_energies(
+        _hinge_corners(position, garment),
+        garment,
+        material,
+        use_rest_angles=use_rest_angles,
+        use_current_length=use_current_length,
+    )
+    return jnp.sum(energies)
 
-    E = sum_hinges k_b l^2 / (4 (A_a + A_b)) (theta - theta_rest)^2 / 2.
+
+def hinge_energies(
+    corners: tuple[Vector3, ...],
+    garment: Garment,
+    material: Material,
+    *,
+    use_rest_angles: bool = False,
+    use_current_length: bool = False,
+) -> Float[Array, " hinges"]:
+    """Return the bending energy of every hinge [J].
+
+    E_h = k_b l^2 / (4 (A_a + A_b)) (theta - theta_rest)^2 / 2.
 
     Args:
-        position: Vertex positions [m], shape [vertices, 3].
+        corners: Positions of the hinges' corners [m], of `gather_corners`.
         garment: Hinges with the sum of their rest areas, and rest angles.
         material: Bending stiffness k_b [J].
         use_rest_angles: Bend around the rest mesh's own angles; fabric is flat, so off by default.
-        use_current_length: Take l from `position`, as HOOD does, instead of from the rest mesh.
+        use_current_length: Take l from the corners, as HOOD does, instead of from the rest mesh.
 
     Source: HOOD (arXiv 2212.07242); Grinspun et al. 2003, doi 10.2312/SCA03/062-067.
     """
-    angle, squared_length = dihedral_angles(position, garment)
+    angle, squared_length = _angles(corners)
     if not use_current_length:
         squared_length = rest_squared_lengths(garment)
     if use_rest_angles:
@@ -108,7 +134,7 @@ def bending_energy(
     is_real = areas > 0
     scale = jnp.where(is_real, squared_length / (4.0 * jnp.where(is_real, areas, 1.0)), 0.0)
     (stiffness,) = in_memory(0.5 * material.bending_stiffness * scale)
-    return jnp.sum(stiffness * angle * angle)
+    return stiffness * angle * angle
 
 
 def rest_squared_lengths(garment: Garment) -> Float[Array, " hinges"]:

@@ -37,9 +37,9 @@ from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import BodyContact, FrameProblem, GroundContact, mean_vertex_area, pin
+from eslr_jax.physics.problem import FrameProblem, mean_vertex_area, pin
 from eslr_jax.physics.repulsion import repulsion_energy
-from eslr_jax.types import PotentialTerms
+from eslr_jax.types import Contacts, PotentialTerms
 
 
 class Point(NamedTuple):
@@ -60,79 +60,82 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
     """
     position = pin(problem, position)
     x = components(position)  # once: gradients of all terms are then summed by components, and joined once
-    garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = own = jnp.zeros((), position.dtype)
+    local, (on_body, repulsion) = vertex_terms(x, problem), pair_energies(x, problem)
+    return local._replace(
+        stretch=stretch_energy(x, problem.garment, problem.material),
+        bending=bending_energy(x, problem.garment, problem.material),
+        collision=local.collision + on_body,
+        repulsion=repulsion,
+        own=own_energy(position, problem),
+    )
+
+
+def vertex_terms(position: Vector3, problem: FrameProblem) -> PotentialTerms:
+    """Return the energies that are sums over single vertices [J]; the others are zero.
+
+    Args:
+        position: Candidate positions at t + 1 [m], by components.
+        problem: The frame's problem.
+    """
+    constants = problem.constants
+    zero = collision = friction = jnp.zeros((), position[0].dtype)
+    planes = []
     if problem.body is not None:
-        collision, friction = _body_energies(x, problem, problem.body)
+        body = problem.body
+        planes += [(contacts, body.thickness) for contacts in (body.nearest, body.opposing)]
+        friction += _friction(position, body.nearest, body.friction_load, problem)
     if problem.ground is not None:
-        on_ground = _ground_energies(x, problem, problem.ground)
-        collision, friction = collision + on_ground[0], friction + on_ground[1]
-    if problem.layers is not None:
-        layers = problem.layers
-        repulsion = repulsion_energy(x, layers.pairs, constants.repulsion_stiffness, layers.thickness)
-    for energy in problem.energies:
-        own = own + energy(position, problem)
+        ground = problem.ground
+        planes.append((ground.contacts, ground.thickness))
+        friction += _friction(position, ground.contacts, ground.friction_load, problem)
+    for contacts, thickness in planes:
+        stiffness = constants.collision_stiffness
+        collision += collision_energy(position, contacts, problem.garment, stiffness, thickness)
     return PotentialTerms(
-        stretch=stretch_energy(x, garment, material),
-        bending=bending_energy(x, garment, material),
-        inertia=inertia_energy(x, problem.inertial_guess, problem.masses, problem.inertial_timestep),
-        gravity=gravity_energy(x, problem.position, problem.masses, constants.gravity),
+        stretch=zero,
+        bending=zero,
+        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.inertial_timestep),
+        gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
         collision=collision,
         friction=friction,
-        repulsion=repulsion,
-        own=own,
+        repulsion=zero,
+        own=zero,
     )
 
 
-def _body_energies(
-    position: Vector3, problem: FrameProblem, body: BodyContact
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the collision and the friction energy of a frame with a body [J]."""
+def _friction(
+    position: Vector3, contacts: Contacts, load: Float[Array, " vertices"], problem: FrameProblem
+) -> Float[Array, ""]:
+    """Return the friction energy of a frame with the body, or with the ground [J]."""
     constants = problem.constants
-    collision = sum(
-        collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
-        for contacts in (body.nearest, body.opposing)
-    )
-    if body.skin is not None:
-        area = mean_vertex_area(problem.garment)
-        thickness = constants.collision_thickness
-        collision += skin_energy(position, body.skin, area, constants.collision_stiffness, thickness)
-    if body.tips is not None:
-        collision = collision + repulsion_energy(
-            position,
-            body.tips.pairs,
-            constants.collision_stiffness,
-            constants.collision_thickness,
-            body.tips.next_body,
-        )
-    friction = friction_energy(
-        position,
-        problem.position,
-        body.nearest,
-        body.friction_load,
-        constants.friction_coefficient,
-        constants.friction_speed * problem.timestep,
-    )
-    return jnp.asarray(collision), friction
+    slip = constants.friction_speed * problem.timestep
+    return friction_energy(position, problem.position, contacts, load, constants.friction_coefficient, slip)
 
 
-def _ground_energies(
-    position: Vector3, problem: FrameProblem, ground: GroundContact
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the collision and the friction energy of a frame with a ground [J]."""
-    constants = problem.constants
-    collision = collision_energy(
-        position, ground.contacts, problem.garment, constants.collision_stiffness, ground.thickness
-    )
-    friction = friction_energy(
-        position,
-        problem.position,
-        ground.contacts,
-        ground.friction_load,
-        constants.friction_coefficient,
-        constants.friction_speed * problem.timestep,
-    )
-    return collision, friction
+def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the energies of faces of cloth against the body's vertices, and against cloth [J].
+
+    Args:
+        position: Candidate positions at t + 1 [m], by components.
+        problem: The frame's problem.
+    """
+    constants, body, layers = problem.constants, problem.body, problem.layers
+    on_body = repulsion = jnp.zeros((), position[0].dtype)
+    if body is not None:
+        stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
+        if body.skin is not None:
+            area = mean_vertex_area(problem.garment)
+            on_body += skin_energy(position, body.skin, area, stiffness, thickness)
+        if body.tips is not None:
+            on_body += repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)
+    if layers is not None:
+        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+    return on_body, repulsion
+
+
+def own_energy(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
+    """Return the sum of a user's own terms [J] at positions [m], shape [vertices, 3]; see `SceneOptions`."""
+    return sum((energy(position, problem) for energy in problem.energies), jnp.zeros((), position.dtype))
 
 
 def potential(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:

@@ -9,8 +9,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components, scatter_corners
-from eslr_jax.physics.collision import penetration, skin_diagonal
-from eslr_jax.physics.problem import FrameProblem, mean_vertex_area
+from eslr_jax.physics.collision import penetration
+from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 
@@ -60,17 +60,6 @@ def hessian_diagonal(
         depth = penetration(position, body.nearest, body.thickness)
         depth = depth + penetration(position, body.opposing, body.thickness)
         slip = constants.friction_speed * problem.timestep
-        if body.skin is not None:
-            area, thickness = mean_vertex_area(garment), constants.collision_thickness
-            diagonal += skin_diagonal(position, body.skin, area, constants.collision_stiffness, thickness)
-        if body.tips is not None:
-            diagonal = diagonal + repulsion_diagonal(
-                position,
-                body.tips.pairs,
-                constants.collision_stiffness,
-                constants.collision_thickness,
-                body.tips.next_body,
-            )
         # The contact curvature acts along one of three axes, friction along two.
         diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + constants.friction_coefficient * body.friction_load / (3.0 * slip)
@@ -79,11 +68,24 @@ def hessian_diagonal(
         slip = constants.friction_speed * problem.timestep
         diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
         diagonal = diagonal + constants.friction_coefficient * problem.ground.friction_load / (3.0 * slip)
-    if problem.layers is not None:
-        diagonal = diagonal + repulsion_diagonal(
-            position, problem.layers.pairs, constants.repulsion_stiffness, problem.layers.thickness
-        )
+    diagonal = diagonal + pair_diagonal(problem, position)
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
+
+
+def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
+    """Return the stiffness per vertex [N/m] of contact between faces and points, at positions [m]."""
+    constants, diagonal = problem.constants, jnp.zeros(position.shape[0], position.dtype)
+    if problem.body is not None:
+        skin, tips = problem.body.skin, problem.body.tips
+        stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
+        if skin is not None:
+            diagonal += skin_diagonal(position, skin, mean_vertex_area(problem.garment), stiffness, thickness)
+        if tips is not None:
+            diagonal += repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
+    if problem.layers is not None:
+        stiffness, thickness = constants.repulsion_stiffness, problem.layers.thickness
+        diagonal = diagonal + repulsion_diagonal(position, problem.layers.pairs, stiffness, thickness)
+    return diagonal
 
 
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:

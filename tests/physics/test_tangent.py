@@ -1,0 +1,112 @@
+"""The assembled Hessian against automatic differentiation, and the linear solver on it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.physics.minres import solve_symmetric
+from eslr_jax.physics.potential import potential
+from eslr_jax.physics.tangent import apply, inverse_diagonal, precondition, tangent
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+
+
+class Crumpled(NamedTuple):
+    """What a frame of a crumpled sheet has; arrays of float32."""
+
+    move: jax.Array
+    is_free: jax.Array
+    forces: jax.Array  # by automatic differentiation
+    assembled: jax.Array
+    diagonal: jax.Array
+    inverse: jax.Array
+
+
+@pytest.fixture(scope="module")
+def crumpled():
+    """A pinned sheet of 25 vertices on a ball, with self-contact, all vertices (pinned ones too) off by noise."""
+    options = SceneOptions(self_contact=True)
+    scene = prepare_scene(square(5, 0.12, is_pinned=np.array([0, 3])), drifting_ball(2), options=options)
+    first = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    is_free = (scene.garment.vertex_mask & ~scene.garment.is_pinned)[:, None]
+    noise, move = np.random.default_rng(0).standard_normal((2, *is_free.shape[:1], 3)).astype(np.float32)
+
+    @jax.jit
+    def everything(position, move):
+        problem = frame_problem(scene, scene.initial_state, first)
+        free = jnp.where(is_free, move, 0.0)
+        _, forces = jax.jvp(lambda x: jax.grad(potential)(x, problem), (position,), (free,))
+        matrix = tangent(problem, position)
+        inverse = inverse_diagonal(matrix, problem, position)
+        return Crumpled(move, is_free, forces, apply(matrix, move.T).T, matrix.blocks[0], inverse)
+
+    return everything(scene.initial_state.position + 3e-3 * jnp.asarray(noise), jnp.asarray(move))
+
+
+def test_the_assembled_product_is_that_of_automatic_differentiation(crumpled):
+    expected = jnp.where(crumpled.is_free, crumpled.forces, crumpled.move)
+    tolerance = 1e-5 * float(jnp.abs(crumpled.forces).max())
+    np.testing.assert_allclose(crumpled.assembled, expected, atol=tolerance)
+
+
+def test_preconditioner_inverts_the_blocks_on_the_diagonal(crumpled):
+    blocks = np.asarray(crumpled.inverse).transpose(2, 0, 1)
+    vertex = 12  # in the middle; free, and its block is positive definite
+    np.testing.assert_allclose(
+        blocks[vertex] @ np.asarray(crumpled.diagonal)[..., vertex], np.eye(3), atol=1e-3
+    )
+    assert np.linalg.eigvalsh(blocks).min() > 0
+    expected = np.einsum("vij,vj->vi", blocks, crumpled.move)
+    np.testing.assert_allclose(
+        precondition(crumpled.inverse, crumpled.move.T).T, expected, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_an_indefinite_system_is_solved_and_said_to_be_so():
+    random = np.random.default_rng(3)
+    basis, _ = np.linalg.qr(random.standard_normal((12, 12)))
+    values = np.linspace(1.0, 5.0, 12)
+    values[0] = -0.5
+    force = random.standard_normal((4, 3)).astype(np.float32)
+    for sign, is_indefinite in ((-1.0, True), (1.0, False)):
+        values[0] = sign * 0.5
+        matrix = jnp.asarray((basis * values) @ basis.T, jnp.float32)
+        found = solve_symmetric(
+            lambda v, matrix=matrix: (matrix @ v.ravel()).reshape(v.shape),
+            lambda v: 0.5 * v,
+            jnp.asarray(force),
+            tolerance=1e-5,
+            iterations=50,
+        )
+        expected = np.linalg.solve(np.asarray(matrix, float), force.ravel()).reshape(force.shape)
+        np.testing.assert_allclose(found.displacement, expected, rtol=1e-3, atol=1e-4)
+        assert bool(found.is_indefinite) is is_indefinite
+        assert float(found.residual) < 1e-4
+        assert int(found.iterations) <= 14
+
+
+def test_a_system_without_a_right_side_is_left_at_zero():
+    found = solve_symmetric(lambda v: v, lambda v: v, jnp.zeros((4, 3)), tolerance=1e-3, iterations=9)
+    assert int(found.iterations) == 0
+    np.testing.assert_array_equal(found.displacement, 0.0)
+
+
+def test_a_system_that_stalls_says_what_is_left():
+    random = np.random.default_rng(4)
+    matrix = jnp.asarray(np.diag(np.geomspace(1e-4, 1.0, 12)), jnp.float32)
+    force = jnp.asarray(random.standard_normal((4, 3)), jnp.float32)
+    found = solve_symmetric(
+        lambda v: (matrix @ v.ravel()).reshape(v.shape), lambda v: v, force, tolerance=1e-6, iterations=3
+    )
+    left = force - (matrix @ found.displacement.ravel()).reshape(force.shape)
+    assert int(found.iterations) == 3
+    assert float(found.residual) == pytest.approx(
+        float(jnp.linalg.norm(left) / jnp.linalg.norm(force)), rel=1e-4
+    )
+    assert float(found.residual) > 0.05
