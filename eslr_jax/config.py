@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import tomllib
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
@@ -285,11 +284,6 @@ def describe_keys(cls: type, prefix: str = "") -> list[str]:
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a config as plain values, ready for JSON."""
     return dataclasses.asdict(config)
-
-
-def to_json(config: Any) -> str:
-    """Return a config as JSON text."""
-    return json.dumps(to_dict(config), indent=2)
 
 
 def apply_overrides(values: dict[str, Any], overrides: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ from eslr_jax.config import (
     from_dict,
     parse_override,
     to_dict,
-    to_json,
 )
 from eslr_jax.errors import ConfigError
 from eslr_jax.training.recipe import load_recipe
@@ -18,7 +17,7 @@ from eslr_jax.training.recipe import load_recipe
 
 def test_round_trip_through_json():
     config = SimConfig(model=ModelConfig(latent_size=64), iterations=3)
-    assert from_dict(SimConfig, json.loads(to_json(config))) == config
+    assert from_dict(SimConfig, json.loads(json.dumps(to_dict(config)))) == config
 
 
 def test_unknown_key_suggests_the_closest():

@@ -104,6 +104,25 @@ def skin(
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
 
+def skin_frames(
+    positions: Float[Array, "vertices 3"],
+    weights: Float[Array, "vertices influences"],
+    indices: Int[Array, "vertices influences"],
+    transforms: Float[Array, "frames joints 3 4"],
+) -> Float[Array, "frames vertices 3"]:
+    """Return skinned points of every frame [m], shape [frames, vertices, 3].
+
+    One frame after the other: a vmap would hold frames x vertices x influences matrices at once.
+
+    Args:
+        positions: Rest points [m], shape [vertices, 3].
+        weights: Skin weights, rows sum to one, shape [vertices, influences].
+        indices: Joint of each weight, shape [vertices, influences].
+        transforms: Affine map of each joint in every frame, shape [frames, joints, 3, 4].
+    """
+    return jax.lax.map(lambda frame: skin(positions, weights, indices, frame), transforms)
+
+
 def bend(
     directions: Float[Array, "vertices 3 entries"], turned: Float[Array, "joints 3 3"]
 ) -> Float[Array, "vertices 3"]:

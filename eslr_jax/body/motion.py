@@ -216,9 +216,12 @@ def _skin_body(body: Body, rotations: np.ndarray, transforms: jax.Array) -> jax.
     """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
     rest = body.rest_positions
     if body.pose_directions is None:
-        return skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
+        return _skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
     bends = jnp.asarray(rotations[:, 1:], jnp.float32)
     return _skin_bent(rest, body.pose_directions, body.skin_weights, body.skin_indices, bends, transforms)
+
+
+_skin_frames = jax.jit(lbs.skin_frames)
 
 
 @jax.jit
@@ -233,18 +236,3 @@ def _skin_bent(rest, directions, weights, indices, rotations, transforms):
         return lbs.skin(rest + lbs.bend(directions, turned), weights, indices, frame[1])
 
     return jax.lax.map(pose, (rotations, transforms))
-
-
-@jax.jit
-def skin_frames(positions, weights, indices, transforms):
-    """Return skinned points of every frame [m], shape [frames, vertices, 3].
-
-    One frame after the other: a vmap would need many times the memory.
-
-    Args:
-        positions: Rest points [m], shape [vertices, 3].
-        weights: Skin weights, shape [vertices, influences].
-        indices: Joint of each weight, shape [vertices, influences].
-        transforms: Map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
-    """
-    return jax.lax.map(lambda frame: lbs.skin(positions, weights, indices, frame), transforms)

@@ -10,7 +10,7 @@ import sys
 import warnings
 
 from eslr_jax.cli import assets, bodies, budget, evaluate, garments, runs, simulate, train
-from eslr_jax.cli.console import app, stderr
+from eslr_jax.cli.console import app, say
 from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
 from eslr_jax.errors import ConfigError, EslrError
 
@@ -31,16 +31,16 @@ def main() -> None:
         with leave_at_once():
             app.cli(prog="eslr")
     except EslrError as error:
-        stderr.print(f"eslr: {error}", markup=False, highlight=False, soft_wrap=True)
+        say(f"eslr: {error}")
         sys.exit(2)
     except KeyboardInterrupt:
-        stderr.print("eslr: interrupted", markup=False)
+        say("eslr: interrupted")
         sys.exit(EXIT_CODE)
 
 
 def _show_warning(message, category, *_) -> None:
     """Show a warning as one line on stderr."""
-    stderr.print(str(message), markup=False, highlight=False, soft_wrap=True)
+    say(str(message))
 
 
 def _refuse_repetition(arguments: list[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.cli.console import app, say, stderr, use_compile_cache
 from eslr_jax.errors import AssetError, MissingExtraError
 from eslr_jax.fit.options import FitOptions
 
@@ -47,19 +47,14 @@ def fit(
         raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
     use_compile_cache()
 
-    def say(text: str | None) -> None:
-        if text:
-            stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+    def describe_source(source) -> None:
+        text = describe_cost(len(source.mesh.positions))
+        if text and options.edge_length is None:  # else it is remeshed, and its size is chosen
+            say(text)
 
     with stderr.status("fitting"):
         rig = load_body(body)
-        is_remeshed = options.edge_length is not None
-        stored = load_garment_file(
-            garment,
-            body=rig,
-            fit=options,
-            on_source=lambda source: say(None if is_remeshed else describe_cost(len(source.mesh.positions))),
-        )
+        stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
         if "fit" not in stored.metadata:
             raise AssetError(
                 f"{garment} needs no fit: it is bundled or already fitted; give it to eslr simulate, or give "
@@ -94,6 +89,6 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
                 for positions in (stored.sewn_positions, stored.rest_positions)
             ]
     except MissingExtraError as error:
-        stderr.print(f"no picture: {error}", markup=False, highlight=False, soft_wrap=True)
+        say(f"no picture: {error}")
         return
     write_png(path, side_by_side(pictures, ("before", "after")))

@@ -9,7 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 
-from eslr_jax.cli.console import stderr
+from eslr_jax.cli.console import say
 
 EXIT_CODE = 130  # of a program that Ctrl-C ended
 _PATIENCE = 1.0  # [s] in which Python may end by itself
@@ -37,7 +37,7 @@ def leave_at_once() -> Iterator[None]:
                 if number[0] != signal.SIGINT or handler != signal.default_int_handler:
                     continue
                 if not is_over.wait(_PATIENCE):
-                    stderr.print("eslr: interrupted", markup=False)
+                    say("eslr: interrupted")
                     os._exit(EXIT_CODE)
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -76,4 +76,4 @@ class Interruption:
     def _remember(self, number: int, frame: object) -> None:
         self.is_wanted = True
         self.end()
-        stderr.print(self._message, markup=False, highlight=False, soft_wrap=True)
+        say(self._message)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 from rich.console import Console
@@ -18,6 +18,13 @@ from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
 from eslr_jax.cli.options import Options, check_same_scene, interrupted_record, read_interrupted
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
+
+if TYPE_CHECKING:
+    from eslr_jax.config import ModelConfig, SimConfig
+    from eslr_jax.io.garment import GarmentFile
+    from eslr_jax.simulation.budget import Choice
+    from eslr_jax.simulation.simulate import Simulation
+    from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
@@ -113,6 +120,18 @@ def simulate(
         sys.exit(EXIT_CODE)
 
 
+class _Method(NamedTuple):
+    """How a scene is simulated: the options with their defaults filled in."""
+
+    simulator: str  # "physics" or "network"
+    model: str | None
+    params: Any  # weights; None without a network
+    config: SimConfig
+    choice: Choice | None  # what a budget or a tolerance led to
+    budget_ms: float | None
+    tolerance: float | None
+
+
 def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bool) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report."""
     from eslr_jax.io.atomic import atomic_write, ensure_output_dir
@@ -124,65 +143,34 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         done, options, choice, capacity = read_interrupted(out, options)
     if options.frames is not None and options.frames < 2:
         raise AssetError(f"--frames {options.frames}: a simulation needs two frames or more")
-
-    import jax
-    import numpy as np
-
-    from eslr_jax.assets import load_garment_file, load_model, prepare_stored
-    from eslr_jax.assets.load import default_model
-    from eslr_jax.body.timing import check_speed, with_settling
-    from eslr_jax.config import SimConfig
-    from eslr_jax.contact.nearest import MAX_APPROACH
-    from eslr_jax.errors import Status
-    from eslr_jax.evaluation.report import environment, trajectory_report
-    from eslr_jax.evaluation.wear import wear_report
-    from eslr_jax.fabric import beyond_training, garment_material
-    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
-    from eslr_jax.io.garment import write_garment_npz
-    from eslr_jax.scene.build import skin_garment
-    from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-    from eslr_jax.simulation.budget import SOLVER, choose, expected_ms, keep_budget, read_calibration
-    from eslr_jax.simulation.simulate import good_frames, last_frames, raise_for_status, try_simulate
-
-    simulator, model, iterations = options.simulator, options.model, options.iterations
-    is_chosen = simulator is None and model is None and iterations is None
-    budget_ms, share = parse_request(options.budget, options.tolerance, is_chosen=is_chosen)
-    if simulator == "physics" and model is not None:
-        raise ConfigError(f"--simulator physics has no network; leave out --model {model}")
     if options.settle < 0:
         raise ConfigError(f"--settle {options.settle}: give a number of frames, 0 or more")
-    if iterations is not None and iterations < 0:
-        raise ConfigError(f"--iterations {iterations}: give a number, 0 or more")
+    if options.iterations is not None and options.iterations < 0:
+        raise ConfigError(f"--iterations {options.iterations}: give a number, 0 or more")
+
+    import numpy as np
+
+    from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.body.timing import check_speed, with_settling
+    from eslr_jax.contact.nearest import MAX_APPROACH
+    from eslr_jax.fabric import beyond_training, garment_material
+    from eslr_jax.fit.report import LARGE, describe_fit
+    from eslr_jax.io.garment import write_garment_npz
+    from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
+    from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
+
+    request = _read_request(options)
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)
         stored = load_garment_file(
             options.garment,
             vertices=options.vertices,
             body=rig,
-            on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
+            on_source=lambda source: _say_cost(len(source.mesh.positions)),
         )
-        if choice is None and (budget_ms is not None or share is not None):
-            choice = choose(
-                read_calibration(), len(stored.rest_positions), budget_ms=budget_ms, tolerance=share
-            )
-        if choice is not None:
-            simulator = "physics" if choice.method == SOLVER else "network"
-            model = None if choice.method == SOLVER else choice.method
-            iterations = choice.iterations
-        simulator = simulator or ("physics" if iterations is not None and model is None else "network")
-        params, architecture = None, None
-        layout: dict[str, Any] = {}
-        if simulator == "network":
-            model = model or default_model()
-            params, architecture = load_model(model)
-            layout = {
-                "embedding_size": architecture.embedding_size,
-                "embedding_mode": architecture.embedding_mode,
-            }
-        cloth = prepare_stored(stored, name=Path(options.garment).name, **layout)
+        method = _choose_method(options, request, len(stored.rest_positions), choice)
+        cloth = prepare_stored(stored, name=Path(options.garment).name, **_embedding(method.config.model))
         material = garment_material(options.fabric, cloth, stored)
-        # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
-        unseen = beyond_training(material) if simulator == "network" and share is None else ()
         check_skin(options.garment, cloth, rig, options.body)
         settling = with_settling(poses, options.settle)
         scene = prepare_scene(
@@ -197,95 +185,48 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             check_same_scene(done, scene, out)
             scene = scene.replace(self_contact=capacity)
     out = ensure_output_dir(out)
-    if unseen:
+    # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
+    if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     if "fit" in stored.metadata:
         say(describe_fit(stored.metadata["fit"]))
-    usual = _ITERATIONS if architecture is None else _BEHIND_NETWORK
-    config = SimConfig(
-        model=architecture,
-        iterations=usual if iterations is None else iterations,
-        tolerance=0.0 if choice is None else choice.tolerance,
-    )
-    num_vertices = len(stored.rest_positions)
-    if num_vertices >= LARGE:
-        method = model if architecture is not None and model is not None else SOLVER
-        frame_ms = (
-            expected_ms(read_calibration(), num_vertices, method, config.iterations)
-            if choice is None
-            else choice.expected_ms
-        )
-        say(describe_load(num_vertices, scene.num_frames, frame_ms))
-    pace = None if choice is None or budget_ms is None else keep_budget(choice, budget_ms)
-    stop = Interruption("stopping after these frames; Ctrl-C again stops at once and loses them")
-    with progress("simulating", scene.num_frames - 1) as advance:
-
-        def on_frames(count: int, total: int) -> None:
-            advance(count, total)
-            stop.begin()  # before the first frames are done there is nothing to keep
-
-        try:
-            whole, timing, scene = try_simulate(
-                params,
-                scene,
-                config=config,
-                pace=pace,
-                on_frames=on_frames,
-                is_stopping=lambda: stop.is_wanted,
-                done=done,
-            )
-        finally:
-            stop.end()
-    kept, total = good_frames(whole), poses.positions.shape[0]
-    error, count = None, kept.num_frames - options.settle
-    if int(whole.status) != Status.OK:
+    if len(stored.rest_positions) >= LARGE:
+        say(_describe_load(method, len(stored.rest_positions), scene.num_frames))
+    whole, timing, scene = _run(method, scene, done)
+    kept, total, error = good_frames(whole), poses.positions.shape[0], None
+    count = kept.num_frames - options.settle
+    try:
+        raise_for_status(whole)
+    except EslrError as raised:
         if count < 2:
-            raise_for_status(whole)
-        try:
-            raise_for_status(whole)
-        except EslrError as raised:
-            error = str(raised)
+            raise
+        error = str(raised)
     is_unfinished = count < total
     if is_unfinished:
         if count < 2:
             raise KeyboardInterrupt
-        record = interrupted_record(options, choice, scene.self_contact)
-        write_unfinished(out, kept, record)
+        write_unfinished(out, kept, interrupted_record(options, method.choice, scene.self_contact))
         poses = poses.replace(
             positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
         )
         scene = first_frames(scene, kept.num_frames)
     trajectory, scene = last_frames(kept, scene, count)
-    if budget_ms is not None and timing.frame_ms > _KEPT * budget_ms:
+    if method.budget_ms is not None and timing.frame_ms > _KEPT * method.budget_ms:
         say(
             f"missed --budget {options.budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells "
             "what the scene costs, eslr calibrate what this machine can do"
         )
     with stderr.status("measuring"):
-        skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-        timestep = float(poses.timestep)
+        last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
             "garment": options.garment,
             "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
-            "simulator": simulator,
-            "model": model,
             "self_contact": options.self_contact,
             "ground_m": None if scene.ground is None else float(scene.ground),
-            "interrupted_at": {"frame": count - 1, "time_s": (count - 1) * timestep}
-            if is_unfinished
-            else None,
+            "interrupted_at": last if is_unfinished else None,
             "error": error,
-            **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
-            **wear_report(trajectory.positions, scene.garment, skinned, poses),
-            "choice": None if choice is None else dataclasses.asdict(choice),
-            "tolerance": share,
-            "within_tolerance": None
-            if share is None
-            else float(np.mean(np.asarray(trajectory.iterations[1:]) < config.iterations)),
-            "frame_ms": timing.frame_ms,
-            "compile_s": timing.compile_s,
-            **environment(),
+            **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
         }
     with stderr.status("writing files"):
         with atomic_write(out / "report.json") as temporary:
@@ -299,10 +240,129 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     return report
 
 
-def _say_if_any(text: str | None) -> None:
-    """Print a line on stderr, if there is one."""
+def _read_request(options: Options) -> tuple[float | None, float | None]:
+    """Return the budget [ms] and the tolerance that the options ask for."""
+    is_chosen = options.simulator is None and options.model is None and options.iterations is None
+    if options.simulator == "physics" and options.model is not None:
+        raise ConfigError(f"--simulator physics has no network; leave out --model {options.model}")
+    return parse_request(options.budget, options.tolerance, is_chosen=is_chosen)
+
+
+def _choose_method(
+    options: Options, request: tuple[float | None, float | None], num_vertices: int, choice: Choice | None
+) -> _Method:
+    """Return how to simulate a garment of this size; `choice` is that of an interrupted run."""
+    from eslr_jax.assets import load_model
+    from eslr_jax.assets.load import default_model
+    from eslr_jax.config import SimConfig
+    from eslr_jax.simulation.budget import SOLVER, choose, read_calibration
+
+    simulator, model, iterations = options.simulator, options.model, options.iterations
+    budget_ms, tolerance = request
+    if choice is None and (budget_ms is not None or tolerance is not None):
+        choice = choose(read_calibration(), num_vertices, budget_ms=budget_ms, tolerance=tolerance)
+    if choice is not None:
+        simulator = "physics" if choice.method == SOLVER else "network"
+        model = None if choice.method == SOLVER else choice.method
+        iterations = choice.iterations
+    simulator = simulator or ("physics" if iterations is not None and model is None else "network")
+    params, architecture = None, None
+    if simulator == "network":
+        model = model or default_model()
+        params, architecture = load_model(model)
+    usual = _ITERATIONS if architecture is None else _BEHIND_NETWORK
+    config = SimConfig(
+        model=architecture,
+        iterations=usual if iterations is None else iterations,
+        tolerance=0.0 if choice is None else choice.tolerance,
+    )
+    return _Method(simulator, model, params, config, choice, budget_ms, tolerance)
+
+
+def _say_cost(num_vertices: int) -> None:
+    """Say what fitting a large garment costs."""
+    from eslr_jax.fit.report import describe_cost
+
+    text = describe_cost(num_vertices)
     if text:
         say(text)
+
+
+def _describe_load(method: _Method, num_vertices: int, num_frames: int) -> str:
+    """Return what a simulation takes on this device."""
+    from eslr_jax.simulation.budget import SOLVER, expected_ms, read_calibration
+
+    if method.choice is not None:
+        return describe_load(num_vertices, num_frames, method.choice.expected_ms)
+    name, iterations = method.model or SOLVER, method.config.iterations
+    return describe_load(
+        num_vertices, num_frames, expected_ms(read_calibration(), num_vertices, name, iterations)
+    )
+
+
+def _embedding(architecture: ModelConfig | None) -> dict[str, Any]:
+    """Return how a garment's embedding has to be for a network."""
+    if architecture is None:
+        return {}
+    return {"embedding_size": architecture.embedding_size, "embedding_mode": architecture.embedding_mode}
+
+
+def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
+    """Simulate with progress; Ctrl-C ends it after the frames in work."""
+    from eslr_jax.simulation.budget import keep_budget
+    from eslr_jax.simulation.simulate import simulate as run
+
+    pace = None
+    if method.choice is not None and method.budget_ms is not None:
+        pace = keep_budget(method.choice, method.budget_ms)
+    stop = Interruption("stopping after these frames; Ctrl-C again stops at once and loses them")
+    with progress("simulating", scene.num_frames - 1) as advance:
+
+        def on_frames(count: int, total: int) -> None:
+            advance(count, total)
+            stop.begin()  # before the first frames are done there is nothing to keep
+
+        try:
+            return run(
+                method.params,
+                scene,
+                config=method.config,
+                pace=pace,
+                on_frames=on_frames,
+                is_stopping=lambda: stop.is_wanted,
+                done=done,
+                raises=False,
+            )
+        finally:
+            stop.end()
+
+
+def _measure(
+    method: _Method, simulation: Simulation, poses: BodyMotion, stored: GarmentFile
+) -> dict[str, Any]:
+    """Return the part of the report that is measured, and with what."""
+    import jax
+    import numpy as np
+
+    from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.evaluation.wear import wear_report
+    from eslr_jax.scene.build import skin_garment
+
+    trajectory, timing, scene = simulation
+    skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
+    has_stopped = np.asarray(trajectory.iterations[1:]) < method.config.iterations
+    return {
+        "simulator": method.simulator,
+        "model": method.model,
+        **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
+        **wear_report(trajectory.positions, scene.garment, skinned, poses),
+        "choice": None if method.choice is None else dataclasses.asdict(method.choice),
+        "tolerance": method.tolerance,
+        "within_tolerance": None if method.tolerance is None else float(np.mean(has_stopped)),
+        "frame_ms": timing.frame_ms,
+        "compile_s": timing.compile_s,
+        **environment(),
+    }
 
 
 def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
@@ -368,7 +428,7 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
                 on_picture=advance,
             )
     except MissingExtraError as error:
-        stderr.print(f"no pictures: {error}", markup=False, highlight=False, soft_wrap=True)
+        say(f"no pictures: {error}")
         return
     write_png(out / "sheet.png", sheet)
 

@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.cli.console import app, say, stderr, use_compile_cache
 from eslr_jax.config import ModelConfig, TrainConfig, describe_keys
 from eslr_jax.errors import ConfigError
 from eslr_jax.extras import require
@@ -95,10 +95,7 @@ def train(
     plot_curves(out)
     done = int(state.step)
     if done < chosen.steps:
-        stderr.print(
-            f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume",
-            markup=False,
-        )
+        say(f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume")
     else:
         print(out / "model.npz")
 

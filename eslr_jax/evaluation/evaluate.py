@@ -19,7 +19,7 @@ from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene.plan import prepare_scene, shared_surface
-from eslr_jax.simulation.simulate import try_simulate
+from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
@@ -147,7 +147,7 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
     options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
     for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS)), (params, config)):
-        trajectory = try_simulate(weights, scene, config=steps).trajectory
+        trajectory = simulate(weights, scene, config=steps, raises=False).trajectory
         measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
     return measured[0], measured[1]
 
@@ -180,9 +180,9 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
 
 def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any]:
     """Return the measures of one free rollout, beside those of the solver's on the same scene."""
-    measured = measure_rollout(try_simulate(params, scene, config=config).trajectory, scene)
+    measured = measure_rollout(simulate(params, scene, config=config, raises=False).trajectory, scene)
     near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
-    reference = try_simulate(None, scene, config=near_optimum).trajectory
+    reference = simulate(None, scene, config=near_optimum, raises=False).trajectory
     return {**measured, "optimum": measure_rollout(reference, scene)}
 
 
@@ -211,7 +211,7 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
 
 def _drift(params: Any, scene: Scene, config: SimConfig) -> float:
     """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s]."""
-    trajectory = try_simulate(params, scene, config=config).trajectory
+    trajectory = simulate(params, scene, config=config, raises=False).trajectory
     areas = np.asarray(scene.garment.vertex_areas)
     centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
     frames = round(1.0 / float(scene.timestep))

@@ -36,7 +36,7 @@ from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.physics.problem import BodyContact, FrameProblem, GroundContact, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import PotentialTerms
 
@@ -61,9 +61,9 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
     garment, material, constants = problem.garment, problem.material, problem.constants
     collision = friction = repulsion = own = jnp.zeros((), position.dtype)
     if problem.body is not None:
-        collision, friction = _body_energies(position, problem)
+        collision, friction = _body_energies(position, problem, problem.body)
     if problem.ground is not None:
-        on_ground = _ground_energies(position, problem)
+        on_ground = _ground_energies(position, problem, problem.ground)
         collision, friction = collision + on_ground[0], friction + on_ground[1]
     if problem.layers is not None:
         layers = problem.layers
@@ -83,12 +83,10 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
 
 
 def _body_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem
+    position: Float[Array, "vertices 3"], problem: FrameProblem, body: BodyContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a body [J]."""
-    body, constants = problem.body, problem.constants
-    if body is None:
-        raise ValueError("a frame without a body has no energies of contact with it")
+    constants = problem.constants
     collision = sum(
         collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
         for contacts in (body.nearest, body.opposing)
@@ -113,12 +111,10 @@ def _body_energies(
 
 
 def _ground_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem
+    position: Float[Array, "vertices 3"], problem: FrameProblem, ground: GroundContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a ground [J]."""
-    ground, constants = problem.ground, problem.constants
-    if ground is None:
-        raise ValueError("a frame without a ground has no energies of contact with it")
+    constants = problem.constants
     collision = collision_energy(
         position, ground.contacts, problem.garment, constants.collision_stiffness, ground.thickness
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
@@ -75,6 +74,15 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     )
 
 
+def slice_tracks(scene: Scene, frames: slice) -> Scene:
+    """Return a scene with some frames of what moves: body and pins; the number of frames is left as it is."""
+    body, pins = scene.body, scene.pin_targets
+    return scene.replace(
+        body=None if body is None else body.replace(positions=body.positions[frames]),
+        pin_targets=None if pins is None else pins[frames],
+    )
+
+
 def safe_plan(poses: BodyMotion) -> ScenePlan:
     """Return the plan that holds whatever the values are: the whole body is searched, and pins are modelled."""
     return ScenePlan(surface=poses.surface)
@@ -85,13 +93,11 @@ def skin_garment(
 ) -> Float[Array, "frames vertices 3"]:
     """Return the garment carried by the joints [m], shape [frames, vertices, 3].
 
-    Frame by frame: a vmap would hold frames x vertices x influences matrices at once.
-
     Args:
         garment: Rest mesh with its skin weights.
         transforms: Maps from rest to posed points, shape [frames, joints, 3, 4].
     """
-    return jax.lax.map(lambda frame: skin_frame(garment, frame), transforms)
+    return lbs.skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
 
 
 def skin_frame(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:

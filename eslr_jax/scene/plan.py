@@ -21,7 +21,7 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import ScenePlan, build_scene, skin_garment
+from eslr_jax.scene.build import ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
@@ -167,12 +167,7 @@ def prepare_scenes(
 def first_frames(scene: Scene, num_frames: int) -> Scene:
     """Return the first frames of a scene, at most all of them."""
     num_frames = min(num_frames, scene.num_frames)
-    body, pins = scene.body, scene.pin_targets
-    return scene.replace(
-        body=None if body is None else body.replace(positions=body.positions[:num_frames]),
-        pin_targets=None if pins is None else pins[:num_frames],
-        num_frames=num_frames,
-    )
+    return slice_tracks(scene, slice(num_frames)).replace(num_frames=num_frames)
 
 
 def ground_height(poses: BodyMotion) -> Float[Array, ""]:

@@ -20,7 +20,8 @@ from eslr_jax.physics.problem import (
     TipContact,
     contact_thickness,
 )
-from eslr_jax.types import ClothState, Scene
+from eslr_jax.scene.build import slice_tracks
+from eslr_jax.types import ClothState, Scene, SceneBody
 
 
 class BodyStep(NamedTuple):
@@ -47,12 +48,8 @@ def frame_inputs(scene: Scene) -> FrameInput:
 
 def without_tracks(scene: Scene) -> Scene:
     """Return what of a scene stays constant: scenes of any length then share a compiled program."""
-    return scene.replace(
-        body=None if scene.body is None else scene.body.replace(positions=scene.body.positions[:0]),
-        pin_targets=None if scene.pin_targets is None else scene.pin_targets[:0],
-        initial_state=jax.tree.map(jnp.zeros_like, scene.initial_state),
-        num_frames=0,
-    )
+    nothing = jax.tree.map(jnp.zeros_like, scene.initial_state)
+    return slice_tracks(scene, slice(0)).replace(initial_state=nothing, num_frames=0)
 
 
 def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameProblem:
@@ -74,9 +71,10 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         energies=scene.energies,
     )
     if scene.body is not None and inputs.body is not None:
-        problem = problem.replace(body=_body_contact(scene, state, inputs.body))
+        body = _body_contact(problem, scene.body, inputs.body, state.friction_load)
+        problem = problem.replace(body=body)
     if scene.ground is not None:
-        problem = problem.replace(ground=_ground_contact(scene, state, scene.ground))
+        problem = problem.replace(ground=_ground_contact(problem, scene.ground))
     if scene.self_contact is not None:
         pairs = find_self_contacts(state.position, problem.inertial_guess, scene.garment, scene.self_contact)
         thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)
@@ -90,32 +88,33 @@ def first_problem(scene: Scene) -> FrameProblem:
     return frame_problem(scene, scene.initial_state, first)
 
 
-def _body_contact(scene: Scene, state: ClothState, step: BodyStep) -> BodyContact:
+def _body_contact(
+    problem: FrameProblem, body: SceneBody, step: BodyStep, friction_load: Float[Array, " vertices"]
+) -> BodyContact:
     """Return the contact of a frame with the scene's body."""
-    if scene.body is None:
-        raise ValueError("a scene without a body has no contact with it")
-    nearest, opposing = find_both_sides(state.position, step.start, step.end, scene.body.surface)
+    garment, constants = problem.garment, problem.constants
+    nearest, opposing = find_both_sides(problem.position, step.start, step.end, body.surface)
     tips = None
-    if scene.body.is_sharp:
-        guess = state.position + scene.timestep * state.velocity
-        tips = TipContact(
-            find_tip_contacts(state.position, guess, step.start, step.end, scene.garment), step.end
-        )
+    if body.is_sharp:
+        pairs = find_tip_contacts(problem.position, problem.inertial_guess, step.start, step.end, garment)
+        tips = TipContact(pairs, step.end)
     return BodyContact(
         nearest=nearest,
         opposing=opposing,
-        friction_load=state.friction_load,
-        thickness=contact_thickness(scene.garment, scene.constants.collision_thickness),
+        friction_load=friction_load,
+        thickness=contact_thickness(garment, constants.collision_thickness),
         tips=tips,
     )
 
 
-def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:
+def _ground_contact(problem: FrameProblem, height: Float[Array, ""]) -> GroundContact:
     """Return the contact of a frame with the ground.
 
     The ground is flat and stands still: no edge dips into it, and where the cloth is tells how hard it presses.
     """
-    constants, contacts = scene.constants, ground_contacts(state.position, height)
+    constants, contacts = problem.constants, ground_contacts(problem.position, height)
     thickness = constants.collision_thickness
-    load = contact_forces(state.position, contacts, scene.garment, constants.collision_stiffness, thickness)
+    load = contact_forces(
+        problem.position, contacts, problem.garment, constants.collision_stiffness, thickness
+    )
     return GroundContact(contacts, load, thickness)

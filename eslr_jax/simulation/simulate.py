@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
-from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper
@@ -53,6 +53,7 @@ def simulate(
     on_frames: Callable[[int, int], None] = lambda done, total: None,
     is_stopping: Callable[[], bool] = lambda: False,
     done: Trajectory | None = None,
+    raises: bool = True,
 ) -> Simulation:
     """Simulate a scene; check it first, enlarge buffers that are too small, and raise what goes wrong.
 
@@ -64,6 +65,8 @@ def simulate(
         on_frames: Called with the number of frames done and the number in all.
         is_stopping: Asked after every chunk; the trajectory ends where it answers yes.
         done: First frames of the same scene, simulated before; the trajectory begins with them.
+        raises: Raise what went wrong in a frame. False: the trajectory ends with the chunk of its first bad
+            frame and keeps its status, see `raise_for_status`.
 
     Raises:
         ConfigError: A network is asked for without weights, or the fabric, a constant or the timestep is out of
@@ -73,67 +76,49 @@ def simulate(
         CapacityError: A buffer was too small and can't be enlarged.
         MotionError: The body is too fast to follow.
     """
-    simulation = try_simulate(
-        params, scene, config=config, pace=pace, on_frames=on_frames, is_stopping=is_stopping, done=done
-    )
-    raise_for_status(simulation.trajectory)
-    return simulation
-
-
-def try_simulate(
-    params: Any,
-    scene: Scene,
-    *,
-    config: SimConfig | None = None,
-    pace: Pace | None = None,
-    on_frames: Callable[[int, int], None] = lambda done, total: None,
-    is_stopping: Callable[[], bool] = lambda: False,
-    done: Trajectory | None = None,
-) -> Simulation:
-    """Simulate a scene as `simulate` does, but leave what went wrong in the trajectory's status.
-
-    The arguments are those of `simulate`. The trajectory ends with the chunk of its first bad frame.
-
-    Raises:
-        ConfigError: As `simulate`.
-        CheckpointError: As `simulate`.
-    """
     config = config or SimConfig()
     check_network(params, config)
     check_scene(scene)
     larger: Scene | None = scene
     while larger is not None:
         scene = larger
-        trajectory, timing = _in_chunks(params, scene, config, pace, on_frames, is_stopping, done)
+        trajectory, timing = _in_chunks(
+            jax.tree.map(jnp.asarray, params), scene, config, _Loop(pace, on_frames, is_stopping), done
+        )
         larger, done = None if is_stopping() else enlarge_buffers(scene, trajectory), None
+    if raises:
+        raise_for_status(trajectory)
     return Simulation(trajectory, timing, scene)
 
 
+class _Loop(NamedTuple):
+    """What the host does between chunks; see `simulate`."""
+
+    pace: Pace | None
+    on_frames: Callable[[int, int], None]
+    is_stopping: Callable[[], bool]
+
+
 def _in_chunks(
-    params: Any,
-    scene: Scene,
-    config: SimConfig,
-    pace: Pace | None,
-    on_frames: Callable[[int, int], None],
-    is_stopping: Callable[[], bool],
-    before: Trajectory | None,
+    params: Any, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
 ) -> tuple[Trajectory, Timing]:
     """Simulate a scene a few frames at a time, and time compilation apart."""
     total = scene.num_frames - 1
     chunk = min(_CHUNK, total)
-    inputs, constant = frame_inputs(scene), without_tracks(scene).replace(num_frames=chunk + 1)
+    inputs = frame_inputs(scene)
+    constant = jax.tree.map(jnp.asarray, without_tracks(scene).replace(num_frames=chunk + 1))
 
     def part(first: int) -> FrameInput:
         # The last chunk repeats its last frame; what it simulates beyond the end is dropped.
         frames = np.minimum(np.arange(first, first + chunk), total - 1)
-        return jax.tree.map(lambda leaf: leaf[frames], inputs)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[frames]), inputs)
 
     iterations = config.iterations
-    start = scene.initial_state if before is None else last_state(before)
+    start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else last_state(before))
     begin = 0 if before is None else before.num_frames - 1
     state, done, seconds, compile_s = start, [], 0.0, 0.0
     for first in range(begin, total, chunk):
-        bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
+        bound = None if loop.pace is None else jnp.int32(iterations)  # all numbers share a program
         arguments = (params, constant, state, part(first), bound)
         program, took = _compiled(config, arguments)
         compile_s += took
@@ -141,15 +126,15 @@ def _in_chunks(
         end, frames = jax.block_until_ready(program(*arguments))
         took = time.perf_counter() - began
         seconds += took
-        if pace is not None:
-            iterations = pace(iterations, took * 1e3 / chunk)
+        if loop.pace is not None:
+            iterations = loop.pace(iterations, took * 1e3 / chunk)
         count = min(chunk, total - first)
         done.append(jax.tree.map(lambda leaf, count=count: leaf[:count], frames))
         is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
         if count == chunk or is_bad:
             state = end
-        on_frames(first + count, total)
-        if is_bad or is_stopping():
+        loop.on_frames(first + count, total)
+        if is_bad or loop.is_stopping():
             break
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
     trajectory = join_frames(start, joined, state)
@@ -160,14 +145,23 @@ def _in_chunks(
 
 def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
     """Return a trajectory and the one that begins with its last frame as one."""
-    end = {"status": after.status, "first_bad_frame": after.first_bad_frame}
-    nothing = {"status": None, "first_bad_frame": None}
-    joined = jax.tree.map(
-        lambda first, second: jnp.concatenate([first, second[1:]]),
-        before.replace(**nothing),
-        after.replace(**nothing),
-    )
-    return joined.replace(**end)
+    tail = _slice_frames(after, slice(1, None))
+    return _map_frames(lambda first, second: jnp.concatenate([first, second]), tail, before)
+
+
+def _slice_frames(trajectory: Trajectory, frames: slice) -> Trajectory:
+    """Return some frames of a trajectory, with its status."""
+    return _map_frames(lambda leaf: leaf[frames], trajectory)
+
+
+def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory) -> Trajectory:
+    """Apply a function to what trajectories hold frame by frame; the status is that of the first given.
+
+    Further trajectories are the function's first arguments.
+    """
+    whole = [one.replace(status=None, first_bad_frame=None) for one in (*before, trajectory)]
+    end = {"status": trajectory.status, "first_bad_frame": trajectory.first_bad_frame}
+    return jax.tree.map(function, *whole).replace(**end)
 
 
 def last_state(trajectory: Trajectory) -> ClothState:
@@ -195,10 +189,10 @@ def _scan(
 
 def _compiled(config: SimConfig, arguments: tuple) -> tuple[Callable, float]:
     """Return the compiled chunk for arguments of these shapes, and the seconds that compiling took."""
-    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
+    leaves, structure = jax.tree.flatten(arguments)
     began = time.perf_counter()
     program = _compile(config, structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
-    return lambda *given: program(*jax.tree.map(jnp.asarray, given)), time.perf_counter() - began
+    return program, time.perf_counter() - began
 
 
 @lru_cache(maxsize=32)
@@ -224,7 +218,7 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
         or scene.self_contact is None
     ):
         return None
-    pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.pair_demand), axis=0))
+    pairs, faces = _peak_demand(trajectory.pair_demand)
     before = scene.self_contact
     capacity = PairCapacity(
         pairs=math.ceil(_HEADROOM * pairs) if pairs > before.pairs else before.pairs,
@@ -233,12 +227,17 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
     return None if capacity == before else scene.replace(self_contact=capacity)
 
 
+def _peak_demand(demand: Int[Array, "frames 2"]) -> tuple[int, int]:
+    """Return what the fullest frame asked for: pairs and faces."""
+    pairs, faces = np.max(np.asarray(demand), axis=0)
+    return int(pairs), int(faces)
+
+
 def good_frames(trajectory: Trajectory) -> Trajectory:
     """Return the frames before the first bad one; all if none is bad."""
     bad = int(trajectory.first_bad_frame)
     count = trajectory.num_frames if bad < 0 else min(bad, trajectory.num_frames)
-    whole = trajectory.replace(status=None, first_bad_frame=None)
-    kept = jax.tree.map(lambda leaf: leaf[:count], whole)
+    kept = _slice_frames(trajectory, slice(count))
     return kept.replace(status=jnp.int32(Status.OK), first_bad_frame=jnp.int32(-1))
 
 
@@ -247,18 +246,12 @@ def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[
     first = trajectory.num_frames - num_frames
     if first <= 0:
         return trajectory, scene
-    whole = trajectory.replace(status=None, first_bad_frame=None)
-    kept = jax.tree.map(lambda leaf: leaf[first:], whole)
     bad = trajectory.first_bad_frame
-    kept = kept.replace(status=trajectory.status, first_bad_frame=jnp.where(bad >= 0, bad - first, bad))
-    body, pins = scene.body, scene.pin_targets
+    kept = _slice_frames(trajectory, slice(first, None))
+    kept = kept.replace(first_bad_frame=jnp.where(bad >= 0, bad - first, bad))
     state = initial_state(kept.positions[0], kept.velocities[0])
-    return kept, scene.replace(
-        body=None if body is None else body.replace(positions=body.positions[first:]),
-        pin_targets=None if pins is None else pins[first:],
-        initial_state=state.replace(friction_load=kept.friction_loads[0]),
-        num_frames=num_frames,
-    )
+    state = state.replace(friction_load=kept.friction_loads[0])
+    return kept, slice_tracks(scene, slice(first, None)).replace(initial_state=state, num_frames=num_frames)
 
 
 def check_scene(scene: Scene) -> None:
@@ -285,7 +278,7 @@ def raise_for_status(trajectory: Trajectory) -> None:
         return
     message = f"frame {int(trajectory.first_bad_frame)}: {status.describe()}"
     if Status.SELF_CONTACT_OVERFLOW in status and trajectory.pair_demand is not None:
-        pairs, faces = (int(value) for value in np.max(np.asarray(trajectory.pair_demand), axis=0))
+        pairs, faces = _peak_demand(trajectory.pair_demand)
         message += f": {pairs} pairs and {faces} faces or more"
     error: type[EslrError] = CapacityError
     if Status.NON_FINITE in status:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.gap import find_friction_loads
-from eslr_jax.simulation.simulate import try_simulate
+from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import PotentialTerms, Scene, Trajectory
 from hard_cases.case import Simulator
 
@@ -19,7 +19,7 @@ def solver_simulator(iterations: int = 200) -> Simulator:
     """Return the L-BFGS solver as a simulator, with so many iterations per frame at most."""
 
     def run(scene: Scene) -> Trajectory:
-        return try_simulate(None, scene, config=SimConfig(iterations=iterations)).trajectory
+        return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
 
     return Simulator(f"physics, {iterations} iterations", run)
 
@@ -36,7 +36,7 @@ def network_simulator(name: str, params: Any, model: ModelConfig, iterations: in
 
     def run(scene: Scene) -> Trajectory:
         config = SimConfig(model=model, iterations=iterations)
-        return try_simulate(params, scene, config=config).trajectory
+        return simulate(params, scene, config=config, raises=False).trajectory
 
     options = {"embedding_size": model.embedding_size, "embedding_mode": model.embedding_mode}
     return Simulator(f"{name}, {iterations} iterations" if iterations else name, run, options)
