@@ -70,13 +70,27 @@ def take3(a: Vector3, rows: Int[Array, ...]) -> Vector3:
     return a[0][rows], a[1][rows], a[2][rows]
 
 
-def components(x: Float[Array, "rows 3"]) -> Vector3:
-    """Split vectors into component arrays."""
-    return x[:, 0], x[:, 1], x[:, 2]
+def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:
+    """Split vectors into component arrays; vectors given by components stay as they are."""
+    if isinstance(x, tuple):
+        return x
+    # The transpose of a split joins; that of slices pads every component to the whole and adds.
+    x_part, y_part, z_part = jax.lax.split(x, (1, 1, 1), axis=1)
+    return x_part[:, 0], y_part[:, 0], z_part[:, 0]
+
+
+def in_memory(*arrays: Float[Array, " rows"]) -> tuple[Array, ...]:
+    """Return the arrays, each computed once and stored before it is read.
+
+    For coefficients that hold a scalar of the scene: a loop on a CPU that reads a scalar from memory is not
+    vectorised by XLA, which took four fifths of an energy's time. It also keeps XLA from computing a gather
+    anew in each of its consumers.
+    """
+    return jax.lax.optimization_barrier(arrays)
 
 
 def gather_corners(
-    x: Float[Array, "rows 3"],
+    x: Float[Array, "rows 3"] | Vector3,
     indices: Int[Array, "items corners"],
     incidence: Int[Array, "rows degree"],
 ) -> tuple[Vector3, ...]:
@@ -96,11 +110,9 @@ def gather_corners(
     """
     num_items, num_corners = indices.shape
     flat = indices.T.ravel()
-    gathered = [_gather_flat.bind(x[:, axis], flat, incidence) for axis in range(3)]
-    return tuple(
-        tuple(component[k * num_items : (k + 1) * num_items] for component in gathered)
-        for k in range(num_corners)
-    )  # type: ignore[return-value]
+    gathered = [_gather_flat.bind(component, flat, incidence) for component in components(x)]
+    parts = [jax.lax.split(component, (num_items,) * num_corners) for component in gathered]
+    return tuple(zip(*parts, strict=True))  # type: ignore[return-value]
 
 
 # Two linear maps, each the other's transpose, as primitives of JAX. A `custom_vjp` would rule out forward mode,

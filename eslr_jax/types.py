@@ -139,6 +139,14 @@ class BodyMotion:
     surface: BodySurface  # all obstacle faces; a scene may search fewer, see `scene.plan_scene`
 
 
+class PastState(NamedTuple):
+    """The cloth one frame ago."""
+
+    position: Float[Array, "vertices 3"]  # [m]
+    velocity: Float[Array, "vertices 3"]  # [m/s]
+    is_known: Bool[Array, ""]  # False before the first frame: that one is stepped by implicit Euler
+
+
 @struct.dataclass
 class ClothState:
     """What changes from frame to frame."""
@@ -149,6 +157,7 @@ class ClothState:
     frame: Int[Array, ""]  # index of this frame
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # -1 while status is OK
+    past: PastState | None = None  # at t - 1, for BDF2; None: implicit Euler
 
 
 @struct.dataclass
@@ -161,6 +170,7 @@ class Contacts:
     next_normals: Float[Array, "vertices 3"]  # at t + 1
     distances: Float[Array, " vertices"]  # signed distance of the vertex at t, positive outside [m]
     is_near: Bool[Array, " vertices"]  # close enough for the tangent plane to stand for the body
+    faces: Int[Array, " vertices"]  # of the body surface, that hold the points; zero on the ground
 
 
 @struct.dataclass
@@ -169,6 +179,7 @@ class SceneBody:
 
     surface: BodySurface
     positions: Float[Array, "frames surface_vertices 3"]  # [m], in the order of the surface
+    has_skin: bool = struct.field(pytree_node=False, default=False)  # its vertices keep off the cloth's faces
     is_sharp: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
 
 

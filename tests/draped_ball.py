@@ -49,9 +49,9 @@ def square(side: int = 8, size: float = 0.24, *, is_pinned: np.ndarray | None = 
     )
 
 
-def drifting_ball(num_frames: int = 6, *, speed: float = 0.3) -> BodyMotion:
+def drifting_ball(num_frames: int = 6, *, speed: float = 0.3, mesh: tuple | None = None) -> BodyMotion:
     """A ball that drifts along x at `speed` [m/s] and rises a little; its two joints move with it."""
-    positions, faces = ball()
+    positions, faces = ball() if mesh is None else mesh
     time = np.arange(num_frames) * TIMESTEP
     shift = np.stack([speed * time, 0.2 * speed * time, np.zeros(num_frames)], axis=1)
     transforms = np.broadcast_to(np.eye(3, 4), (num_frames, 2, 3, 4)).copy()

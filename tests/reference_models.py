@@ -352,6 +352,7 @@ def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool 
         next_normals=next_normals,
         distances=distances,
         is_near=distances < 0.04,
+        faces=jnp.zeros(len(distances), jnp.int32),
     )
     velocity = noise(0.01, 3)
     inputs = GraphInputs(

@@ -40,7 +40,8 @@ class Options:
     loop: str | None
     settle: int
     self_contact: bool
-    ground: Literal["auto", "on", "off"]
+    ground: Literal["auto", "on", "off"] = "auto"
+    integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
 
 
 def interrupted_record(

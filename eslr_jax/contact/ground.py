@@ -25,6 +25,7 @@ def ground_contacts(position: Float[Array, "vertices 3"], height: Float[Array, "
         next_normals=normals,
         distances=position[:, 1] - height,
         is_near=jnp.ones(position.shape[0], bool),
+        faces=jnp.zeros(position.shape[0], jnp.int32),
     )
 
 

@@ -275,6 +275,7 @@ def _contacts_at(
         # A limb that comes closer during the frame would otherwise jump over cloth that is far at t.
         is_near=(distance - jnp.maximum(approach(points, next_points, here), 0.0) < CONTACT_RADIUS)
         & ~is_on_boundary,
+        faces=location.face,
     )
 
 

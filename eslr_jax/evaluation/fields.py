@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from eslr_jax.assets import prepare_stored
 from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.gap import find_friction_loads, map_frames
+from eslr_jax.evaluation.gap import find_friction_loads, map_frames, past_states
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
@@ -25,7 +25,7 @@ from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import evaluate, potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.build import initial_state, start_integrator
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.types import (
     ClothState,
@@ -132,7 +132,9 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
         garment=garment,
         material=material,
         constants=PhysicsConstants(),
-        initial_state=initial_state(positions[0], velocities[0]),
+        initial_state=start_integrator(
+            initial_state(positions[0], velocities[0]), run.report.get("integrator", "euler")
+        ),
         timestep=jnp.float32(trajectory.timestep),
         body=body,
         pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
@@ -151,10 +153,14 @@ def _problem_values(
     loads = run.trajectory.friction_loads
     if loads is None:  # a run of an older version, or somebody else's
         loads = find_friction_loads(positions, velocities, scene)
-    before = initial_state(positions[0], velocities[0])
-    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(positions) - 1, *leaf.shape)), before)
+    states = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(positions) - 1, *leaf.shape)), scene.initial_state
+    )
     states = states.replace(
-        position=positions[:-1], velocity=velocities[:-1], friction_load=jnp.asarray(loads)[:-1]
+        position=positions[:-1],
+        velocity=velocities[:-1],
+        friction_load=jnp.asarray(loads)[:-1],
+        past=past_states(positions, velocities, scene),
     )
     values = np.asarray(_every_frame(name, positions[1:], states, scene))
     return np.concatenate([np.zeros_like(values[:1]), values])

@@ -16,7 +16,7 @@ from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import find_start
-from eslr_jax.types import ClothState, Scene, Trajectory
+from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
 _LEAST_INITIAL_GAP = 1e-9  # [J]
@@ -52,8 +52,20 @@ def trajectory_states(trajectory: Trajectory, scene: Scene) -> tuple[ClothState,
         position=trajectory.positions[:-1],
         velocity=trajectory.velocities[:-1],
         friction_load=trajectory.friction_loads[:-1],
+        past=past_states(trajectory.positions, trajectory.velocities, scene),
     )
     return states, frame_inputs(scene)
+
+
+def past_states(
+    positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
+) -> PastState | None:
+    """Return what BDF2 remembers before every simulated frame, stacked; None for implicit Euler."""
+    first = scene.initial_state.past
+    if first is None:
+        return None
+    tracks = PastState(positions[:-2], velocities[:-2], jnp.ones(len(positions) - 2, bool))
+    return jax.tree.map(lambda start, track: jnp.concatenate([start[None], track]), first, tracks)
 
 
 @jax.jit
@@ -69,13 +81,16 @@ def find_friction_loads(
     """
 
     def advance(load, frame):
-        position, velocity, reached, inputs = frame
-        state = scene.initial_state.replace(position=position, velocity=velocity, friction_load=load)
+        position, velocity, past, reached, inputs = frame
+        state = scene.initial_state.replace(
+            position=position, velocity=velocity, friction_load=load, past=past
+        )
         load = contact_load(reached, frame_problem(scene, state, inputs))
         return load, load
 
     first = scene.initial_state.friction_load
-    frames = (positions[:-1], velocities[:-1], positions[1:], frame_inputs(scene))
+    past = past_states(positions, velocities, scene)
+    frames = (positions[:-1], velocities[:-1], past, positions[1:], frame_inputs(scene))
     _, loads = jax.lax.scan(advance, first, frames)
     return jnp.concatenate([first[None], loads])
 

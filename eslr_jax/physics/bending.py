@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import Vector3, arctan2, cross3, dot3, gather_corners, sub3
+from eslr_jax.numerics import Vector3, arctan2, cross3, dot3, gather_corners, in_memory, sub3
 from eslr_jax.types import Garment, Material
 
 
 def dihedral_angles(
-    position: Float[Array, "vertices 3"], garment: Garment
+    position: Float[Array, "vertices 3"] | Vector3, garment: Garment
 ) -> tuple[Float[Array, " hinges"], Float[Array, " hinges"]]:
     """Return each hinge's signed angle [rad] (zero is flat) and its squared edge length [m^2].
 
@@ -62,18 +62,24 @@ def _corner_angles_jvp(primals, tangents):
         dot3(to_left, edge) / squared_length,  # foot of the height along the edge, 0 at its start
         dot3(to_right, edge) / squared_length,
     )
-    by_left, by_right, foot_left, foot_right = jax.lax.optimization_barrier(levers)
+    by_left, by_right, foot_left, foot_right = in_memory(*levers)
+    to_start = tangents[0]
+    to_end = sub3(tangents[1], to_start)
     change = jnp.zeros_like(by_left)
-    for axis in range(3):
-        left_part, right_part = by_left * normal_left[axis], by_right * normal_right[axis]
-        end_part = -foot_left * left_part - foot_right * right_part
-        parts = (-left_part - right_part - end_part, end_part, left_part, right_part)
-        change = change + sum(part * tangent[axis] for part, tangent in zip(parts, tangents, strict=True))
+    for lever, foot, normal, corner in (
+        (by_left, foot_left, normal_left, tangents[2]),
+        (by_right, foot_right, normal_right, tangents[3]),
+    ):
+        apart = sub3(corner, to_start)
+        lifted = (apart[0] - foot * to_end[0], apart[1] - foot * to_end[1], apart[2] - foot * to_end[2])
+        change = change + lever * dot3(normal, lifted)
+    # Its transpose stores the moment, which XLA would compute for every corner anew.
+    (change,) = in_memory(change)
     return _corner_angles(*primals), change
 
 
 def bending_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     garment: Garment,
     material: Material,
     *,
@@ -101,7 +107,8 @@ def bending_energy(
     areas = garment.hinge_rest_areas
     is_real = areas > 0
     scale = jnp.where(is_real, squared_length / (4.0 * jnp.where(is_real, areas, 1.0)), 0.0)
-    return 0.5 * jnp.sum(material.bending_stiffness * scale * angle * angle)
+    (stiffness,) = in_memory(0.5 * material.bending_stiffness * scale)
+    return jnp.sum(stiffness * angle * angle)
 
 
 def rest_squared_lengths(garment: Garment) -> Float[Array, " hinges"]:

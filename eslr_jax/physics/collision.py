@@ -5,12 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import components, dot3, sub3
+from eslr_jax.contact.skin import SkinContacts, skin_heights
+from eslr_jax.numerics import Vector3, components, dot3, segment_sum, sub3
 from eslr_jax.types import Contacts, Garment
 
 
 def penetration(
-    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
+    position: Float[Array, "vertices 3"] | Vector3, contacts: Contacts, thickness: Float[Array, ""] | float
 ) -> Float[Array, " vertices"]:
     """Return max(thickness - d, 0) [m], d the height over the tangent plane at t + 1; zero where far."""
     offset = sub3(components(position), components(contacts.next_points))
@@ -19,7 +20,7 @@ def penetration(
 
 
 def collision_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     contacts: Contacts,
     garment: Garment,
     stiffness: Float[Array, ""] | float,
@@ -40,6 +41,48 @@ def collision_energy(
     """
     depth = penetration(position, contacts, thickness)
     return stiffness * jnp.sum(garment.vertex_areas * depth * depth * depth)
+
+
+def skin_depths(
+    position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts, thickness: Float[Array, ""] | float
+) -> Float[Array, " rows"]:
+    """Return max(thickness - d, 0) [m], d the height of the cloth's face over the skin; zero where far."""
+    return jnp.where(skin.is_near, jnp.maximum(thickness - skin_heights(position, skin), 0.0), 0.0)
+
+
+def skin_energy(
+    position: Float[Array, "vertices 3"] | Vector3,
+    skin: SkinContacts,
+    area: Float[Array, ""],
+    stiffness: Float[Array, ""] | float,
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """Return stiffness a sum_p max(thickness - d_p, 0)^3 [J] over body vertices p under faces of the cloth.
+
+    Args:
+        position: Vertex positions at t + 1 [m].
+        skin: Body vertices and the places of the cloth over them.
+        area: Area that every one stands for [m^2].
+        stiffness: [J/m^5].
+        thickness: Distance kept from the body [m].
+
+    Source: the barrier is `collision_energy`'s.
+    """
+    depth = skin_depths(position, skin, thickness)
+    return stiffness * area * jnp.sum(depth * depth * depth)
+
+
+def skin_diagonal(
+    position: Float[Array, "vertices 3"],
+    skin: SkinContacts,
+    area: Float[Array, ""],
+    stiffness: Float[Array, ""] | float,
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, " vertices"]:
+    """Return an estimate of `skin_energy`'s curvature per vertex [N/m], a third of that along the normal."""
+    curvature = 2.0 * stiffness * area * skin_depths(position, skin, thickness)
+    values = skin.weights**2 * curvature[:, None]
+    return segment_sum(values.T.ravel(), skin.corners.T.ravel(), position.shape[0])
 
 
 def contact_forces(

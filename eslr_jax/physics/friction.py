@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import components, dot3, sub3
+from eslr_jax.numerics import Vector3, components, dot3, sub3
 from eslr_jax.types import Contacts
 
 
 def friction_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     start: Float[Array, "vertices 3"],
     contacts: Contacts,
     load: Float[Array, " vertices"],

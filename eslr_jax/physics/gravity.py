@@ -5,9 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import Vector3, components
+
 
 def gravity_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     reference: Float[Array, "vertices 3"] | None,
     masses: Float[Array, " vertices"],
     gravity: Float[Array, ""] | float,
@@ -21,5 +23,7 @@ def gravity_energy(
         masses: Vertex masses [kg].
         gravity: Acceleration [m/s^2].
     """
-    height = position[:, 1] if reference is None else position[:, 1] - reference[:, 1]
+    height = components(position)[1]
+    if reference is not None:
+        height = height - reference[:, 1]
     return gravity * jnp.sum(masses * height)

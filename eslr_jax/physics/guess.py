@@ -33,7 +33,7 @@ def initial_guess(problem: FrameProblem) -> InitialGuess:
     The potential decides.
     """
     inertial = pushed_out_guess(problem)
-    fall = problem.constants.gravity * problem.timestep * problem.timestep
+    fall = problem.constants.gravity * jnp.square(problem.inertial_timestep)
     falling = problem.inertial_guess - jnp.array([[0.0, 1.0, 0.0]], inertial.dtype) * fall
     ballistic = pushed_out_guess(problem.replace(inertial_guess=falling))
     guesses = jnp.stack([inertial, ballistic])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import components, dot3, sub3
+from eslr_jax.numerics import Vector3, components, dot3, sub3
 from eslr_jax.types import Garment, Material
 
 
@@ -15,7 +15,7 @@ def vertex_masses(garment: Garment, material: Material) -> Float[Array, " vertic
 
 
 def inertia_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     inertial_guess: Float[Array, "vertices 3"],
     masses: Float[Array, " vertices"],
     timestep: Float[Array, ""],

@@ -30,13 +30,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import Vector3, components
 from eslr_jax.physics.bending import bending_energy
-from eslr_jax.physics.collision import collision_energy, contact_forces
+from eslr_jax.physics.collision import collision_energy, contact_forces, skin_energy
 from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import BodyContact, FrameProblem, GroundContact, pin
+from eslr_jax.physics.problem import BodyContact, FrameProblem, GroundContact, mean_vertex_area, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import PotentialTerms
 
@@ -57,9 +58,12 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
             so that the gradient vanishes there.
         problem: The frame's problem.
     """
-    position = pin(problem, position)
+    whole = pin(problem, position)
+    position = components(
+        whole
+    )  # once: gradients of all terms are then summed by components, and joined once
     garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = own = jnp.zeros((), position.dtype)
+    collision = friction = repulsion = own = jnp.zeros((), position[0].dtype)
     if problem.body is not None:
         collision, friction = _body_energies(position, problem, problem.body)
     if problem.ground is not None:
@@ -69,11 +73,11 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         layers = problem.layers
         repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
     for energy in problem.energies:
-        own = own + energy(position, problem)
+        own = own + energy(whole, problem)
     return PotentialTerms(
         stretch=stretch_energy(position, garment, material),
         bending=bending_energy(position, garment, material),
-        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.timestep),
+        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.inertial_timestep),
         gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
         collision=collision,
         friction=friction,
@@ -83,7 +87,7 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
 
 
 def _body_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, body: BodyContact
+    position: Vector3, problem: FrameProblem, body: BodyContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a body [J]."""
     constants = problem.constants
@@ -91,6 +95,10 @@ def _body_energies(
         collision_energy(position, contacts, problem.garment, constants.collision_stiffness, body.thickness)
         for contacts in (body.nearest, body.opposing)
     )
+    if body.skin is not None:
+        area = mean_vertex_area(problem.garment)
+        thickness = constants.collision_thickness
+        collision += skin_energy(position, body.skin, area, constants.collision_stiffness, thickness)
     if body.tips is not None:
         collision = collision + repulsion_energy(
             position,
@@ -111,7 +119,7 @@ def _body_energies(
 
 
 def _ground_energies(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, ground: GroundContact
+    position: Vector3, problem: FrameProblem, ground: GroundContact
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the collision and the friction energy of a frame with a ground [J]."""
     constants = problem.constants

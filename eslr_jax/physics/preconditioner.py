@@ -9,8 +9,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components, scatter_corners
-from eslr_jax.physics.collision import penetration
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.collision import penetration, skin_diagonal
+from eslr_jax.physics.problem import FrameProblem, mean_vertex_area
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 
@@ -54,12 +54,15 @@ def hessian_diagonal(
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     garment, constants = problem.garment, problem.constants
-    diagonal = problem.masses / problem.timestep**2 + stretch_diagonal(garment, problem.material)
+    diagonal = problem.masses / problem.inertial_timestep**2 + stretch_diagonal(garment, problem.material)
     if problem.body is not None:
         body = problem.body
         depth = penetration(position, body.nearest, body.thickness)
         depth = depth + penetration(position, body.opposing, body.thickness)
         slip = constants.friction_speed * problem.timestep
+        if body.skin is not None:
+            area, thickness = mean_vertex_area(garment), constants.collision_thickness
+            diagonal += skin_diagonal(position, body.skin, area, constants.collision_stiffness, thickness)
         if body.tips is not None:
             diagonal = diagonal + repulsion_diagonal(
                 position,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.collision import penetration
 from eslr_jax.physics.inertia import vertex_masses
@@ -33,6 +36,7 @@ class BodyContact:
     opposing: Contacts  # with the body part on the other side of the cloth
     friction_load: Float[Array, " vertices"]  # normal force at t [N]
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
+    skin: SkinContacts | None = None  # None: skin may show between vertices
     tips: TipContact | None = None  # None: a tip may pass between vertices
 
 
@@ -53,21 +57,36 @@ class SelfContact:
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
 
 
+class SecondOrder(NamedTuple):
+    """What BDF2 puts in the place of a frame's first positions and timestep, see `simulation.frame`."""
+
+    origin: Float[Array, "vertices 3"]  # [m]
+    timestep: Float[Array, ""]  # [s]
+
+
 @struct.dataclass
 class FrameProblem:
-    """One step of implicit Euler as a minimisation. A part that is None is not modelled."""
+    """One step of implicit Euler, or of BDF2, as a minimisation. A part that is None is not modelled."""
 
     garment: Garment
     material: Material
     constants: PhysicsConstants
     timestep: Float[Array, ""]  # [s]
     position: Float[Array, "vertices 3"]  # at t [m]
-    inertial_guess: Float[Array, "vertices 3"]  # position + timestep * velocity [m]
+    inertial_guess: Float[
+        Array, "vertices 3"
+    ]  # where inertia alone takes the cloth [m], see `simulation.frame`
     body: BodyContact | None = None
     ground: GroundContact | None = None
     layers: SelfContact | None = None
     energies: tuple[Partial, ...] = ()  # of positions and this problem to joules
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
+    bdf2: SecondOrder | None = None  # None: implicit Euler
+
+    @property
+    def inertial_timestep(self) -> Float[Array, ""]:
+        """Time for which a frame's acceleration acts [s]."""
+        return self.timestep if self.bdf2 is None else self.bdf2.timestep
 
     @property
     def masses(self) -> Float[Array, " vertices"]:
@@ -85,9 +104,13 @@ def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> 
         garment: Rest mesh; its mean vertex area gives the spacing.
         thickness: Distance that a smooth sheet would keep [m].
     """
-    mean_area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_area  # of equilateral triangles, two per vertex
+    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_vertex_area(garment)  # of equilateral triangles, two per vertex
     return thickness + squared_edge / (8.0 * _LIMB_RADIUS)
+
+
+def mean_vertex_area(garment: Garment) -> Float[Array, ""]:
+    """Return the area of cloth that a vertex stands for in the mean [m^2]."""
+    return jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
 
 
 def weight_norm(problem: FrameProblem) -> Float[Array, ""]:

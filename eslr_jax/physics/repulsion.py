@@ -15,7 +15,7 @@ _SWEEPS = 4  # of `push_apart`
 
 
 def pair_heights(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     pairs: FacePairs,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> tuple[Float[Array, " pairs"], Vector3]:
@@ -36,7 +36,7 @@ def pair_heights(
 
 
 def overlaps(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     pairs: FacePairs,
     thickness: Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
@@ -47,7 +47,7 @@ def overlaps(
 
 
 def repulsion_energy(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     pairs: FacePairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,

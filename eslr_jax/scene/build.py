@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
@@ -10,6 +12,7 @@ from jaxtyping import Array, Float
 from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
+from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.types import (
     BodyMotion,
     BodySurface,
@@ -17,10 +20,14 @@ from eslr_jax.types import (
     Garment,
     Material,
     PairCapacity,
+    PastState,
     PhysicsConstants,
     Scene,
     SceneBody,
 )
+
+Integrator = Literal["euler", "bdf2"]
+"""Implicit Euler is the paper's, and networks are trained with it. BDF2, of second order, keeps motion alive."""
 
 
 @struct.dataclass
@@ -34,6 +41,8 @@ class ScenePlan:
         pytree_node=False, default=False
     )  # else frame 0 moves as the body does
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
+    has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
+    integrator: Integrator = struct.field(pytree_node=False, default="euler")
     ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
     energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
 
@@ -52,8 +61,10 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     skinned = skin_garment(garment, poses.joint_transforms)
     position, body = skinned[0], None
     if plan.surface is not None:
-        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids])
+        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids], has_skin=plan.has_skin)
         position = clear_of_body(position, body.positions[0], plan.surface, garment)
+        if plan.has_skin:
+            position = lift_off_skin(position, body.positions[0], plan.surface, garment)
     if plan.ground is not None:
         position = clear_of_ground(position, plan.ground, garment.is_pinned)
     velocity = (skinned[1] - skinned[0]) / poses.timestep
@@ -63,7 +74,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         garment=garment,
         material=material,
         constants=plan.constants,
-        initial_state=initial_state(position, velocity),
+        initial_state=start_integrator(initial_state(position, velocity), plan.integrator),
         timestep=poses.timestep,
         body=body,
         pin_targets=skinned if plan.has_pins else None,
@@ -103,6 +114,14 @@ def skin_garment(
 def skin_frame(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
     """Return the garment carried by the joints of one frame [m], shape [vertices, 3]."""
     return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
+
+
+def start_integrator(state: ClothState, integrator: Integrator) -> ClothState:
+    """Return a state without a past, from which an integrator can begin."""
+    if integrator == "euler":
+        return state.replace(past=None)
+    nothing = jnp.zeros_like(state.position)
+    return state.replace(past=PastState(nothing, nothing, jnp.zeros((), bool)))
 
 
 def initial_state(position: Float[Array, "vertices 3"], velocity: Float[Array, "vertices 3"]) -> ClothState:

@@ -21,7 +21,7 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import ScenePlan, build_scene, skin_garment, slice_tracks
+from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
@@ -40,6 +40,8 @@ class SceneOptions:
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
     self_contact: bool = False  # keep layers of cloth apart
+    has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
+    integrator: Integrator = "euler"
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
     ground: Literal["auto", "on", "off"] = "auto"
     # Terms of one's own: functions of positions [m], shape [vertices, 3], and the frame's `FrameProblem` to an
@@ -90,6 +92,8 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
+        has_skin=options.has_skin,
+        integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
         energies=tuple(Partial(energy) for energy in options.energies),
     )

@@ -20,7 +20,7 @@ from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
+from eslr_jax.types import ClothState, PairCapacity, PastState, Scene, Trajectory
 
 _HEADROOM = 1.25  # of a buffer made larger: with it, cloth moves on a little differently and may need more
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
@@ -114,7 +114,7 @@ def _in_chunks(
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[frames]), inputs)
 
     iterations = config.iterations
-    start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else last_state(before))
+    start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))
     begin = 0 if before is None else before.num_frames - 1
     state, done, seconds, compile_s = start, [], 0.0, 0.0
     for first in range(begin, total, chunk):
@@ -164,14 +164,16 @@ def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory)
     return jax.tree.map(function, *whole).replace(**end)
 
 
-def last_state(trajectory: Trajectory) -> ClothState:
-    """Return the state that a trajectory without an error ended in."""
-    position, velocity, load = (  # of a file they are NumPy's
-        jnp.asarray(leaf[-1])
-        for leaf in (trajectory.positions, trajectory.velocities, trajectory.friction_loads)
-    )
-    state = initial_state(position, velocity)
-    return state.replace(friction_load=load, frame=jnp.int32(trajectory.num_frames - 1))
+def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothState:
+    """Return the state of the cloth at a frame of a trajectory without an error, the last by default."""
+    frame = range(trajectory.num_frames)[frame]
+    position, velocity = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)  # or a file's
+    past = scene.initial_state.past
+    if past is not None and frame > 0:
+        past = PastState(position[frame - 1], velocity[frame - 1], jnp.ones((), bool))
+    state = initial_state(position[frame], velocity[frame])
+    load = jnp.asarray(trajectory.friction_loads[frame])
+    return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)
 
 
 def _scan(
@@ -249,8 +251,7 @@ def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[
     bad = trajectory.first_bad_frame
     kept = _slice_frames(trajectory, slice(first, None))
     kept = kept.replace(first_bad_frame=jnp.where(bad >= 0, bad - first, bad))
-    state = initial_state(kept.positions[0], kept.velocities[0])
-    state = state.replace(friction_load=kept.friction_loads[0])
+    state = state_at(trajectory, scene, first).replace(frame=jnp.int32(0))
     return kept, slice_tracks(scene, slice(first, None)).replace(initial_state=state, num_frames=num_frames)
 
 

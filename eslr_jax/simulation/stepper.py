@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach
-from eslr_jax.errors import Status
+from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Minimum
@@ -19,7 +19,7 @@ from eslr_jax.physics.potential import contact_load, evaluate, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pin, separate, weight_norm
 from eslr_jax.physics.solve import Start, lower_point, solve, start_from_guess
 from eslr_jax.simulation.network import predict
-from eslr_jax.types import ClothState, PotentialTerms
+from eslr_jax.types import ClothState, PastState, PotentialTerms
 
 
 class FrameReport(NamedTuple):
@@ -57,6 +57,11 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
                 memory=config.memory,
             )
         else:
+            if config.model is not None and state.past is not None:
+                raise ConfigError(
+                    'a network steps by implicit Euler; choose integrator "euler", or iterations of the solver '
+                    "behind the network"
+                )
             start, status = find_start(params, problem, state, config)
             minimum = Minimum(*start.point, iterations=jnp.int32(0))
         position = pin(problem, minimum.position)
@@ -114,7 +119,7 @@ def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:
 def next_state(
     position: Float[Array, "vertices 3"], problem: FrameProblem, state: ClothState, status: Int[Array, ""]
 ) -> ClothState:
-    """Return the state at t + 1, with the velocity that brought the cloth there (semi-implicit Euler).
+    """Return the state at t + 1, with the velocity that brought the cloth there.
 
     Args:
         position: Positions at t + 1 [m], shape [vertices, 3].
@@ -124,13 +129,15 @@ def next_state(
     """
     status = state.status | status | problem_status(problem) | _finiteness(position)
     frame = state.frame + 1
+    origin = problem.position if problem.bdf2 is None else problem.bdf2.origin
     return ClothState(
         position=position,
-        velocity=(position - problem.position) / problem.timestep,
+        velocity=(position - origin) / problem.inertial_timestep,
         friction_load=contact_load(position, problem),
         frame=frame,
         status=status,
         first_bad_frame=jnp.where((state.status == 0) & (status != 0), frame, state.first_bad_frame),
+        past=None if state.past is None else PastState(state.position, state.velocity, jnp.ones((), bool)),
     )
 
 

@@ -42,6 +42,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("simulator", nargs="?", default="corrected", choices=choices)
     parser.add_argument("--model", default=DEFAULT_MODEL)
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
+    parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
     parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
@@ -66,7 +67,7 @@ def find_simulator(arguments: argparse.Namespace):
 
     name = arguments.simulator
     if name == "physics":
-        return solver_simulator(arguments.iterations)
+        return solver_simulator(arguments.iterations, arguments.integrator)
     if name in ITERATIONS:
         return network_simulator(arguments.model, *load_model(arguments.model), arguments.iterations)
     if arguments.iterations is not None:
@@ -102,6 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
     simulator = find_simulator(arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
+    other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
     path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
     outcomes = []
     for case in cases:

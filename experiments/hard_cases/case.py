@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError, Status
+from eslr_jax.scene.build import Integrator, start_integrator
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.colliders import Collider
 
@@ -38,6 +39,7 @@ class Simulator:
     name: str
     simulate: Callable[[Scene], Trajectory]
     garment_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of `prepare_garment`
+    integrator: Integrator = "euler"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +145,9 @@ def run_case(case: HardCase, simulator: Simulator) -> Outcome:
         try:
             if isinstance(built, EslrError):
                 raise built
-            runs[label] = Run(built.scene, built.colliders, simulator.simulate(built.scene))
+            state = start_integrator(built.scene.initial_state, simulator.integrator)
+            scene = built.scene.replace(initial_state=state)
+            runs[label] = Run(scene, built.colliders, simulator.simulate(scene))
         except EslrError as error:
             refusals[label] = error
     measures = [Measure("frames not finite", sum(int(np.sum(~run.is_finite)) for run in runs.values()), 0)]

@@ -10,18 +10,20 @@ from jaxtyping import Float
 
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.gap import find_friction_loads
+from eslr_jax.scene.build import Integrator
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import PotentialTerms, Scene, Trajectory
 from hard_cases.case import Simulator
 
 
-def solver_simulator(iterations: int = 200) -> Simulator:
+def solver_simulator(iterations: int = 200, integrator: Integrator = "euler") -> Simulator:
     """Return the L-BFGS solver as a simulator, with so many iterations per frame at most."""
 
     def run(scene: Scene) -> Trajectory:
         return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
 
-    return Simulator(f"physics, {iterations} iterations", run)
+    name = "physics" if integrator == "euler" else f"physics, {integrator}"
+    return Simulator(f"{name}, {iterations} iterations", run, integrator=integrator)
 
 
 def network_simulator(name: str, params: Any, model: ModelConfig, iterations: int = 0) -> Simulator:

@@ -112,7 +112,9 @@ def test_contact_spring_pushes_as_our_cubic_does_through_the_whole_distance():
     inside = jnp.zeros_like(scene.initial_state.position)
     up = jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), inside.shape)
     near = jnp.ones(len(inside), bool)
-    contacts = Contacts(inside, inside, up, up, jnp.zeros(len(inside)), near)
+    contacts = Contacts(
+        inside, inside, up, up, jnp.zeros(len(inside)), near, jnp.zeros(len(inside), jnp.int32)
+    )
     forces = contact_forces(inside, contacts, scene.garment, scene.constants.collision_stiffness, radius)
     count = np.sum(np.asarray(scene.garment.vertex_mask))
     assert contact_stiffness(scene) * radius == pytest.approx(float(forces.sum()) / count, rel=1e-4)

@@ -61,6 +61,7 @@ def make_contacts(start, normals, heights, is_near) -> Contacts:
         next_normals=normals,
         distances=heights,
         is_near=is_near,
+        faces=np.zeros(len(start), np.int32),
     )
 
 

@@ -160,7 +160,7 @@ def test_the_three_criteria_look_at_different_bodies(step):
     with jax.enable_x64(True):
         values = {name: evaluate(step, name)[0] for name, _ in CRITERIA}
     for one, other in (("postcvpr", "cvpr"), ("postcvpr", "metric")):
-        np.testing.assert_array_equal(values[one][:4], values[other][:4])
+        np.testing.assert_allclose(values[one][:4], values[other][:4], rtol=1e-12)  # each is compiled anew
         assert values[one][4] != values[other][4]
     assert values["postcvpr"][5] == values["cvpr"][5], "friction is a frame late in both"
     assert values["postcvpr"][5] != values["metric"][5]

@@ -1,0 +1,202 @@
+"""Skin under the faces of the cloth: where the body's own vertices would show between those of the cloth."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.contact.nearest import CLEARANCE, find_contacts, point_triangle
+from eslr_jax.contact.nearest import _first_true as first_true
+from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
+from eslr_jax.types import BodySurface, Contacts, Garment
+
+_LIFTS = 8  # of skinned cloth off the skin
+_ROUNDS = 4  # of neighbours; at 1k vertices the cloth's are two to three of the body's edges apart
+_BESIDE = 0.005  # [m] that the cloth may be beside a body vertex instead of over it
+_OVER = 0.02  # [m] over a body vertex, at the end of the frame, beyond which the cloth does not matter to it
+_UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
+
+
+@struct.dataclass
+class SkinContacts:
+    """Body vertices close under a face of the cloth at t, and where the body carries them."""
+
+    corners: Int[Array, "rows 3"]  # vertices of the face
+    weights: Float[Array, "rows 3"]  # barycentric, of the place nearest to the body vertex at t
+    next_points: Float[Array, "rows 3"]  # body vertices at t + 1 [m]
+    next_normals: Float[Array, "rows 3"]  # of the body there
+    is_near: Bool[Array, " rows"]
+
+
+def find_skin_contacts(
+    cloth: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
+    bodies: tuple[Float[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"]],
+    nearest: Contacts,
+    surface: BodySurface,
+    garment: Garment,
+) -> SkinContacts:
+    """Return the body vertices that the cloth's faces are about to cut.
+
+    Vertices of the cloth keep off the body, but between them a face may cut a knee. The rows are those body
+    vertices that are least far below the cloth, at most half of them: there is no buffer that could run over.
+
+    Args:
+        cloth: Cloth vertices at t [m], and a guess of them at t + 1, such as the inertial one.
+        bodies: Surface vertices at t and at t + 1 [m].
+        nearest: The nearest body point of every cloth vertex.
+        surface: Faces of the body.
+        garment: Rest mesh.
+    """
+    position, predicted = cloth
+    body, next_body = bodies
+    vertex = _nearest_vertices(position, body, nearest, surface)
+    vertex = _descend(vertex, position, body, garment)
+    corners, weights, squared = _nearest_places(vertex, position, body, garment)
+    normals = vertex_normals(body, surface.faces, surface.face_incidence)
+    next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
+
+    def height(cloth: Array, points: Array, outward: Array) -> Float[Array, " surface_vertices"]:
+        place = sum(weights[:, k, None] * cloth[corners[:, k]] for k in range(3))
+        return jnp.sum((place - points) * outward, axis=-1)
+
+    over, next_over = height(position, body, normals), height(predicted, next_body, next_normals)
+    is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
+    clearance = jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
+    nearness, rows = jax.lax.top_k(-clearance, min(position.shape[0], clearance.shape[0] // 2))
+    return SkinContacts(
+        corners=corners[rows],
+        weights=weights[rows],
+        next_points=next_body[rows],
+        next_normals=next_normals[rows],
+        is_near=-nearness < _OVER,
+    )
+
+
+def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts) -> Float[Array, " rows"]:
+    """Return how high the places of the cloth are over the body vertices at t + 1 [m]."""
+    x = components(position)
+    place = tuple(sum(skin.weights[:, k] * axis[skin.corners[:, k]] for k in range(3)) for axis in x)
+    return dot3(sub3(place, components(skin.next_points)), components(skin.next_normals))  # type: ignore[arg-type]
+
+
+def lift_off_skin(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+    garment: Garment,
+) -> Float[Array, "vertices 3"]:
+    """Return positions [m], shape [vertices, 3], with faces of the cloth lifted off the skin; pinned ones stay.
+
+    Args:
+        position: Cloth vertices outside the body, of `clear_of_body` [m].
+        body: Surface vertices [m].
+        surface: Faces of the body.
+        garment: Says which vertices are pinned.
+    """
+    count = position.shape[0]
+
+    def lift(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+        nearest = find_contacts(position, body, body, surface)
+        skin = find_skin_contacts((position, position), (body, body), nearest, surface, garment)
+        depth = jnp.where(skin.is_near, jnp.maximum(CLEARANCE - skin_heights(position, skin), 0.0), 0.0)
+        # Corner k moves by w_k / |w|^2 times the depth, so that the place does by the depth; a corner of several
+        # places by the largest that they ask for.
+        share = skin.weights / jnp.sum(skin.weights**2, axis=1, keepdims=True) * depth[:, None]
+        highest = jnp.zeros(count).at[skin.corners].max(share)
+        is_highest = (share > 0) & (share == highest[skin.corners])
+        moves = jnp.where(is_highest[..., None], share[..., None] * skin.next_normals[:, None], 0.0)
+        times = jnp.zeros(count).at[skin.corners].add(is_highest.astype(position.dtype))
+        move = jnp.zeros_like(position).at[skin.corners].add(moves) / jnp.maximum(times, 1.0)[:, None]
+        return position + jnp.where(garment.is_pinned[:, None], 0.0, move)
+
+    return jax.lax.fori_loop(0, _LIFTS, lift, position)
+
+
+def _nearest_vertices(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    nearest: Contacts,
+    surface: BodySurface,
+) -> Int[Array, " surface_vertices"]:
+    """Return a near cloth vertex of every body vertex.
+
+    A cloth vertex begins at the corners of the body face that it is nearest to; body vertices then take over
+    what is nearest of their neighbours', a few times.
+    """
+    num_faces, cloth, here = surface.faces.shape[0], components(position), components(body)
+    flat = surface.faces.T.ravel()
+    is_neighbor = surface.face_incidence < flat.size
+    # The corner that follows a vertex in each of its faces: around an inner vertex, every neighbour once.
+    neighbors = flat[jnp.where(is_neighbor, (surface.face_incidence + num_faces) % flat.size, 0)]
+    own = jnp.arange(body.shape[0], dtype=jnp.int32)[:, None]
+    around = jnp.concatenate([own, jnp.where(is_neighbor, neighbors, own)], axis=1)
+    nobody = position.shape[0]
+    is_seed = nearest.is_near[:, None]
+    seeds = jnp.where(is_seed, surface.faces[nearest.faces], body.shape[0])
+    vertex = jnp.full(body.shape[0], nobody, jnp.int32)
+    ids = jnp.broadcast_to(jnp.arange(nobody, dtype=jnp.int32)[:, None], seeds.shape)
+    vertex = vertex.at[seeds].set(ids, mode="drop")
+
+    def spread(_, vertex: Int[Array, " surface_vertices"]) -> Int[Array, " surface_vertices"]:
+        return _nearest_candidate(vertex[around], cloth, here)
+
+    return jax.lax.fori_loop(0, _ROUNDS, spread, vertex)
+
+
+def _descend(
+    vertex: Int[Array, " surface_vertices"],
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    garment: Garment,
+) -> Int[Array, " surface_vertices"]:
+    """Return cloth vertices that are nearer still, edges of the cloth away: its mesh may be the finer one."""
+    cloth, here, nobody = components(position), components(body), position.shape[0]
+
+    def walk(_, vertex: Int[Array, " surface_vertices"]) -> Int[Array, " surface_vertices"]:
+        known = jnp.minimum(vertex, nobody - 1)
+        around = jnp.where(garment.neighbor_mask[known], garment.neighbors[known], known[:, None])
+        candidates = jnp.concatenate([known[:, None], around], axis=1)
+        nearer = _nearest_candidate(candidates, cloth, here)
+        return jnp.where(vertex < nobody, nearer, nobody)
+
+    return jax.lax.fori_loop(0, _ROUNDS, walk, vertex)
+
+
+def _nearest_candidate(
+    candidates: Int[Array, "rows candidates"], cloth: Vector3, point: Vector3
+) -> Int[Array, " rows"]:
+    """Return each row's candidate that is nearest to its point; one that names no cloth vertex comes last."""
+    nobody = cloth[0].shape[0]
+    places = take3(cloth, jnp.minimum(candidates, nobody - 1))
+    squared = sum((p - b[:, None]) ** 2 for p, b in zip(places, point, strict=True))
+    squared = jnp.where(candidates < nobody, squared, jnp.inf)
+    slot = first_true(squared <= jnp.min(squared, axis=1)[:, None])
+    return jnp.take_along_axis(candidates, slot[:, None], axis=1)[:, 0]
+
+
+def _nearest_places(
+    vertex: Int[Array, " surface_vertices"],
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    garment: Garment,
+) -> tuple[
+    Int[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"], Float[Array, " surface_vertices"]
+]:
+    """Return the nearest place on the faces around a cloth vertex: corners, weights, squared distance [m^2].
+
+    The distance is infinite where there is no vertex.
+    """
+    num_faces, cloth, point = garment.faces.shape[0], components(position), components(body)
+    is_known = vertex < position.shape[0]
+    incidence = garment.face_incidence[jnp.minimum(vertex, position.shape[0] - 1)]
+    is_face = (incidence < garment.faces.size) & is_known[:, None]
+    candidates = jnp.where(is_face, incidence % num_faces, 0)
+    a, b, c = (take3(take3(cloth, garment.faces[:, k]), candidates) for k in range(3))
+    expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
+    squared, u, v = point_triangle(expanded, a, b, c)
+    squared = jnp.where(is_face, squared, jnp.inf)
+    slot = first_true(squared <= jnp.min(squared, axis=1)[:, None])[:, None]
+    face, u, v, squared = (jnp.take_along_axis(x, slot, axis=1)[:, 0] for x in (candidates, u, v, squared))
+    return garment.faces[face], jnp.stack([1.0 - u - v, u, v], axis=1), squared

@@ -1,0 +1,92 @@
+"""Skin under the faces of the cloth: found, kept covered, and lifted off where the start is cut."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import RADIUS, ball, drifting_ball, square
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.skin import find_skin_contacts, lift_off_skin, skin_heights
+from eslr_jax.geometry.closest import closest_points
+from eslr_jax.physics.collision import skin_diagonal, skin_energy
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+
+STIFFNESS, THICKNESS, AREA = 3.5e7, 2e-3, 1e-4  # [J/m^5], [m], [m^2]
+
+
+def scene_of(*, has_skin, num_frames):
+    """A coarse square over a ball of 2 cm radius that fits between four of its vertices, 5 cm apart."""
+    positions, faces = ball(15, 24)
+    small = positions * 0.2 + np.array([0.0, 0.8 * RADIUS, 0.0]), faces
+    options = SceneOptions(has_skin=has_skin)
+    return prepare_scene(square(side=6), drifting_ball(num_frames, speed=0.0, mesh=small), options=options)
+
+
+def height_over_top(position):
+    """Return how far the diagonal in the middle of the square is over the top of the ball [m]."""
+    rows = np.asarray(position).reshape(6, 6, 3)
+    return float((rows[2, 2, 1] + rows[3, 3, 1]) / 2 - RADIUS)
+
+
+def test_a_ball_that_fits_between_vertices_carries_the_faces():
+    scene = scene_of(has_skin=True, num_frames=6)  # in which free cloth falls by 16 cm
+    trajectory = rollout_scene(None, scene, SimConfig(iterations=40))
+    assert height_over_top(trajectory.positions[-1]) > -1e-3
+
+
+def test_faces_are_lifted_off_the_skin():
+    scene = scene_of(has_skin=True, num_frames=2)
+    cut = scene.garment.rest_positions - jnp.array([[0.0, 0.006, 0.0]])
+    assert height_over_top(cut) < -1e-3
+    lifted = lift_off_skin(cut, scene.body.positions[0], scene.body.surface, scene.garment)
+    assert height_over_top(lifted) >= 0
+
+
+@pytest.fixture(scope="module")
+def contacts():
+    scene = scene_of(has_skin=True, num_frames=2)
+    body = scene.body.positions[0]
+    position = scene.initial_state.position
+    nearest = find_contacts(position, body, body, scene.body.surface)
+    skin = find_skin_contacts((position,) * 2, (body,) * 2, nearest, scene.body.surface, scene.garment)
+    return scene, position, body, skin
+
+
+def test_the_rows_are_the_nearest_places_of_the_cloth(contacts):
+    scene, position, _, skin = contacts
+    near = np.asarray(skin.is_near)
+    points = np.asarray(skin.next_points)[near]
+    faces = np.asarray(scene.garment.faces)
+    nearest, weights = closest_points(points, np.asarray(position), faces)
+    true = np.linalg.norm(
+        np.einsum("pk,pkx->px", weights, np.asarray(position)[faces[nearest]]) - points, axis=1
+    )
+    ours = np.einsum(
+        "pk,pkx->px", np.asarray(skin.weights)[near], np.asarray(position)[np.asarray(skin.corners)[near]]
+    )
+    distance = np.linalg.norm(ours - points, axis=1)
+    assert near.sum() > 20
+    assert np.mean(distance > true + 1e-4) < 0.02
+
+
+def test_energy_pushes_the_faces_off_and_needs_no_other_force(contacts):
+    """The gradient is that of central differences, and the diagonal bounds what the curvature is."""
+    *_, position, _, skin = contacts
+    pressed = position - jnp.array([[0.0, 0.003, 0.0]])
+    assert float(jnp.min(jnp.where(skin.is_near, skin_heights(pressed, skin), 1.0))) < THICKNESS
+
+    def energy(x):
+        return skin_energy(x, skin, jnp.asarray(AREA), STIFFNESS, THICKNESS)
+
+    gradient = jax.grad(energy)(pressed)
+    direction = gradient / jnp.linalg.norm(gradient)
+    step = 1e-4
+    difference = (energy(pressed + step * direction) - energy(pressed - step * direction)) / (2 * step)
+    assert float(difference) == pytest.approx(float(jnp.vdot(gradient, direction)), rel=0.02)
+    assert float(jnp.sum(gradient[:, 1])) < 0  # the force, its opposite, lifts
+    diagonal = skin_diagonal(pressed, skin, jnp.asarray(AREA), STIFFNESS, THICKNESS)
+    assert float(jnp.max(diagonal)) > 0
+    assert bool(jnp.all(diagonal >= 0))

@@ -1,0 +1,109 @@
+"""Implicit Euler and BDF2 against what is known of falling and swinging cloth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.evaluation.gap import trajectory_gap
+from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.models.registry import init_model
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import initial_state, start_integrator
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import simulate
+from eslr_jax.types import PhysicsConstants, Scene
+
+LENGTH = 0.5  # [m] of the strip
+GRAVITY = 9.81  # [m/s^2]
+
+
+def strip(integrator, *, frames, is_pinned, timestep=1 / 30, tilt=0.35):
+    """A strip that is released at an angle [rad] from the vertical; pinned at its upper end, or nowhere."""
+    x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
+    index = np.arange(22).reshape(2, 11)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    garment = prepare_garment(
+        np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1),
+        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
+        skin_weights=np.ones((22, 1)),
+        skin_indices=np.zeros((22, 1), int),
+        is_pinned=along == 0 if is_pinned else None,
+    )
+    garment = jax.tree.map(jnp.asarray, garment)
+    start, dt = garment.rest_positions, jnp.float32(timestep)
+    return Scene(
+        garment=garment,
+        material=COTTON,
+        constants=PhysicsConstants(),
+        initial_state=start_integrator(initial_state(start, jnp.zeros_like(start)), integrator),
+        timestep=dt,
+        body=None,
+        pin_targets=jnp.broadcast_to(start, (frames, *start.shape)) if is_pinned else None,
+        num_frames=frames,
+    )
+
+
+def swings(integrator):
+    """Return the heights of the mean angle's turning points over the lowest point [m], one per half period."""
+    scene = strip(integrator, frames=100, is_pinned=True)
+    trajectory = rollout_scene(None, scene, SimConfig(iterations=60))
+    side = np.asarray(trajectory.positions[:, :, 2].mean(axis=1)) * 2
+    is_turn = (np.diff(side[:-1]) * np.diff(side[1:]) <= 0) & (np.abs(side[1:-1]) > 1e-3)
+    turns = np.abs(side[1:-1][is_turn])
+    return LENGTH - np.sqrt(LENGTH**2 - turns**2)
+
+
+def test_bdf2_keeps_a_strip_swinging_and_euler_does_not():
+    kept = {name: swings(name) for name in ("euler", "bdf2")}
+    per_period = {name: np.median(heights[2:] / heights[:-2]) for name, heights in kept.items()}
+    assert per_period["bdf2"] > 0.9, kept
+    assert per_period["euler"] < 0.5, kept
+
+
+@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+def test_a_free_fall_is_off_by_as_much_as_the_integrator_says(integrator):
+    """Euler falls g dt t / 2 too far; BDF2 3/4 g dt^2, which is what its first step by Euler becomes."""
+    frames, dt = 31, 1 / 30
+    scene = strip(integrator, frames=frames, is_pinned=False)
+    end = rollout_scene(None, scene, SimConfig(iterations=5)).positions[-1]
+    fallen = float(jnp.mean(scene.initial_state.position[:, 1] - end[:, 1]))
+    time = (frames - 1) * dt
+    too_far = GRAVITY * dt * {"euler": time / 2, "bdf2": 0.75 * dt}[integrator]
+    assert fallen == pytest.approx(GRAVITY * time**2 / 2 + too_far, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def draped():
+    return prepare_scene(square(), drifting_ball(13), options=SceneOptions(integrator="bdf2"))
+
+
+def test_bdf2_goes_on_where_it_was_interrupted(draped):
+    config = SimConfig(iterations=15)
+    whole = simulate(None, draped, config=config).trajectory
+    first = simulate(None, draped, config=config, is_stopping=lambda: True).trajectory
+    joined = simulate(None, draped, config=config, done=first).trajectory
+    np.testing.assert_array_equal(joined.positions, whole.positions)
+
+
+def test_the_gap_of_a_bdf2_trajectory_is_that_of_its_own_problems(draped):
+    trajectory = rollout_scene(None, draped, SimConfig(iterations=100))
+    gap = trajectory_gap(trajectory, draped, every=6)
+    assert float(jnp.max(gap.share(gap.reached))) < 1e-3
+
+
+def test_a_network_alone_refuses_bdf2(draped):
+    model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
+    with pytest.raises(ConfigError, match="implicit Euler"):
+        rollout_scene(init_model(model), draped, SimConfig(model=model, iterations=0))
+
+
+def test_euler_compiles_what_it_compiled_before(draped):
+    """What BDF2 remembers is not there at all."""
+    euler = prepare_scene(square(), drifting_ball(13))
+    assert euler.initial_state.past is None
+    assert len(jax.tree.leaves(draped)) == len(jax.tree.leaves(euler)) + 3
