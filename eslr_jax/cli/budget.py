@@ -13,7 +13,7 @@ from eslr_jax.errors import ConfigError
 # Peak memory of whole runs of 1,920 and 31,200 vertices over 6 and 60 frames, of the solver and smooth-small.
 _BASE_GB = 1.7
 _VERTEX_BYTES = 1e4
-_FRAME_BYTES = 300
+_FRAME_BYTES = 240
 _TOLERANCE = "1%"  # by default: what is left is not seen, and it takes a third of the default network's time
 
 

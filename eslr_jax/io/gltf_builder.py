@@ -62,10 +62,11 @@ class GlbBuilder:
         steps = np.iinfo(np.int16).max
         rounded = np.zeros((len(points), 4), np.int16)  # vertices start at multiples of four bytes
         rounded[:, :3] = np.round(points * steps)
-        index = self.add_accessor(rounded, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
+        index = self.add_vertices(rounded, gltf.VEC3)
         accessor = self.document.accessors[index]
         accessor.normalized = True
-        accessor.min, accessor.max = rounded[:, :3].min(axis=0).tolist(), rounded[:, :3].max(axis=0).tolist()
+        accessor.min = rounded[:, :3].min(axis=0).tolist()
+        accessor.max = rounded[:, :3].max(axis=0).tolist()
         self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
         self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
         return index

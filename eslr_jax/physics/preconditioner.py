@@ -9,8 +9,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components, scatter_corners
-from eslr_jax.physics.collision import penetration
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.collision import penetration, skin_diagonal
+from eslr_jax.physics.problem import FrameProblem, mean_vertex_area
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 

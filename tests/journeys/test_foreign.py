@@ -76,8 +76,8 @@ def test_a_skirt_that_nothing_holds_ends_on_the_ground_and_is_told(fallen):
     ground = float(run["body_positions"][..., 1].min())
     assert report["ground_m"] == pytest.approx(ground, abs=1e-6)
     heights = run["positions"][..., 1]
-    assert heights.min() > ground
-    assert heights[-1].min() < ground + 0.005
+    assert heights.min() > ground - 0.002, "it hits the ground at three metres a second"
+    assert ground < heights[-1].min() < ground + 0.005
     assert "warning: the garment slid or fell: its centre is" in text
     assert "frame 6" in text
 
