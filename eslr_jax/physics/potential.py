@@ -59,26 +59,25 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         problem: The frame's problem.
     """
     whole = pin(problem, position)
-    position = components(
-        whole
-    )  # once: gradients of all terms are then summed by components, and joined once
+    # Once: gradients of all terms are then summed by components, and joined once.
+    points = components(whole)
     garment, material, constants = problem.garment, problem.material, problem.constants
-    collision = friction = repulsion = own = jnp.zeros((), position[0].dtype)
+    collision = friction = repulsion = own = jnp.zeros((), points[0].dtype)
     if problem.body is not None:
-        collision, friction = _body_energies(position, problem, problem.body)
+        collision, friction = _body_energies(points, problem, problem.body)
     if problem.ground is not None:
-        on_ground = _ground_energies(position, problem, problem.ground)
+        on_ground = _ground_energies(points, problem, problem.ground)
         collision, friction = collision + on_ground[0], friction + on_ground[1]
     if problem.layers is not None:
         layers = problem.layers
-        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+        repulsion = repulsion_energy(points, layers.pairs, constants.repulsion_stiffness, layers.thickness)
     for energy in problem.energies:
         own = own + energy(whole, problem)
     return PotentialTerms(
-        stretch=stretch_energy(position, garment, material),
-        bending=bending_energy(position, garment, material),
-        inertia=inertia_energy(position, problem.inertial_guess, problem.masses, problem.inertial_timestep),
-        gravity=gravity_energy(position, problem.position, problem.masses, constants.gravity),
+        stretch=stretch_energy(points, garment, material),
+        bending=bending_energy(points, garment, material),
+        inertia=inertia_energy(points, problem.inertial_guess, problem.masses, problem.inertial_timestep),
+        gravity=gravity_energy(points, problem.position, problem.masses, constants.gravity),
         collision=collision,
         friction=friction,
         repulsion=repulsion,
