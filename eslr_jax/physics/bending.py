@@ -21,7 +21,7 @@ def dihedral_angles(
     return _angles(_hinge_corners(position, garment))
 
 
-def _hinge_corners(position: Float[Array, "vertices 3"], garment: Garment) -> tuple[Vector3, ...]:
+def _hinge_corners(position: Float[Array, "vertices 3"] | Vector3, garment: Garment) -> tuple[Vector3, ...]:
     # Gathered once: XLA would repeat the gathers in every one of the twelve components of the gradient.
     return jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
 

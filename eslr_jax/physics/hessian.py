@@ -124,7 +124,9 @@ def vertex_blocks(
     position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
 ) -> Float[np.ndarray, "vertices 3 3"]:
     """Return the Hessian of inertia, collision and friction per vertex [N/m]; all positive semi-definite."""
-    blocks = (float64_masses(problem) / float(problem.inertial_timestep) ** 2)[:, None, None] * np.eye(3)
+    with jax.enable_x64(True):
+        timestep = float(jax.tree.map(jnp.asarray, problem).inertial_timestep)
+    blocks = (float64_masses(problem) / timestep**2)[:, None, None] * np.eye(3)
     if problem.body is not None:
         for contacts in (problem.body.nearest, problem.body.opposing):
             blocks = blocks + _collision_blocks(position, contacts, problem.body.thickness, problem)
