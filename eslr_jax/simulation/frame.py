@@ -75,7 +75,9 @@ def _body_contact(
 ) -> BodyContact:
     """Return the contact of a frame with the scene's body."""
     garment, constants = problem.garment, problem.constants
-    nearest, opposing = find_both_sides(problem.position, step.start, step.end, body.surface)
+    nearest, opposing = find_both_sides(
+        problem.position, step.start, step.end, body.surface, garment.vertex_blocks
+    )
     tips = None
     if body.is_sharp:
         pairs = find_tip_contacts(problem.position, problem.inertial_guess, step.start, step.end, garment)
