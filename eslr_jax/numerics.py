@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
@@ -33,6 +35,57 @@ def masked_sum(x: Float[Array, "rows ..."], mask: Bool[Array, " rows"]) -> Float
     """Sum the rows of `x` where `mask` holds; masked rows may be anything, also NaN."""
     mask = mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim))
     return jnp.sum(jnp.where(mask, x, 0), axis=0)
+
+
+def true_rows(mask: Bool[Array, " rows"], capacity: int) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
+    """Return the first `capacity` rows where `mask` holds (the rest is past the end), and how many hold.
+
+    A binary search in the running count: `jnp.nonzero` scatters, one element at a time on a CPU.
+    """
+    running = jnp.cumsum(mask, dtype=jnp.int32)
+    rows = jnp.searchsorted(running, jnp.arange(1, capacity + 1, dtype=jnp.int32), side="left")
+    return rows, running[-1]
+
+
+class TrueEntries(NamedTuple):
+    """The true entries of a matrix in order, each to be found by its number."""
+
+    words: Int[Array, "rows words"]  # 32 columns each, the first in the lowest bit
+    running: Int[Array, " rows"]  # true entries up to the end of every row
+
+    @property
+    def count(self) -> Int[Array, ""]:
+        """Number of true entries."""
+        return self.running[-1]
+
+    def find(self, number: Int[Array, " entries"]) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
+        """Return row and column of the entries with these numbers; of some entry where there is none."""
+        last_row = self.running.shape[0] - 1
+        row = jnp.minimum(jnp.searchsorted(self.running, number, side="right"), last_row)
+        counts = jax.lax.population_count(self.words)
+        left = number - (self.running - jnp.sum(counts, axis=1))[row]
+        column = jnp.zeros_like(row)
+        # Halve the span again and again: first in words, then in bits of the word.
+        before = (jnp.cumsum(counts, axis=1) - counts)[row]
+        word = jnp.sum(before <= left[:, None], axis=1) - 1
+        left = left - jnp.take_along_axis(before, word[:, None], axis=1)[:, 0]
+        bits = self.words[row, word].astype(jnp.uint32)
+        for width in (16, 8, 4, 2, 1):
+            low = jax.lax.population_count(bits & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+            is_higher = left >= low
+            left = jnp.where(is_higher, left - low, left)
+            bits = jnp.where(is_higher, bits >> jnp.uint32(width), bits)
+            column = column + jnp.where(is_higher, width, 0)
+        return row.astype(jnp.int32), (32 * word + column).astype(jnp.int32)
+
+
+def true_entries(mask: Bool[Array, "rows columns"]) -> TrueEntries:
+    """Return the true entries of a matrix, to be found by number without a list of them all."""
+    padded = jnp.pad(mask, ((0, 0), (0, -mask.shape[1] % 32))).reshape(mask.shape[0], -1, 32)
+    bits = jnp.left_shift(jnp.uint32(1), jnp.arange(32, dtype=jnp.uint32))
+    words = jnp.sum(jnp.where(padded, bits[None, None], jnp.uint32(0)), axis=2, dtype=jnp.uint32)
+    counts = jnp.sum(jax.lax.population_count(words), axis=1, dtype=jnp.uint32).astype(jnp.int32)
+    return TrueEntries(words.astype(jnp.int32), jnp.cumsum(counts))
 
 
 def segment_sum(

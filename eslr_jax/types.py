@@ -61,6 +61,7 @@ class Garment:
     neighbor_mask: Bool[Array, "vertices degree"]
     face_incidence: Int[Array, "vertices face_degree"]  # see numerics.gather_corners
     hinge_incidence: Int[Array, "vertices hinge_degree"]
+    vertex_blocks: Int[Array, "vertex_blocks block"]  # compact groups of all vertices; some may be repeated
     edge_mask: Bool[Array, " edges"]
     vertex_mask: Bool[Array, " vertices"]
     geodesic_embedding: Float[Array, "vertices embedding"]  # [m]
@@ -114,15 +115,13 @@ class BodySurface:
     """Part of a body that cloth can touch, with a two-level search structure.
 
     Vertices are grouped into patches that stay together when the body bends. The nearest patches lead to the
-    nearest vertex, and that vertex to the faces around it.
+    nearest vertices, and these to the faces around them.
     """
 
     vertex_ids: Int[Array, " surface_vertices"]  # of the whole body's vertices
     faces: Int[Array, "surface_faces 3"]  # into `vertex_ids`
     face_incidence: Int[Array, "surface_vertices degree"]  # see numerics.gather_corners
-    patch_centers: Int[Array, " patches"]  # a vertex of each patch
-    patch_vertices: Int[Array, "patches members"]  # padded by repetition
-    vertex_faces: Int[Array, "surface_vertices candidates"]  # padded by repetition
+    patch_vertices: Int[Array, "patches members"]  # compact groups of all vertices; the last may repeat one
     is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
 
 

@@ -67,7 +67,10 @@ def compare_searches(pair: Pair, turns: int) -> dict[str, Any]:
 
     def search(scene: Scene) -> tuple[Callable, tuple]:
         first = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene)).body
-        nearest = lambda x: find_both_sides(x, first.start, first.end, scene.body.surface)[0].distances  # noqa: E731
+
+        def nearest(x: jax.Array) -> jax.Array:
+            return find_both_sides(x, *first, scene.body.surface, scene.garment.vertex_blocks)[0].distances
+
         return nearest, (scene.initial_state.position,)
 
     faces = [int(scene.body.surface.faces.shape[0]) for scene in pair.values()]

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.nearest import point_triangle
+from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.errors import Status
-from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3
+from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3, true_rows
 from eslr_jax.types import Garment, PairCapacity
 
 TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
@@ -147,11 +147,11 @@ def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCap
     squared = _squared_distance((x[:, None], y[:, None], z[:, None]), listed)
     is_close = is_listed & points.mask[:, None] & (squared < grid.cell_size**2)
     limit = capacity.faces * num_points
-    rows, num_close = _compact(is_close.ravel(), limit)
+    rows, num_close = true_rows(is_close.ravel(), limit)
     point = jnp.minimum(rows // faces.shape[1], num_points - 1)
     face = faces.ravel()[jnp.minimum(rows, faces.size - 1)]
     is_pair, weights, side = _is_pair(point, face, points, cloth, radius)
-    rows, count = _compact(is_pair & (jnp.arange(limit) < num_close), capacity.pairs)
+    rows, count = true_rows(is_pair & (jnp.arange(limit) < num_close), capacity.pairs)
     is_used = jnp.arange(capacity.pairs) < count
     rows = jnp.minimum(rows, limit - 1)
     point = jnp.where(is_used, point[rows], num_points - 1)
@@ -222,16 +222,6 @@ def _listed_faces(
         is_listed.reshape(num_points, -1),
         jnp.max(last - first),
     )
-
-
-def _compact(mask: Bool[Array, " rows"], capacity: int) -> tuple[Int[Array, " capacity"], Int[Array, ""]]:
-    """Return the first `capacity` rows where `mask` holds (the rest is past the end), and how many hold.
-
-    A binary search in the running count: `jnp.nonzero` scatters, one element at a time on a CPU.
-    """
-    running = jnp.cumsum(mask, dtype=jnp.int32)
-    rows = jnp.searchsorted(running, jnp.arange(1, capacity + 1, dtype=jnp.int32), side="left")
-    return rows, running[-1]
 
 
 def _is_pair(

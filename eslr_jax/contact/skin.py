@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.nearest import CLEARANCE, find_contacts, point_triangle
-from eslr_jax.contact.nearest import _first_true as first_true
+from eslr_jax.contact.nearest import CLEARANCE, find_contacts
+from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
@@ -172,7 +172,7 @@ def _nearest_candidate(
     places = take3(cloth, jnp.minimum(candidates, nobody - 1))
     squared = sum((p - b[:, None]) ** 2 for p, b in zip(places, point, strict=True))
     squared = jnp.where(candidates < nobody, squared, jnp.inf)
-    slot = first_true(squared <= jnp.min(squared, axis=1)[:, None])
+    slot = _first_smallest(squared)
     return jnp.take_along_axis(candidates, slot[:, None], axis=1)[:, 0]
 
 
@@ -197,6 +197,14 @@ def _nearest_places(
     expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
     squared, u, v = point_triangle(expanded, a, b, c)
     squared = jnp.where(is_face, squared, jnp.inf)
-    slot = first_true(squared <= jnp.min(squared, axis=1)[:, None])[:, None]
+    slot = _first_smallest(squared)[:, None]
     face, u, v, squared = (jnp.take_along_axis(x, slot, axis=1)[:, 0] for x in (candidates, u, v, squared))
     return garment.faces[face], jnp.stack([1.0 - u - v, u, v], axis=1), squared
+
+
+def _first_smallest(values: Float[Array, "rows columns"]) -> Int[Array, " rows"]:
+    """Return the first column of every row's minimum; `argmin` is slow on XLA's CPU backend."""
+    width = values.shape[1]
+    columns = jnp.arange(width, dtype=jnp.int32)[None]
+    is_smallest = values <= jnp.min(values, axis=1)[:, None]
+    return jnp.min(jnp.where(is_smallest, columns, width - 1), axis=1)

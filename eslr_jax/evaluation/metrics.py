@@ -39,7 +39,7 @@ def measure_frames(trajectory: Trajectory, scene: Scene) -> FrameMeasures:
         stretch = jnp.sort(jnp.where(is_real, principal_stretches(moved_to, garment)[0], jnp.inf))
         distances = None
         if scene.body is not None:
-            contacts = find_contacts(moved_to, body, body, scene.body.surface)
+            contacts = find_contacts(moved_to, body, body, scene.body.surface, garment.vertex_blocks)
             distances = jnp.where(garment.vertex_mask, contacts.distances, jnp.inf)
         moved = jnp.where(garment.vertex_mask[:, None], (moved_to - position) / scene.timestep, 0.0)
         speed = jnp.sqrt(jnp.sum(moved * moved) / jnp.sum(garment.vertex_mask, dtype=moved.dtype))

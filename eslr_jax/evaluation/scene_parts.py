@@ -98,7 +98,10 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
     }
     if scene.body is not None:
         surface = scene.body.surface
-        parts["contact search"] = (lambda x: find_both_sides(x, *inputs.body, surface), (state.position,))
+        parts["contact search"] = (
+            lambda x: find_both_sides(x, *inputs.body, surface, scene.garment.vertex_blocks),
+            (state.position,),
+        )
     if config.model is not None:
         model = config.model
         parts["network"] = (lambda state: predict(params, problem, state, model).position, (state,))

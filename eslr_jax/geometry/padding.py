@@ -11,6 +11,7 @@ import numpy as np
 from eslr_jax.errors import CapacityError
 from eslr_jax.types import Garment
 
+BLOCK = 8  # vertices that a search handles together, see `Garment.vertex_blocks`
 STEPS_PER_OCTAVE = 16  # a size is rounded up by at most a sixteenth
 
 
@@ -120,6 +121,9 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     padded["hinge_incidence"] = _pad_incidence(
         leaves["hinge_incidence"], 4, (have.hinges, bucket.hinges), (bucket.vertices, bucket.hinge_degree)
     )
+    blocks = leaves["vertex_blocks"]
+    spare = -(-bucket.vertices // BLOCK) - len(blocks)
+    padded["vertex_blocks"] = np.pad(blocks, ((0, spare), (0, 0)), constant_values=bucket.vertices - 1)
     return dataclasses.replace(garment, **padded)
 
 

@@ -117,7 +117,9 @@ def _body_contact(
 ) -> BodyContact:
     """Return the contact of a frame with the scene's body."""
     garment, constants = problem.garment, problem.constants
-    nearest, opposing = find_both_sides(problem.position, step.start, step.end, body.surface)
+    nearest, opposing = find_both_sides(
+        problem.position, step.start, step.end, body.surface, garment.vertex_blocks
+    )
     skin = tips = None
     if body.has_skin:
         cloth = (problem.position, problem.inertial_guess)

@@ -1,0 +1,164 @@
+"""Time the parts of a frame of the solver, by size, with and without self-contact.
+
+    python experiments/benchmarks/frame_cost.py [--sizes 1k 4k 10k 50k] [--out DIR] [--smoke]
+
+A T-shirt in the middle of a walk. Every part is called in turns with the others, and counts as a ratio to one
+iteration of the solver in the same turns: figures of a busy machine then compare with those of a quiet one.
+Writes frame_cost.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from eslr_jax.assets import load_body, load_garment, load_motion
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import find_both_sides, find_contacts
+from eslr_jax.contact.self_contact import find_self_contacts
+from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.numerics import vertex_normals
+from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.preconditioner import stiffness
+from eslr_jax.physics.solve import solve, start_from_guess
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.frame import frame_problem
+from eslr_jax.simulation.simulate import simulate
+from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.types import Scene
+
+RESULTS = Path(__file__).parents[1] / "results"
+SIZES = ("1k", "4k", "10k")
+CLIP = "cmu_016_32"
+FRAMES = 12  # simulated before the one that is timed
+ITERATIONS = 20  # of the whole frame, as in scene_needs.py
+FEW, MANY = 5, 25  # iterations between which one is timed
+
+
+def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
+    """Return the parts of the frame after a short rollout, as functions with their arguments.
+
+    Args:
+        scene: What is simulated.
+        iterations: Of the rollout before.
+    """
+    run = simulate(None, scene, config=SimConfig(iterations=iterations))
+    scene = run.scene  # with buffers that sufficed
+    states, inputs = trajectory_states(run.trajectory, scene)
+    state, step = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), (states, inputs))
+    problem = jax.jit(frame_problem)(scene, state, step)
+    start = jax.jit(lambda problem: start_from_guess(problem, initial_guess(problem)))(problem)
+    surface, blocks = scene.body.surface, scene.garment.vertex_blocks
+
+    @jax.jit
+    def minimise(problem, start, iterations):
+        return solve(problem, start, iterations=iterations).position
+
+    @jax.jit
+    def before(scene, state, step):
+        problem = frame_problem(scene, state, step)
+        start = start_from_guess(problem, initial_guess(problem))
+        return start, stiffness(problem, start.point.position)
+
+    @jax.jit
+    def whole(scene, state, step):
+        return make_stepper(None, SimConfig(iterations=ITERATIONS))(frame_problem(scene, state, step), state)
+
+    body = (state.position, step.body.start, step.body.end, surface, blocks)
+    parts = {
+        "body normals": (jax.jit(vertex_normals), (step.body.end, surface.faces, surface.face_incidence)),
+        "nearest contact": (jax.jit(find_contacts), body),
+        "both contacts": (jax.jit(find_both_sides), body),
+        "frame problem": (jax.jit(frame_problem), (scene, state, step)),
+        "guess": (jax.jit(initial_guess), (problem,)),
+        "preconditioner": (jax.jit(stiffness), (problem, start.point.position)),
+        "all before the first iteration": (before, (scene, state, step)),
+        "few": (minimise, (problem, start, FEW)),
+        "many": (minimise, (problem, start, MANY)),
+        f"whole frame, {ITERATIONS} iterations": (whole, (scene, state, step)),
+    }
+    if scene.self_contact is not None:
+        search = jax.jit(partial(find_self_contacts, capacity=scene.self_contact))
+        parts["self search"] = (search, (state.position, problem.inertial_guess, scene.garment))
+    return parts
+
+
+def measure(size: str, turns: int, frames: int) -> dict[str, Any]:
+    """Return the milliseconds of every part with and without self-contact, and ratios to one iteration.
+
+    Args:
+        size: Resolution of the T-shirt.
+        turns: Calls of every part.
+        frames: Frames simulated before.
+    """
+    poses = pose_body(load_body(), load_motion(CLIP), num_frames=frames + 1)
+    garment = load_garment("tshirt", vertices=size)
+    cases = {
+        name: frame_parts(prepare_scene(garment, poses, options=SceneOptions(self_contact=layers)), MANY)
+        for name, layers in (("without self-contact", False), ("with self-contact", True))
+    }
+    timed = time_in_turns(
+        {(case, part): call for case, parts in cases.items() for part, call in parts.items()}, turns
+    )
+    # The least of all calls: what else runs on the machine only ever adds.
+    times = {case: {part: min(timed[case, part]) for part in parts} for case, parts in cases.items()}
+    result: dict[str, Any] = {"vertices": int(np.sum(garment.vertex_mask))}
+    for case, parts in times.items():
+        parts["one iteration"] = (parts.pop("many") - parts.pop("few")) / (MANY - FEW)
+        result[case] = {"ms": parts, "iterations": {k: v / parts["one iteration"] for k, v in parts.items()}}
+    whole = [times[case][f"whole frame, {ITERATIONS} iterations"] for case in cases]
+    return {**result, "whole frame with self-contact / without": whole[1] / whole[0]}
+
+
+def print_table(size: str, result: dict[str, Any]) -> None:
+    """Print one size as a table: milliseconds, and iterations that would take as long."""
+    print(f"{size}: {result['vertices']} vertices{'':14}without self-contact{'':12}with", flush=True)
+    with_layers, without = result["with self-contact"], result["without self-contact"]
+    for part in with_layers["ms"]:
+        cells = [
+            f"{case['ms'][part]:9.2f} ms {case['iterations'][part]:6.2f} it"
+            if part in case["ms"]
+            else " " * 22
+            for case in (without, with_layers)
+        ]
+        print(f"  {part:32}{cells[0]}  {cells[1]}")
+    print(
+        f"  whole frame with / without: {result['whole frame with self-contact / without']:.2f}", flush=True
+    )
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sizes", nargs="+", default=list(SIZES), choices=SIZES)
+    parser.add_argument("--turns", type=int, default=15)
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="1k, two frames, one turn")
+    arguments = parser.parse_args()
+    sizes, turns, frames = (["1k"], 1, 2) if arguments.smoke else (arguments.sizes, arguments.turns, FRAMES)
+    result: dict[str, Any] = {}
+    for size in sizes:
+        result[size] = measure(size, turns, frames)
+        print_table(size, result[size])
+    result |= {"clip": CLIP, "device": device_name(), "environment": environment()}
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(arguments.out / "frame_cost.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
