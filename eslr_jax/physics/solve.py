@@ -23,7 +23,7 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.physics.guess import InitialGuess
 from eslr_jax.physics.lbfgs import Minimum, Stop, minimize
 from eslr_jax.physics.potential import Point, evaluate, potential
-from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
+from eslr_jax.physics.preconditioner import stiffness, stiffness_inverse
 from eslr_jax.physics.problem import FrameProblem
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
@@ -162,11 +162,8 @@ def solve_hessian(
     Source: Nocedal and Wright 2006, algorithm 5.3.
     """
     apply = _hessian(problem, position)
-    matrix = stiffness(problem, position)
+    precondition = stiffness_inverse(stiffness(problem, position))
     tolerance = _LINEAR_TOLERANCE[str(force.dtype)]
-
-    def precondition(residual: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        return solve_stiffness(matrix, residual)
 
     def is_running(state):
         _, _, _, energy, iterations, _ = state
