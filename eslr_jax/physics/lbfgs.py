@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.physics.potential import Point
-from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness
+from eslr_jax.physics.preconditioner import Stiffness, stiffness_inverse
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
@@ -40,9 +41,11 @@ class _State(NamedTuple):
     x: Float[Array, " n"]
     value: Float[Array, ""]
     gradient: Float[Array, " n"]
-    steps: Float[Array, "memory n"]  # s_k, a ring whose newest row is `head`
-    changes: Float[Array, "memory n"]  # y_k
-    curvatures: Float[Array, " memory"]  # 1 / (s_k . y_k); zero marks an empty row
+    smoothed: Float[Array, " n"]  # P g, with the preconditioner P
+    pairs: Float[Array, "rows n"]  # steps s_k, then P y_k; two rings whose newest row is `head`
+    by_gradient: Float[Array, " rows"]  # products of the pairs' rows with the gradient
+    by_change: Float[Array, "rows memory"]  # the same with the gradient changes y_k
+    is_kept: Bool[Array, " memory"]  # rows in use
     head: Int[Array, ""]
     scale: Float[Array, ""]
     decrement: Float[Array, ""]  # gap [J] that the last point was estimated to have
@@ -53,20 +56,32 @@ class _State(NamedTuple):
 Inverse = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 
 
-def _direction(state: _State, inverse: Inverse) -> Float[Array, " n"]:
-    """Return minus the inverse-Hessian estimate times the gradient, by the two-loop recursion."""
-    memory = state.steps.shape[0]
-    rows = [(state.head - age) % memory for age in range(memory)]
-    q = state.gradient
-    weights = []
-    for row in rows:
-        weight = state.curvatures[row] * jnp.dot(state.steps[row], q)
-        q = q - weight * state.changes[row]
-        weights.append(weight)
-    q = state.scale * inverse(q)
-    for row, weight in zip(reversed(rows), reversed(weights), strict=True):
-        q = q + state.steps[row] * (weight - state.curvatures[row] * jnp.dot(state.changes[row], q))
-    return -q
+def _direction(state: _State) -> Float[Array, " n"]:
+    """Return minus the inverse-Hessian estimate times the gradient, in its compact form.
+
+    With S and Y the kept steps and changes in columns, R the upper triangle of S'Y, D its diagonal and P times
+    a scale c as the first estimate:
+    H g = c P g + S R^-T ((D + c Y'PY) R^-1 S'g - c Y'P g) - c PY R^-1 S'g.
+
+    It equals the two-loop recursion, but reads the pairs half as often, and applies P to the gradient alone.
+
+    Source: Byrd, Nocedal and Schnabel 1994, doi 10.1007/BF01582063, theorem 2.2.
+    """
+    memory = state.is_kept.shape[0]
+    order = (state.head + 1 + jnp.arange(memory, dtype=state.head.dtype)) % memory  # oldest first
+    is_kept = state.is_kept[order]
+    both = is_kept[:, None] & is_kept[None, :]
+    of_step, of_change = state.by_gradient[order], state.by_gradient[memory + order]
+    step_change = jnp.where(both, state.by_change[:memory][order][:, order], 0.0)
+    change_change = jnp.where(both, state.by_change[memory:][order][:, order], 0.0)
+    curvatures = jnp.diag(step_change)
+    upper = jnp.triu(step_change) + jnp.diag(jnp.where(is_kept, 0.0, 1.0))  # an empty row solves to nothing
+    back = solve_triangular(upper, jnp.where(is_kept, of_step, 0.0))
+    right = curvatures * back + state.scale * (change_change @ back - jnp.where(is_kept, of_change, 0.0))
+    forth = solve_triangular(upper, right, trans="T")
+    weights = jnp.zeros_like(state.by_gradient).at[order].set(forth)
+    weights = weights.at[memory + order].set(-state.scale * back)
+    return -(state.scale * state.smoothed + weights @ state.pairs)
 
 
 def minimize(
@@ -93,12 +108,18 @@ def minimize(
 
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
-    shape = start.position.shape
+    balance = stiffness_inverse(stiffness)
 
     def inverse(force: Float[Array, " n"]) -> Float[Array, " n"]:
-        return solve_stiffness(stiffness, force.reshape(shape)).reshape(-1)
+        return _flat(balance(_vectors(force)))
 
-    value_and_gradient = jax.value_and_grad(lambda x: function(x.reshape(shape)))
+    def value_and_gradient(x: Float[Array, " n"]):
+        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(tuple(_split(x)))
+        # Written over x one by one: joined at once, XLA computes them in a loop that it can't vectorise.
+        gradient = x
+        for axis, part in enumerate(parts):
+            gradient = jax.lax.dynamic_update_slice(gradient, part, (axis * part.size,))
+        return value, gradient
 
     def is_running(state: _State) -> Array:
         is_above = jnp.dot(state.gradient, state.gradient) > 0
@@ -106,28 +127,29 @@ def minimize(
         return (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
 
     def iterate(state: _State) -> _State:
-        direction = _direction(state, inverse)
+        direction = _direction(state)
         slope = jnp.dot(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
         # Where no step along the direction leads down, the history is dropped and tried without.
-        curvatures = jnp.where(is_lower, state.curvatures, 0.0)
-        moved = _advance(state._replace(curvatures=curvatures), Point(x, value, gradient), inverse)
+        kept = state._replace(is_kept=state.is_kept & is_lower)
+        moved = _advance(kept, Point(x, value, gradient), inverse)
         return moved._replace(
             decrement=-0.5 * slope,
             iterations=state.iterations + 1,
-            is_stuck=~is_lower & jnp.all(state.curvatures == 0),
+            is_stuck=~is_lower & ~jnp.any(state.is_kept),
         )
 
-    first = _ravel(start)
+    first = _flat_point(start)
     x = first.position
-    history = jnp.zeros((memory, x.size), x.dtype)
     initial = _State(
         x=x,
         value=first.value,
         gradient=first.gradient,
-        steps=history,
-        changes=history,
-        curvatures=jnp.zeros(memory, x.dtype),
+        smoothed=inverse(first.gradient),
+        pairs=jnp.zeros((2 * memory, x.size), x.dtype),
+        by_gradient=jnp.zeros(2 * memory, x.dtype),
+        by_change=jnp.zeros((2 * memory, memory), x.dtype),
+        is_kept=jnp.zeros(memory, bool),
         head=jnp.zeros((), jnp.int32),
         scale=jnp.ones((), x.dtype),
         decrement=jnp.full((), jnp.inf, x.dtype),
@@ -135,33 +157,60 @@ def minimize(
         is_stuck=jnp.zeros((), bool),
     )
     if previous is not None:
-        before = _ravel(previous)
-        initial = _advance(initial._replace(x=before.position, gradient=before.gradient), first, inverse)
+        before = _flat_point(previous)
+        initial = initial._replace(
+            x=before.position, gradient=before.gradient, smoothed=inverse(before.gradient)
+        )
+        initial = _advance(initial, first, inverse)
     final = jax.lax.while_loop(is_running, iterate, initial)
-    return Minimum(final.x.reshape(shape), final.value, final.gradient.reshape(shape), final.iterations)
+    return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations)
 
 
-def _ravel(point: Point) -> Point:
+def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:
+    """Return vectors with one axis: all x, all y, all z."""
+    return vectors.T.reshape(-1)
+
+
+def _split(flat: Float[Array, " n"]) -> list[Array]:
+    """Return the components of flat vectors."""
+    return jax.lax.split(flat, (flat.size // 3,) * 3)
+
+
+def _vectors(flat: Float[Array, " n"]) -> Float[Array, "vertices 3"]:
+    """Return flat vectors in rows."""
+    return flat.reshape(3, -1).T
+
+
+def _flat_point(point: Point) -> Point:
     """Return a point whose position and gradient have one axis."""
-    return Point(point.position.reshape(-1), point.value, point.gradient.reshape(-1))
+    return Point(_flat(point.position), point.value, _flat(point.gradient))
 
 
 def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
     """Move to a point, and add the way there to the history, if it says anything about curvature."""
     x, value, gradient = point
     step, change = x - state.x, gradient - state.gradient
+    # P g is summed up: as a difference of two P g, P y holds ten times the rounding.
+    smoothed_change = inverse(change)
+    smoothed = state.smoothed + smoothed_change
     curvature = jnp.dot(step, change)
     is_useful = curvature > 1e-10 * jnp.sqrt(jnp.dot(step, step) * jnp.dot(change, change))
-    inverse_curvature = jnp.where(is_useful, 1.0 / jnp.where(is_useful, curvature, 1.0), 0.0)
-    weighted = jnp.dot(change, inverse(change))
-    head = (state.head + 1) % state.steps.shape[0]
+    memory = state.is_kept.shape[0]
+    head = (state.head + 1) % memory
+    pairs = state.pairs.at[head].set(step).at[memory + head].set(smoothed_change)
+    products = pairs @ change
+    by_change = state.by_change.at[:, head].set(products)
+    by_change = by_change.at[memory + head].set(products[memory:])  # Y'PY is symmetric
+    weighted = products[memory + head]
     return state._replace(
         x=x,
         value=value,
         gradient=gradient,
-        steps=state.steps.at[head].set(step),
-        changes=state.changes.at[head].set(change),
-        curvatures=state.curvatures.at[head].set(inverse_curvature),
+        smoothed=smoothed,
+        pairs=pairs,
+        by_gradient=pairs @ gradient,
+        by_change=by_change,
+        is_kept=state.is_kept.at[head].set(is_useful),
         head=head,
         scale=jnp.where(is_useful, curvature / jnp.where(weighted > 0, weighted, 1.0), state.scale),
     )

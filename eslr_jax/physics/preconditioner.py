@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,18 +115,25 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
 
 
 def solve_stiffness(matrix: Stiffness, force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return displacements [m] that nearly balance a force [N]: a fixed polynomial in D^-1 W times D^-1.
+    """Return displacements [m] that nearly balance a force [N]; see `stiffness_inverse`."""
+    return stiffness_inverse(matrix)(force)
+
+
+def stiffness_inverse(
+    matrix: Stiffness,
+) -> Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]]:
+    """Return a map from forces [N] to displacements [m] that nearly balance them, a polynomial in D^-1 W.
 
     Four terms of the Chebyshev semi-iteration on D - reach W, with diagonal D and springs W. The eigenvalues
     of D^-1 W lie in [-1, 1], so the polynomial is positive: the map is linear, symmetric and positive
-    definite, as L-BFGS needs.
+    definite, as L-BFGS needs. Outside a loop, its coefficients are computed once.
 
     Source: Golub and Varga 1961, doi 10.1007/BF01386013.
     """
     inverse_diagonal = 1.0 / matrix.diagonal
     weights = (_REACH * inverse_diagonal[:, None] * matrix.springs).T
     neighbors = matrix.neighbors.T
-    factors = jnp.asarray(_chebyshev_factors(), force.dtype)
+    factors = jnp.asarray(_chebyshev_factors(), matrix.diagonal.dtype)
 
     def smooth(x: Array) -> Array:
         return sum(weight * x[neighbor] for weight, neighbor in zip(weights, neighbors, strict=True))  # type: ignore[return-value]
@@ -137,10 +146,13 @@ def solve_stiffness(matrix: Stiffness, force: Float[Array, "vertices 3"]) -> Flo
             total[axis] = total[axis] + update[axis]
         return tuple(update), tuple(total), tuple(residual)
 
-    first = components(inverse_diagonal[:, None] * force)
-    # A loop, although its length is fixed: unrolled, XLA computes a term anew for each of its neighbours.
-    _, total, _ = jax.lax.fori_loop(0, _TERMS - 1, add_term, (first, first, first))
-    return jnp.stack(total, axis=-1)
+    def solve(force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+        first = components(inverse_diagonal[:, None] * force)
+        # A loop, although its length is fixed: unrolled, XLA computes a term anew for each of its neighbours.
+        _, total, _ = jax.lax.fori_loop(0, _TERMS - 1, add_term, (first, first, first))
+        return jnp.stack(total, axis=-1)
+
+    return solve
 
 
 def _chebyshev_factors() -> np.ndarray:
