@@ -56,17 +56,11 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, attention_blocks=0)
 
 
-MEDIUM = dataclasses.replace(
-    SMALL, message_passing_steps=2, latent_size=64, attention_size=64, refinement_steps=4
-)
-DEEP = dataclasses.replace(
-    MEDIUM, message_passing_steps=6, attention_blocks=2, refinement_steps=1, remat="products"
-)
 # One step as the solver's initial guess: it costs three to four iterations and saves more.
 SMOOTH = dataclasses.replace(
     _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
-# The paper's network at 1k vertices, which are 21 hops across where its own garments have some 60: layers are to hops,
+# The paper's network for 1k vertices, which are 21 hops across where its garments have some 60: layers are to hops,
 # and widths to layers, as there. One application a frame, HOOD's features, an acceleration.
 SHALLOW = dataclasses.replace(
     PAPER,
@@ -97,10 +91,6 @@ MODELS: dict[str, ModelConfig] = {
     "gsa-small": _without_smoothing(SMALL),
     "mgn-small": _without_attention(_without_smoothing(SMALL)),
     "smooth-small": SMOOTH,
-    "eslr-medium": MEDIUM,
-    "mgn-medium": _without_attention(_without_smoothing(MEDIUM)),
-    "eslr-deep": DEEP,
-    "mgn-deep": _without_attention(_without_smoothing(DEEP)),
 }
 
 
