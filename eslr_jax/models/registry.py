@@ -60,8 +60,8 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
 SMOOTH = dataclasses.replace(
     _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
-# The paper's network for 1k vertices, which are 21 hops across where its garments have some 60: layers are to hops,
-# and widths to layers, as there. One application a frame, HOOD's features, an acceleration.
+# The paper's network for 1k vertices, which are 21 hops across where its garments have some 60: layers are to
+# hops, and widths to layers, as there. One application a frame, HOOD's features, an acceleration.
 SHALLOW = dataclasses.replace(
     PAPER,
     message_passing_steps=5,
