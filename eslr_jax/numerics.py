@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 
 def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> Float[Array, ...]:
@@ -132,14 +132,14 @@ def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:
     return x_part[:, 0], y_part[:, 0], z_part[:, 0]
 
 
-def in_memory(*arrays: Float[Array, " rows"]) -> tuple[Array, ...]:
-    """Return the arrays, each computed once and stored before it is read.
+def in_memory(*arrays: Float[ArrayLike, " rows"]) -> tuple[Array, ...]:
+    """Return the arrays, JAX's or NumPy's, each computed once and stored before it is read.
 
     For coefficients that hold a scalar of the scene: a loop on a CPU that reads a scalar from memory is not
     vectorised by XLA, which took four fifths of an energy's time. It also keeps XLA from computing a gather
     anew in each of its consumers.
     """
-    return jax.lax.optimization_barrier(arrays)
+    return jax.lax.optimization_barrier(tuple(jnp.asarray(array) for array in arrays))
 
 
 def gather_corners(
