@@ -191,6 +191,20 @@ class PairCapacity:
 
 
 @struct.dataclass
+class Air:
+    """Air that cloth moves through; see `physics.air`."""
+
+    # Velocity [m/s], shape [3]; or a function of points [m], shape [points, 3], and the time since the first
+    # frame [s] to velocities, shape [points, 3] or [3], such as `physics.air.gusts`.
+    wind: Float[Array, " 3"] | Partial
+    density: Float[Array, ""] | float = 1.2  # [kg/m^3], at 20 degrees and sea level
+    normal_drag: Float[Array, ""] | float = 1.17  # of a square plate across the flow (Hoerner 1965, 3-15)
+    tangential_drag: Float[Array, ""] | float = (
+        0.02  # of a rough plate along it, both sides (Hoerner 1965, 2-6)
+    )
+
+
+@struct.dataclass
 class Scene:
     """All that a rollout reads. A part that is None is not modelled: the compiled step does not hold it."""
 
@@ -204,6 +218,8 @@ class Scene:
     num_frames: int = struct.field(pytree_node=False)
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
     ground: Float[Array, ""] | None = None  # height of a level ground [m]
+    air: Air | None = None
+    damping: Float[Array, ""] | None = None  # of the fabric [s], see `physics.damping`
     energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
 
 
@@ -217,6 +233,8 @@ class PotentialTerms(NamedTuple):
     collision: Float[Array, "*frames"]
     friction: Float[Array, "*frames"]
     repulsion: Float[Array, "*frames"]  # between layers of cloth
+    air: Float[Array, "*frames"]  # drag and lift, as a dissipation potential
+    damping: Float[Array, "*frames"]  # of the fabric, likewise
     own: Float[Array, "*frames"]  # of the scene's own terms, see `Scene.energies`
 
 

@@ -42,6 +42,9 @@ class Options:
     self_contact: bool
     ground: Literal["auto", "on", "off"] = "auto"
     integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
+    wind: tuple[float, float, float] | None = None
+    gust: float = 0.0
+    damping: float | None = None
 
 
 def interrupted_record(

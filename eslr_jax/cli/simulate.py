@@ -56,6 +56,9 @@ def simulate(
     integrator: Literal["euler", "bdf2"] | None = None,
     self_contact: bool = False,
     ground: Literal["auto", "on", "off"] = "auto",
+    wind: tuple[float, float, float] | None = None,
+    gust: float = 0.0,
+    damping: float | None = None,
     out: Path = Path("out"),
     resume: bool = False,
     pictures: bool = True,
@@ -101,6 +104,9 @@ def simulate(
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
         self_contact: Keep layers of cloth apart.
         ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
+        wind: Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
+        gust: Strength of gusts, as a share of the wind's speed.
+        damping: Internal damping of the fabric in seconds, such as 0.005; it calms fast ripples first.
         out: Folder to write to.
         resume: Go on with the simulation that was interrupted in this folder, with its own options.
         pictures: Render the contact sheet.
@@ -159,6 +165,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
     from eslr_jax.io.garment import write_garment_npz
+    from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
     from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
 
@@ -183,6 +190,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             ground=options.ground,
             has_skin=method.config.iterations > 0,
             integrator=integrator,
+            air=blowing(options.wind, options.gust),
+            damping=options.damping,
         )
         scene = prepare_scene(cloth, settling, material=material, options=modelled)
         if scene.body is not None:
@@ -230,6 +239,9 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "motion": motion,
             "self_contact": options.self_contact,
             "integrator": integrator,
+            "wind_m_s": options.wind,
+            "gust": options.gust,
+            "damping_s": options.damping,
             "ground_m": None if scene.ground is None else float(scene.ground),
             "interrupted_at": last if is_unfinished else None,
             "error": error,

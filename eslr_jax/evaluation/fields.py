@@ -21,6 +21,7 @@ from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
+from eslr_jax.physics.air import blowing
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import evaluate, potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
@@ -37,7 +38,8 @@ from eslr_jax.types import (
     SceneBody,
 )
 
-_TERMS = tuple(term for term in PotentialTerms._fields if term != "own")  # no file holds functions
+# No file holds functions of one's own; what air and damping take away is of a frame, not of a shape.
+_TERMS = tuple(term for term in PotentialTerms._fields if term not in ("air", "damping", "own"))
 FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
 _CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
@@ -141,6 +143,8 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
         num_frames=trajectory.num_frames,
         self_contact=default_capacity(positions.shape[1]) if has_layers else None,
         ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
+        air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
+        damping=run.report.get("damping_s"),
     )
 
 
@@ -160,6 +164,7 @@ def _problem_values(
         position=positions[:-1],
         velocity=velocities[:-1],
         friction_load=jnp.asarray(loads)[:-1],
+        frame=jnp.arange(len(positions) - 1, dtype=jnp.int32),
         past=past_states(positions, velocities, scene),
     )
     values = np.asarray(_every_frame(name, positions[1:], states, scene))

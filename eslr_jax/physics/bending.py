@@ -126,15 +126,30 @@ def hinge_energies(
     Source: HOOD (arXiv 2212.07242); Grinspun et al. 2003, doi 10.2312/SCA03/062-067.
     """
     angle, squared_length = _angles(corners)
-    if not use_current_length:
-        squared_length = rest_squared_lengths(garment)
     if use_rest_angles:
         angle = angle - garment.hinge_rest_angles
+    return (
+        hinge_stiffnesses(garment, material, squared_length if use_current_length else None) * angle * angle
+    )
+
+
+def hinge_stiffnesses(
+    garment: Garment, material: Material, squared_length: Float[Array, " hinges"] | None = None
+) -> Float[Array, " hinges"]:
+    """Return the energy of every hinge [J] by its squared angle; zero where padded.
+
+    Args:
+        garment: Hinges with the sum of their rest areas.
+        material: Bending stiffness [J].
+        squared_length: Of the hinges' edges [m^2]; those of the rest mesh if None.
+    """
+    if squared_length is None:
+        squared_length = rest_squared_lengths(garment)
     areas = garment.hinge_rest_areas
     is_real = areas > 0
     scale = jnp.where(is_real, squared_length / (4.0 * jnp.where(is_real, areas, 1.0)), 0.0)
     (stiffness,) = in_memory(0.5 * material.bending_stiffness * scale)
-    return stiffness * angle * angle
+    return stiffness
 
 
 def rest_squared_lengths(garment: Garment) -> Float[Array, " hinges"]:

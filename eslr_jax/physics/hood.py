@@ -239,6 +239,5 @@ def hood_terms(
         gravity=gravity_energy(position, None, masses, parameters.gravity),
         collision=parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask),
         friction=hood_friction_energy(position, problem, criterion),
-        repulsion=jnp.zeros((), position.dtype),
-        own=jnp.zeros((), position.dtype),
+        **dict.fromkeys(("repulsion", "air", "damping", "own"), jnp.zeros((), position.dtype)),
     )

@@ -45,10 +45,27 @@ def face_energies(
 
     Source: HOOD (arXiv 2212.07242), supplementary; Santesteban et al. 2022, eq. 5.
     """
+    return strain_energies(green_strains(corners, garment), garment, material)
+
+
+def green_strains(corners: tuple[Vector3, ...], garment: Garment) -> Vector3:
+    """Return the components 00, 11 and 01 of the Green strain of every face.
+
+    Args:
+        corners: Positions of the faces' corners [m], of `gather_corners`.
+        garment: Rest frames.
+    """
     first, second = deformation_gradient(corners, garment)
-    g00 = 0.5 * (dot3(first, first) - 1.0)
-    g11 = 0.5 * (dot3(second, second) - 1.0)
-    g01 = 0.5 * dot3(first, second)
+    return (
+        0.5 * (dot3(first, first) - 1.0),
+        0.5 * (dot3(second, second) - 1.0),
+        0.5 * dot3(first, second),
+    )
+
+
+def strain_energies(strains: Vector3, garment: Garment, material: Material) -> Float[Array, " faces"]:
+    """Return the energy of every face [J] by its strain, of `green_strains`."""
+    g00, g11, g01 = strains
     trace = g00 + g11
     volumes = garment.rest_areas * material.thickness
     mu, half_lambda = in_memory(volumes * material.lame_mu, 0.5 * volumes * material.lame_lambda)

@@ -19,6 +19,8 @@ published losses for its tables. Side by side, from x_t to x_{t+1}:
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
 | repulsion | between layers of cloth, where they can meet  | none                                        |
 | ground    | collision and friction as with the body       | none                                        |
+| air       | drag and lift of faces, `physics.air`         | none                                        |
+| damping   | of the fabric's strain, `physics.damping`     | none                                        |
 | own       | terms that the scene was given                | none                                        |
 """
 
@@ -31,8 +33,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components
+from eslr_jax.physics.air import air_energy
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.collision import collision_energy, contact_forces, skin_energy
+from eslr_jax.physics.damping import damping_energy
 from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
@@ -66,6 +70,8 @@ def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem)
         bending=bending_energy(x, problem.garment, problem.material),
         collision=local.collision + on_body,
         repulsion=repulsion,
+        air=air_energy(x, problem),
+        damping=damping_energy(x, problem),
         own=own_energy(position, problem),
     )
 
@@ -99,6 +105,8 @@ def vertex_terms(position: Vector3, problem: FrameProblem) -> PotentialTerms:
         collision=collision,
         friction=friction,
         repulsion=zero,
+        air=zero,
+        damping=zero,
         own=zero,
     )
 

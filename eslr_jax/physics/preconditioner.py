@@ -56,7 +56,7 @@ def hessian_diagonal(
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     garment, constants = problem.garment, problem.constants
-    diagonal = problem.masses / problem.inertial_timestep**2 + stretch_diagonal(garment, problem.material)
+    diagonal = problem.masses / problem.inertial_timestep**2 + _membrane_diagonal(problem)
     if problem.body is not None:
         body = problem.body
         depth = penetration(position, body.nearest, body.thickness)
@@ -72,6 +72,12 @@ def hessian_diagonal(
         diagonal = diagonal + constants.friction_coefficient * problem.ground.friction_load / (3.0 * slip)
     diagonal = diagonal + pair_diagonal(problem, position)
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
+
+
+def _membrane_diagonal(problem: FrameProblem) -> Float[Array, " vertices"]:
+    """Return the stiffness per vertex of the strain and of its change [N/m]."""
+    diagonal = stretch_diagonal(problem.garment, problem.material)
+    return diagonal if problem.strain is None else (1.0 + problem.strain.rate) * diagonal
 
 
 def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
@@ -105,7 +111,7 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
-    share = jnp.where(is_free, stretch_diagonal(garment, problem.material) / degree, 0.0)
+    share = jnp.where(is_free, _membrane_diagonal(problem) / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(
         diagonal=hessian_diagonal(problem, position),

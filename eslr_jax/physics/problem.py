@@ -12,10 +12,12 @@ from jaxtyping import Array, Float
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
+from eslr_jax.physics.air import AirFlow
 from eslr_jax.physics.collision import penetration
+from eslr_jax.physics.damping import PastStrain
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.repulsion import push_apart
-from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
+from eslr_jax.types import Air, Contacts, Garment, Material, PhysicsConstants
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
 
@@ -79,6 +81,9 @@ class FrameProblem:
     body: BodyContact | None = None
     ground: GroundContact | None = None
     layers: SelfContact | None = None
+    air: Air | None = None
+    flow: AirFlow | None = None  # of that air, around the faces
+    strain: PastStrain | None = None  # None: the fabric has no damping
     energies: tuple[Partial, ...] = ()  # of positions and this problem to joules
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
     bdf2: SecondOrder | None = None  # None: implicit Euler

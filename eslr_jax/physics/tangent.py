@@ -16,7 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components, gather_corners, segment_sum
+from eslr_jax.physics.air import air_energy
 from eslr_jax.physics.bending import hinge_energies
+from eslr_jax.physics.damping import damping_energy
 from eslr_jax.physics.membrane import face_energies
 from eslr_jax.physics.potential import own_energy, pair_energies, vertex_terms
 from eslr_jax.physics.preconditioner import hessian_diagonal, pair_diagonal
@@ -33,7 +35,7 @@ class Tangent(NamedTuple):
     blocks: Float[Array, "slots 3 3 vertices"]  # [N/m]; zero where a slot is not used
     pairs: (
         Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]] | None
-    )  # of contact with faces, and of own energies
+    )  # of contact with faces, air, damping, and own energies
     is_free: Bool[Array, "1 vertices"]
 
 
@@ -56,10 +58,13 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
     (vertices,) = (_element_blocks(lambda x: sum(vertex_terms(x[0], problem)), (components(position),)),)
     body, pairs = problem.body, None
     has_faces = body is not None and not (body.skin is None and body.tips is None)
-    if has_faces or problem.layers is not None or problem.energies:
+    dissipates = problem.flow is not None or problem.strain is not None
+    if has_faces or dissipates or problem.layers is not None or problem.energies:
 
         def others(x: Float[Array, "vertices 3"]) -> Float[Array, ""]:
-            return sum(pair_energies(components(x), problem), own_energy(x, problem))
+            parts = components(x)
+            lost = air_energy(parts, problem) + damping_energy(parts, problem)
+            return sum(pair_energies(parts, problem), lost + own_energy(x, problem))
 
         _, pairs = jax.linearize(jax.grad(others), position)
     columns, slots = _pattern(garment)

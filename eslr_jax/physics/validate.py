@@ -9,7 +9,7 @@ import numpy as np
 from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
-    from eslr_jax.types import Garment, Material, PhysicsConstants
+    from eslr_jax.types import Air, Garment, Material, PhysicsConstants
 
 
 class Range(NamedTuple):
@@ -37,6 +37,13 @@ CONSTANT_RANGES = {
     "repulsion_stiffness": Range(0.0, 1e12, "J/m^5"),
     "repulsion_thickness": Range(0.0, 5e-2, "m"),
 }
+AIR_RANGES = {
+    "density": Range(0.0, 1e3, "kg/m^3"),  # up to water
+    "normal_drag": Range(0.0, 10.0, ""),
+    "tangential_drag": Range(0.0, 10.0, ""),
+}
+WIND_RANGE = Range(-100.0, 100.0, "m/s")
+DAMPING_RANGE = Range(0.0, 1.0, "s")
 TIMESTEP_RANGE = Range(1e-4, 1.0, "s")  # HOOD's first step takes a third of a second
 
 
@@ -76,6 +83,32 @@ def validate_timestep(timestep: Any) -> None:
         ConfigError: It is not a finite number in its range.
     """
     _check_range("timestep", timestep, TIMESTEP_RANGE)
+
+
+def validate_air(air: Air) -> Air:
+    """Check the air of a scene, and return it with arrays in the place of sequences.
+
+    Raises:
+        ConfigError: The wind is no velocity, or a number is not finite or out of range.
+    """
+    for name, accepted in AIR_RANGES.items():
+        _check_range(f"air {name}", getattr(air, name), accepted)
+    if callable(air.wind):
+        return air
+    if _check_range("wind", air.wind, WIND_RANGE).shape != (3,):
+        raise ConfigError(f"wind = {air.wind!r} is no velocity; give three numbers in m/s, such as 3, 0, 0")
+    return air.replace(wind=np.asarray(air.wind, np.float32))
+
+
+def validate_damping(damping: Any) -> Any:
+    """Check the damping of a fabric [s], and return it.
+
+    Raises:
+        ConfigError: It is not a finite number in its range.
+    """
+    if _check_range("damping", damping, DAMPING_RANGE).ndim:
+        raise ConfigError("damping is one number for the whole scene [s]")
+    return damping
 
 
 def _check_range(label: str, value: Any, accepted: Range) -> np.ndarray:

@@ -14,6 +14,7 @@ from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.types import (
+    Air,
     BodyMotion,
     BodySurface,
     ClothState,
@@ -44,6 +45,8 @@ class ScenePlan:
     has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
     ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
+    air: Air | None = None
+    damping: Float[Array, ""] | None = None  # of the fabric [s]
     energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
 
 
@@ -81,6 +84,8 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         num_frames=skinned.shape[0],
         self_contact=plan.self_contact,
         ground=plan.ground,
+        air=plan.air,
+        damping=plan.damping,
         energies=plan.energies,
     )
 

@@ -21,8 +21,9 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.validate import validate_air, validate_damping
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
-from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
+from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
 REACH = 0.08
@@ -44,6 +45,8 @@ class SceneOptions:
     integrator: Integrator = "euler"
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
     ground: Literal["auto", "on", "off"] = "auto"
+    air: Air | None = None  # drag and wind; None: a vacuum
+    damping: float | None = None  # of the fabric [s], see `physics.damping`; None: none
     # Terms of one's own: functions of positions [m], shape [vertices, 3], and the frame's `FrameProblem` to an
     # energy [J]. The arguments that a `jax.tree_util.Partial` binds are traced, for jit, vmap and grad.
     energies: tuple[Callable[..., Array], ...] = ()
@@ -95,6 +98,8 @@ def plan_scene(
         has_skin=options.has_skin,
         integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
+        air=None if options.air is None else validate_air(options.air),
+        damping=None if options.damping is None else validate_damping(options.damping),
         energies=tuple(Partial(energy) for energy in options.energies),
     )
 

@@ -12,7 +12,9 @@ from eslr_jax.contact.ground import ground_contacts
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
+from eslr_jax.physics.air import air_flow
 from eslr_jax.physics.collision import contact_forces
+from eslr_jax.physics.damping import past_strain
 from eslr_jax.physics.problem import (
     BodyContact,
     FrameProblem,
@@ -79,6 +81,14 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         problem = problem.replace(body=body)
     if scene.ground is not None:
         problem = problem.replace(ground=_ground_contact(scene, state, scene.ground))
+    if scene.air is not None:
+        time = (state.frame + 1).astype(scene.timestep.dtype) * scene.timestep
+        problem = problem.replace(
+            air=scene.air, flow=air_flow(scene.air, state.position, scene.garment, time)
+        )
+    if scene.damping is not None:
+        strain = past_strain(scene.damping, scene.timestep, state.position, scene.garment)
+        problem = problem.replace(strain=strain)
     if scene.self_contact is not None:
         pairs = find_self_contacts(state.position, problem.inertial_guess, scene.garment, scene.self_contact)
         thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)

@@ -15,6 +15,7 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.tangent import apply, inverse_diagonal, precondition, tangent
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.types import Air
 
 
 class Crumpled(NamedTuple):
@@ -30,8 +31,8 @@ class Crumpled(NamedTuple):
 
 @pytest.fixture(scope="module")
 def crumpled():
-    """A pinned sheet of 25 vertices on a ball, with self-contact, all vertices (pinned ones too) off by noise."""
-    options = SceneOptions(self_contact=True)
+    """A pinned sheet of 25 vertices on a ball, with all that can be modelled; all vertices are off by noise."""
+    options = SceneOptions(self_contact=True, air=Air((1.0, 2.0, 0.5)), damping=0.01)
     scene = prepare_scene(square(5, 0.12, is_pinned=np.array([0, 3])), drifting_ball(2), options=options)
     first = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     is_free = (scene.garment.vertex_mask & ~scene.garment.is_pinned)[:, None]

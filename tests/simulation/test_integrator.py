@@ -5,47 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
+from hanging_strip import LENGTH, strip
 
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.models.registry import init_model
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state, start_integrator
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import PhysicsConstants, Scene
 
-LENGTH = 0.5  # [m] of the strip
 GRAVITY = 9.81  # [m/s^2]
-
-
-def strip(integrator, *, frames, is_pinned, timestep=1 / 30, tilt=0.35):
-    """A strip that is released at an angle [rad] from the vertical; pinned at its upper end, or nowhere."""
-    x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
-    index = np.arange(22).reshape(2, 11)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    garment = prepare_garment(
-        np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1),
-        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
-        skin_weights=np.ones((22, 1)),
-        skin_indices=np.zeros((22, 1), int),
-        is_pinned=along == 0 if is_pinned else None,
-    )
-    garment = jax.tree.map(jnp.asarray, garment)
-    start, dt = garment.rest_positions, jnp.float32(timestep)
-    return Scene(
-        garment=garment,
-        material=COTTON,
-        constants=PhysicsConstants(),
-        initial_state=start_integrator(initial_state(start, jnp.zeros_like(start)), integrator),
-        timestep=dt,
-        body=None,
-        pin_targets=jnp.broadcast_to(start, (frames, *start.shape)) if is_pinned else None,
-        num_frames=frames,
-    )
 
 
 def swings(integrator):

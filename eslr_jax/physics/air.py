@@ -1,0 +1,149 @@
+"""Air: drag and lift of every face, as a dissipation potential.
+
+A face of area A moves against the air with velocity u: u_n along its normal n, u_t in its plane. It feels the
+force -rho A / 2 (C_n |u_n| u_n n + C_t |u_t| u_t). C_n is the larger, so a tilted face is also pushed across the
+wind: lift. With u from the positions at t + 1 and the normal at t, the force is the negative gradient of
+
+    h rho A / 2 (C_n |u_n|^3 + C_t |u_t|^3) / 3,
+
+which is convex: however light the cloth and strong the wind, the step stays stable.
+
+Source: Hoerner 1965, Fluid-Dynamic Drag, chapter 3 (plates across and along a flow).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+from jaxtyping import Array, Float
+
+from eslr_jax.errors import ConfigError
+from eslr_jax.numerics import Vector3, cross3, dot3, gather_corners, safe_normalize, sub3
+from eslr_jax.types import Air, Garment
+
+if TYPE_CHECKING:
+    from eslr_jax.physics.problem import FrameProblem
+
+_NUM_WAVES = 8  # of a gust, in each direction
+_LONGEST, _SHORTEST = 4.0, 0.5  # [s], periods of a gust's waves
+
+
+@struct.dataclass
+class AirFlow:
+    """The air around every face during a frame."""
+
+    areas: Float[Array, " faces"]  # at t [m^2], zero where padded
+    normals: Float[Array, "faces 3"]  # at t, unit length; zero where padded
+    wind: Float[Array, "faces 3"]  # at t + 1 [m/s]
+
+
+def air_flow(
+    air: Air, position: Float[Array, "vertices 3"], garment: Garment, time: Float[Array, ""]
+) -> AirFlow:
+    """Return the air around the faces of a garment.
+
+    Args:
+        air: The scene's air.
+        position: Vertex positions at t [m].
+        garment: Faces; padded ones have no area.
+        time: At t + 1, since the scene's first frame [s].
+    """
+    a, b, c = gather_corners(position, garment.faces, garment.face_incidence)
+    doubled = jnp.stack(cross3(sub3(b, a), sub3(c, a)), axis=-1)
+    normals = safe_normalize(doubled)
+    centers = jnp.stack(_mean((a, b, c)), axis=-1)
+    wind = air.wind(centers, time) if callable(air.wind) else jnp.asarray(air.wind, position.dtype)
+    return AirFlow(
+        areas=0.5 * jnp.sum(doubled * normals, axis=-1),
+        normals=normals,
+        wind=jnp.broadcast_to(wind, normals.shape).astype(position.dtype),
+    )
+
+
+def air_energy(position: Vector3, problem: FrameProblem) -> Float[Array, ""]:
+    """Return the dissipation potential of the air [J]; zero where the scene has none.
+
+    Args:
+        position: Candidate positions at t + 1 [m], by components.
+        problem: The frame's problem.
+    """
+    air, flow = problem.air, problem.flow
+    if air is None or flow is None:
+        return jnp.zeros((), position[0].dtype)
+    garment, timestep = problem.garment, problem.inertial_timestep
+    origin = problem.position if problem.bdf2 is None else problem.bdf2.origin
+    now, before = (
+        _mean(gather_corners(x, garment.faces, garment.face_incidence)) for x in (position, origin)
+    )
+    normals, wind = tuple(flow.normals.T), tuple(flow.wind.T)
+    moved = sub3(now, before)
+    through = (moved[0] / timestep - wind[0], moved[1] / timestep - wind[1], moved[2] / timestep - wind[2])
+    across = dot3(through, normals)
+    along = dot3(through, through) - across * across
+    is_still = along <= 0  # the root has no gradient there
+    along = jnp.where(is_still, 0.0, along)
+    cubed = along * jnp.sqrt(jnp.where(is_still, 1.0, along))
+    scale = timestep * air.density * flow.areas / 6.0
+    return jnp.sum(
+        scale * (air.normal_drag * jnp.abs(across) * across * across + air.tangential_drag * cubed)
+    )
+
+
+def blowing(wind: Sequence[float] | None, gust: float = 0.0) -> Air | None:
+    """Return air with a steady wind, or with gusts; None where there is no wind to blow.
+
+    Args:
+        wind: Mean velocity [m/s]; zeros are still air.
+        gust: Strength of the gusts, see `gusts`.
+
+    Raises:
+        ConfigError: There are gusts without a wind, or their strength is negative.
+    """
+    if not gust:
+        return None if wind is None else Air(wind)  # type: ignore[arg-type]: a sequence, until it is checked
+    if wind is None or not gust > 0:
+        raise ConfigError(
+            f"gusts of {gust:g} need a wind, and a strength above 0; give both, such as 3 0 0 and 0.3"
+        )
+    return Air(gusts(wind, gust))
+
+
+def gusts(mean: Sequence[float], strength: float, seed: int = 0) -> Partial:
+    """Return a wind that blows in gusts, for `Air.wind`; the same seed gives the same gusts.
+
+    Eight sines of random phase with periods from half a second to four seconds, along every axis. The whole air
+    moves alike.
+
+    Args:
+        mean: Mean velocity [m/s].
+        strength: Root mean square of the gusts in each direction, as a share of the mean speed.
+        seed: Of the phases.
+    """
+    random = np.random.default_rng(seed)
+    rates = 2.0 * np.pi / np.geomspace(_LONGEST, _SHORTEST, _NUM_WAVES)
+    phases = random.uniform(0.0, 2.0 * np.pi, (_NUM_WAVES, 3))
+    height = strength * float(np.linalg.norm(mean)) * np.sqrt(2.0 / _NUM_WAVES)
+    return Partial(_gusty, *(jnp.asarray(part, jnp.float32) for part in (mean, height, rates, phases)))
+
+
+def _gusty(
+    mean: Float[Array, " 3"],
+    height: Float[Array, ""],
+    rates: Float[Array, " waves"],
+    phases: Float[Array, "waves 3"],
+    points: Float[Array, "points 3"],
+    time: Float[Array, ""],
+) -> Float[Array, " 3"]:
+    return mean + height * jnp.sum(jnp.sin(rates[:, None] * time + phases), axis=0)
+
+
+def _mean(corners: tuple[Vector3, ...]) -> Vector3:
+    """Return the means of the corners of every face, by components."""
+    a, b, c = corners
+    third = 1.0 / 3.0
+    return (third * (a[0] + b[0] + c[0]), third * (a[1] + b[1] + c[1]), third * (a[2] + b[2] + c[2]))

@@ -1,0 +1,66 @@
+"""Air against known answers: terminal velocity, a strip in the wind, and gusts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hanging_strip import LENGTH, strip
+from jax.tree_util import Partial
+from scipy.optimize import brentq
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.physics.air import air_flow, blowing, gusts
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.validate import validate_air
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.types import Air
+
+GRAVITY = 9.81  # [m/s^2]
+WEIGHT = float(COTTON.density) * GRAVITY  # [N/m^2]
+CONFIG = SimConfig(iterations=30)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+def test_a_flat_strip_falls_as_fast_as_its_drag_lets_it(integrator):
+    air = Air(jnp.zeros(3))
+    scene = strip(integrator, frames=40, is_pinned=False, tilt=np.pi / 2, air=air)
+    fall = -float(rollout_scene(None, scene, CONFIG).velocities[-1, :, 1].mean())
+    assert fall == pytest.approx(np.sqrt(2.0 * WEIGHT / (air.density * air.normal_drag)), rel=0.005)
+
+
+def test_a_wind_lifts_a_hanging_strip_to_the_angle_of_balance():
+    """Weight and drag along the normal balance everywhere: sigma g sin(a) = rho / 2 C_n (U cos(a))^2."""
+    speed = 2.0  # [m/s]
+    air = Air(jnp.array([0.0, 0.0, speed]), tangential_drag=0.0)
+    pressure = 0.5 * air.density * air.normal_drag * speed**2
+    expected = brentq(lambda a: WEIGHT * np.sin(a) - pressure * np.cos(a) ** 2, 0.0, np.pi / 2)
+    scene = strip("euler", frames=121, is_pinned=True, tilt=expected + 0.1, air=air)
+    end = np.asarray(rollout_scene(None, scene, CONFIG).positions[-1]).reshape(2, 11, 3)
+    along = (end[:, -1] - end[:, 0]).mean(axis=0)
+    assert np.arctan2(along[2], -along[1]) == pytest.approx(expected, abs=0.01)
+
+
+def test_gusts_have_the_mean_and_the_strength_asked_for():
+    wind = gusts((4.0, 0.0, 3.0), 0.2, seed=1)
+    blown = np.asarray(jax.vmap(lambda time: wind(jnp.zeros((1, 3)), time))(jnp.linspace(0.0, 400.0, 4000)))
+    np.testing.assert_allclose(blown.mean(axis=0), (4.0, 0.0, 3.0), atol=0.03)
+    np.testing.assert_allclose(blown.std(axis=0), 0.2 * 5.0, rtol=0.03)
+
+
+def test_a_function_blows_where_and_when_it_is_asked():
+    scene = strip(frames=2, is_pinned=True)
+    shear = Air(Partial(lambda rate, points, time: rate * time * points, jnp.float32(3.0)))
+    flow = air_flow(shear, scene.initial_state.position, scene.garment, jnp.float32(2.0))
+    real = np.asarray(scene.garment.rest_areas) > 0
+    corners = np.asarray(scene.initial_state.position)[np.asarray(scene.garment.faces)]
+    np.testing.assert_allclose(flow.wind[real], 6.0 * corners.mean(axis=1)[real], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(flow.areas.sum(), 0.05 * LENGTH, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wind", "gust"), [((1.0, 2.0), 0.0), ((0.0, np.nan, 0.0), 0.0), ((0.0, 0.0, 500.0), 0.0), (None, 0.5)]
+)
+def test_an_impossible_wind_is_refused(wind, gust):
+    with pytest.raises(ConfigError, match="wind"):
+        validate_air(blowing(wind, gust))
