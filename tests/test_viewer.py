@@ -1,12 +1,11 @@
 """Runs in the browser: the scene over the server's own interface, and in headless Chromium."""
 
-import os
-import shutil
 import threading
 import time
 
 import numpy as np
 import pytest
+from chromium import CHROMIUM, launch
 from example_runs import write_run
 
 from eslr_jax.assets import load_garment_file
@@ -148,27 +147,15 @@ def test_names_are_above_the_heads_and_the_page_follows(view):
         moved.body.positions[2] -= [0.0, 0.0, 2.0]
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or os.environ.get("CHROMIUM")
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_page_in_headless_chromium(view, tmp_path):
-    sync_api = pytest.importorskip("playwright.sync_api")
     from PIL import Image
 
     from eslr_jax.viewer import show
 
-    with sync_api.sync_playwright() as playwright:
-        arguments = [
-            "--no-sandbox",
-            "--use-gl=angle",
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-        ]
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        page = browser.new_page(viewport={"width": 640, "height": 480})
+    with launch() as page:
         page.goto(view.url)
         picture = tmp_path / "page.png"
 
@@ -197,4 +184,3 @@ def test_page_in_headless_chromium(view, tmp_path):
         exported = np.asarray(Image.open(saved.value.path()).convert("RGB"))
         assert exported.shape == (960, 1280, 3)
         assert len(np.unique(exported.reshape(-1, 3), axis=0)) > 100  # not one colour
-        browser.close()

@@ -9,12 +9,22 @@ from __future__ import annotations
 import sys
 import warnings
 
-from eslr_jax.cli import assets, bodies, budget, evaluate, garments, runs, simulate, train
+from eslr_jax.cli import assets, bodies, budget, evaluate, garments, play, runs, simulate, train
 from eslr_jax.cli.console import app, say
 from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
 from eslr_jax.errors import ConfigError, EslrError
 
-COMMANDS = (simulate, garments, bodies, runs, assets, train, evaluate, budget)  # each has registered its own
+COMMANDS = (
+    simulate,
+    garments,
+    bodies,
+    runs,
+    play,
+    assets,
+    train,
+    evaluate,
+    budget,
+)  # each has registered its own
 
 _REPEATABLE = ("--set",)
 

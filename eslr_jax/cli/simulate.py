@@ -143,7 +143,7 @@ class _Method(NamedTuple):
 
 def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bool) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report."""
-    from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+    from eslr_jax.io.atomic import ensure_output_dir
     from eslr_jax.io.unfinished import NAME, write_unfinished
 
     use_compile_cache()
@@ -164,7 +164,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
-    from eslr_jax.io.garment import write_garment_npz
+    from eslr_jax.io.run import ClothTrack, write_run
     from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
     from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
@@ -248,10 +248,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
         }
     with stderr.status("writing files"):
-        with atomic_write(out / "report.json") as temporary:
-            temporary.write_text(json.dumps(report, indent=2))
-        write_garment_npz(out / "garment.npz", stored)
-        _write_motion(out, trajectory, scene, rig, poses, stored)
+        track = ClothTrack(trajectory.positions, trajectory.velocities, trajectory.friction_loads)
+        write_run(out, track, scene, (rig, poses, stored), report=report)
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
     if has_pictures and not is_unfinished:
@@ -376,51 +374,6 @@ def _say_if_any(text: str | None) -> None:
     """Print a line on stderr, if there is one."""
     if text:
         say(text)
-
-
-def _write_motion(out: Path, trajectory, scene, rig, poses, stored) -> None:
-    """Write the trajectory and the animated GLB."""
-    import jax
-    import numpy as np
-
-    from eslr_jax.io.export import export_trajectory
-    from eslr_jax.io.skin import Skin
-    from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
-
-    contact_faces, contact_boundary = np.empty((0, 3), np.int32), np.empty(0, np.int32)
-    if scene.body is not None:
-        surface = scene.body.surface
-        vertex_ids = np.asarray(surface.vertex_ids)
-        contact_faces = vertex_ids[np.asarray(surface.faces)]
-        contact_boundary = vertex_ids[np.asarray(surface.is_boundary)]
-    skin = Skin(
-        skin_weights=np.asarray(rig.skin_weights),
-        skin_indices=np.asarray(rig.skin_indices),
-        joint_transforms=np.asarray(poses.joint_transforms),
-        joint_rest_positions=np.asarray(rig.joint_rest_positions),
-        parents=rig.parents,
-        joint_names=rig.joint_names,
-    )
-    body = BodyTrack(
-        positions=np.asarray(poses.positions),
-        faces=np.asarray(poses.faces),
-        rest_positions=np.asarray(poses.rest_positions),
-        contact_faces=contact_faces,
-        contact_boundary=contact_boundary,
-        skin=skin,
-    )
-    file = TrajectoryFile(
-        positions=np.asarray(trajectory.positions),
-        velocities=np.asarray(trajectory.velocities),
-        faces=np.asarray(scene.garment.faces),
-        timestep=float(poses.timestep),
-        body=body,
-        friction_loads=np.asarray(trajectory.friction_loads),
-        ground=None if scene.ground is None else float(scene.ground),
-        material=jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scene.material),
-    )
-    write_trajectory(out / "trajectory.npz", file)
-    export_trajectory(file, out / "animation.glb", garment=stored)
 
 
 def _write_sheet(out: Path, positions, cloth, poses) -> None:

@@ -1,15 +1,23 @@
-"""Read the folder that `eslr simulate` writes: trajectory, garment and report."""
+"""The folder that `eslr simulate` writes: trajectory, animation, garment and report."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.garment import GarmentFile, read_garment_npz
-from eslr_jax.io.trajectory import TrajectoryFile, read_trajectory
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.export import export_trajectory
+from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
+from eslr_jax.io.skin import Skin
+from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.types import Body, BodyMotion, Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +28,79 @@ class Run:
     trajectory: TrajectoryFile
     garment: GarmentFile | None  # None without garment.npz: then frame 0 is the rest shape
     report: dict[str, Any]  # of report.json; empty without it
+
+
+class ClothTrack(NamedTuple):
+    """The cloth, frame by frame."""
+
+    positions: Float[Array, "frames vertices 3"]  # [m]
+    velocities: Float[Array, "frames vertices 3"]  # [m/s]
+    friction_loads: Float[Array, "frames vertices"]  # [N]
+
+
+def write_run(
+    folder: Path,
+    track: ClothTrack,
+    scene: Scene,
+    actor: tuple[Body, BodyMotion, GarmentFile],
+    *,
+    report: dict[str, Any],
+) -> None:
+    """Write the folder of a run, file by file and each of them whole.
+
+    Args:
+        folder: It is made if it is not there.
+        track: What was simulated.
+        scene: Of `prepare_scene`; its body's faces, its ground and its fabric are kept.
+        actor: The body at rest, the body in motion over the same frames, and the garment's file.
+        report: What `report.json` says; values of JSON.
+
+    Raises:
+        AssetError: A file can't be written.
+    """
+    rig, poses, stored = actor
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(folder / "report.json") as temporary:
+        temporary.write_text(json.dumps(report, indent=2))
+    write_garment_npz(folder / "garment.npz", stored)
+    file = TrajectoryFile(
+        positions=np.asarray(track.positions),
+        velocities=np.asarray(track.velocities),
+        faces=np.asarray(scene.garment.faces),
+        timestep=float(poses.timestep),
+        body=_body_track(scene, rig, poses),
+        friction_loads=np.asarray(track.friction_loads),
+        ground=None if scene.ground is None else float(scene.ground),
+        material=jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scene.material),
+    )
+    write_trajectory(folder / "trajectory.npz", file)
+    export_trajectory(file, folder / "animation.glb", garment=stored)
+
+
+def _body_track(scene: Scene, rig: Body, poses: BodyMotion) -> BodyTrack:
+    """Return a body in motion with its joints, and the faces that its scene searched."""
+    contact_faces, contact_boundary = np.empty((0, 3), np.int32), np.empty(0, np.int32)
+    if scene.body is not None:
+        surface = scene.body.surface
+        vertex_ids = np.asarray(surface.vertex_ids)
+        contact_faces = vertex_ids[np.asarray(surface.faces)]
+        contact_boundary = vertex_ids[np.asarray(surface.is_boundary)]
+    skin = Skin(
+        skin_weights=np.asarray(rig.skin_weights),
+        skin_indices=np.asarray(rig.skin_indices),
+        joint_transforms=np.asarray(poses.joint_transforms),
+        joint_rest_positions=np.asarray(rig.joint_rest_positions),
+        parents=rig.parents,
+        joint_names=rig.joint_names,
+    )
+    return BodyTrack(
+        positions=np.asarray(poses.positions),
+        faces=np.asarray(poses.faces),
+        rest_positions=np.asarray(poses.rest_positions),
+        contact_faces=contact_faces,
+        contact_boundary=contact_boundary,
+        skin=skin,
+    )
 
 
 def read_run(path: str | Path) -> Run:

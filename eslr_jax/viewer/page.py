@@ -171,7 +171,12 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
     name = f"/runs/{k}/garment"
     if colors is None or wireframe:
         scene.add_mesh_simple(
-            name, points, trajectory.faces, color=_bytes(GARMENT_COLOR), wireframe=wireframe, side="double"
+            name,
+            points,
+            trajectory.faces,
+            color=byte_color(GARMENT_COLOR),
+            wireframe=wireframe,
+            side="double",
         )
     else:
         mesh = trimesh.Trimesh(
@@ -183,7 +188,7 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
             f"/runs/{k}/body",
             (trajectory.body.positions[frame] + offset).astype(np.float32),
             trajectory.body.faces,
-            color=_bytes(BODY_COLOR),
+            color=byte_color(BODY_COLOR),
             visible=bool(view.controls["body"].value),
         )
 
@@ -227,7 +232,7 @@ def _save_picture(client: Any) -> None:
     client.send_file_download("garment.png", stream.getvalue(), save_immediately=True)  # else a link
 
 
-def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:
+def byte_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
     """Return sRGB in [0, 1] as bytes."""
     red, green, blue = (round(255 * value) for value in color)
     return red, green, blue

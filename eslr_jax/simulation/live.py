@@ -1,0 +1,149 @@
+"""A simulation that goes on frame by frame while a person watches and changes it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, without_tracks
+from eslr_jax.simulation.stepper import FrameReport, make_stepper
+from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
+
+TOLERANCE = 1e-2  # relative gap at which a frame ends
+MOST_ITERATIONS = 100
+_HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
+
+
+class Hand(NamedTuple):
+    """What holds the cloth."""
+
+    vertex: Int[Array, ""]
+    place: Float[Array, " 3"]  # [m]
+    stiffness: Float[Array, ""]  # [N/m]; zero where nothing is held
+
+
+class Stage(NamedTuple):
+    """A scene that can be stepped forth and back along its motion."""
+
+    scene: Scene  # with tracks
+    constant: Scene  # without
+    inputs: FrameInput  # from every frame to the next
+    back: FrameInput  # from every frame to the one before
+
+
+class Step(NamedTuple):
+    """One frame."""
+
+    state: ClothState
+    report: FrameReport
+
+
+def no_hand() -> Hand:
+    """Return a hand that holds nothing."""
+    return Hand(jnp.int32(0), jnp.zeros(3), jnp.float32(0.0))
+
+
+def grasp(vertex: int, place: Any) -> Hand:
+    """Return a hand that pulls a vertex to a place [m]."""
+    return Hand(jnp.int32(vertex), jnp.asarray(place, jnp.float32), jnp.float32(_HOLD))
+
+
+def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
+    """Return a garment on a moving body, with all that one can change while it moves.
+
+    It is stepped by BDF2 in air. Changes of fabric, wind and hand do not compile anew.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion, two frames or more.
+        material: Fabric.
+
+    Raises:
+        MotionError: The motion has fewer than two frames.
+    """
+    options = SceneOptions(
+        has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), energies=(Partial(_pull, no_hand()),)
+    )
+    scene = prepare_scene(garment, poses, material=material, options=options)
+    inputs = frame_inputs(scene)
+    back = (
+        inputs
+        if inputs.body is None
+        else inputs._replace(body=inputs.body._replace(start=inputs.body.end, end=inputs.body.start))
+    )
+    if scene.pin_targets is not None:
+        back = back._replace(pin_targets=scene.pin_targets[:-1])
+    constant = jax.tree.map(jnp.asarray, without_tracks(scene)).replace(num_frames=2)
+    # Changed to what it is, so that it has the types of all that it will be changed to.
+    return changed(Stage(scene, constant, inputs, back), material, (0.0, 0.0, 0.0), no_hand())
+
+
+def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
+    """Return a stage with another fabric, wind [m/s] and hand."""
+    air = stage.constant.air.replace(wind=jnp.asarray(wind, jnp.float32))
+    material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
+    constant = stage.constant.replace(material=material, air=air, energies=(Partial(_pull, hand),))
+    return stage._replace(constant=constant)
+
+
+def advance(stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int) -> Step:
+    """Step the cloth while the body moves from one frame to a neighbour.
+
+    Args:
+        stage: Of `set_stage`.
+        state: Cloth at the first of the two frames.
+        frames: Two neighbouring frames.
+        iterations: Of the solver, at most.
+    """
+    now, then = frames
+    inputs = stage.inputs if then > now else stage.back
+    row = min(now, then)
+    frame = jax.tree.map(lambda leaf: leaf[row], inputs)
+    return _step(stage.constant, state, frame, jnp.int32(iterations))
+
+
+@jax.jit
+def _step(scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""]) -> Step:
+    stepper = make_stepper(None, SimConfig(iterations=MOST_ITERATIONS, tolerance=TOLERANCE), iterations)
+    return Step(*stepper(frame_problem(scene, state, frame), state))
+
+
+def there_and_back(step: int, num_frames: int) -> tuple[int, int]:
+    """Return the two frames of a step, for a motion that is played forth and back without end."""
+    period = 2 * (num_frames - 1)
+
+    def place(at: int) -> int:
+        at %= period
+        return min(at, period - at)
+
+    return place(step), place(step + 1)
+
+
+def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
+    """Return the vertex that a ray points at: of those within a centimetre more than the nearest, the first.
+
+    Args:
+        positions: Vertices [m].
+        origin: Where the ray begins [m].
+        direction: Where it goes; unit length.
+    """
+    offset = positions - np.asarray(origin)
+    along = offset @ np.asarray(direction)
+    aside = np.linalg.norm(offset - along[:, None] * np.asarray(direction), axis=1)
+    aside = np.where(along > 0, aside, np.inf)
+    is_close = aside <= aside.min() + 0.01
+    return int(np.flatnonzero(is_close)[np.argmin(along[is_close])])
+
+
+def _pull(hand: Hand, position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
+    """Return the energy of the spring between a hand and its vertex [J]."""
+    offset = position[hand.vertex] - hand.place
+    return 0.5 * hand.stiffness * jnp.sum(offset * offset)

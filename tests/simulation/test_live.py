@@ -1,0 +1,71 @@
+"""A simulation that goes on frame by frame: forth and back, with a hand, a wind and another fabric."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+
+from eslr_jax.physics.materials import COTTON, fabric_material
+from eslr_jax.simulation.live import (
+    advance,
+    changed,
+    grasp,
+    nearest_vertex,
+    no_hand,
+    set_stage,
+    there_and_back,
+)
+
+STILL = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def stage():
+    return set_stage(square(5, 0.2, is_pinned=np.array([0])), drifting_ball(4), COTTON)
+
+
+def played(stage, count, first=0):
+    state = stage.scene.initial_state
+    for step in range(first, first + count):
+        state, report = advance(stage, state, there_and_back(step, stage.scene.num_frames), 40)
+    assert int(state.status) == 0
+    return np.asarray(state.position), int(report.iterations)
+
+
+def test_a_motion_is_played_forth_and_back():
+    frames = [there_and_back(step, 4) for step in range(8)]
+    assert frames == [(0, 1), (1, 2), (2, 3), (3, 2), (2, 1), (1, 0), (0, 1), (1, 2)]
+
+
+def test_the_body_carries_pins_forth_and_back(stage):
+    for count, frame in ((3, 3), (5, 1), (6, 0)):
+        positions, iterations = played(stage, count)
+        target = np.asarray(stage.scene.pin_targets[frame, 0])
+        np.testing.assert_allclose(positions[0], target, atol=1e-6)
+        assert 0 < iterations <= 40
+
+
+def test_a_hand_holds_its_vertex(stage):
+    corner = 24
+    place = np.add(stage.scene.initial_state.position[corner], [0.02, 0.1, 0.02])
+    free, _ = played(stage, 12)
+    held, _ = played(changed(stage, COTTON, STILL, grasp(corner, place)), 12)
+    assert np.linalg.norm(held[corner] - place) < 0.03 < np.linalg.norm(free[corner] - place)
+
+
+def test_wind_and_fabric_change_the_cloth_without_compiling_anew(stage):
+    from eslr_jax.simulation.live import _step
+
+    played(stage, 1)
+    before = _step._cache_size()
+    still, _ = played(changed(stage, COTTON, STILL, no_hand()), 8)
+    blown, _ = played(changed(stage, COTTON, (0.0, 0.0, 6.0), no_hand()), 8)
+    stiff, _ = played(changed(stage, fabric_material("denim"), STILL, no_hand()), 8)
+    assert (blown - still)[:, 2].mean() > 0.005
+    assert np.abs(stiff - still).max() > 1e-3
+    assert _step._cache_size() == before
+
+
+def test_a_ray_finds_the_vertex_in_front():
+    points = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 1.0], [0.2, 0.0, 2.0], [0.0, 0.0, 9.0]])
+    assert nearest_vertex(points, jnp.array([0.0, 0.0, 5.0]), jnp.array([0.0, 0.0, -1.0])) == 1
