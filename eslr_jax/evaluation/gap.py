@@ -15,7 +15,7 @@ from eslr_jax.physics.potential import contact_load, potential
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
-from eslr_jax.simulation.stepper import find_start
+from eslr_jax.simulation.stepper import find_start, past_state
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
@@ -52,19 +52,30 @@ def trajectory_states(trajectory: Trajectory, scene: Scene) -> tuple[ClothState,
         position=trajectory.positions[:-1],
         velocity=trajectory.velocities[:-1],
         friction_load=trajectory.friction_loads[:-1],
-        past=past_states(trajectory.positions, trajectory.velocities, scene),
+        past=past_states(trajectory.positions, trajectory.velocities, scene, trajectory.residuals),
     )
     return states, frame_inputs(scene)
 
 
 def past_states(
-    positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
+    positions: Float[Array, "frames vertices 3"],
+    velocities: Float[Array, "frames vertices 3"],
+    scene: Scene,
+    residuals: Float[Array, " frames"] | None = None,
 ) -> PastState | None:
-    """Return what BDF2 remembers before every simulated frame, stacked; None for implicit Euler."""
+    """Return what BDF2 remembers before every simulated frame, stacked; None for implicit Euler.
+
+    Args:
+        positions: Vertex positions [m].
+        velocities: Vertex velocities [m/s].
+        scene: Its scene.
+        residuals: Force norm over weight at the end of every frame; if unknown, all ended in their minimum.
+    """
     first = scene.initial_state.past
     if first is None:
         return None
-    tracks = PastState(positions[:-2], velocities[:-2], jnp.ones(len(positions) - 2, bool))
+    left = jnp.zeros(len(positions) - 2) if residuals is None else residuals[1:-1]
+    tracks = past_state(positions[:-2], velocities[:-2], left)
     return jax.tree.map(lambda start, track: jnp.concatenate([start[None], track]), first, tracks)
 
 

@@ -63,9 +63,10 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     has_ground = scene.ground is not None
     sort("ground", has_ground, f"at {float(scene.ground):.2f} m" if has_ground else "", "out of reach")
     wind = None if scene.air is None else scene.air.wind
-    speed = "in gusts" if callable(wind) else f"{np.linalg.norm(np.asarray(wind or 0.0)):.1f} m/s"
+    is_steady = wind is not None and not callable(wind)
+    speed = f"{np.linalg.norm(np.asarray(wind)):.1f} m/s" if is_steady else "a wind that changes"
     sort("air", wind is not None, speed, "not asked for")
-    sort("damping", scene.damping is not None, f"{scene.damping} s", "not asked for")
+    sort("damping", scene.damping is not None, f"{float(scene.damping or 0.0):g} s", "not asked for")
     if scene.energies:
         modelled["own terms"] = f"{len(scene.energies)}"
     sort("self-contact", scene.self_contact is not None, "layers of cloth keep apart", "not asked for")

@@ -19,8 +19,8 @@ from eslr_jax.physics.validate import validate_constants, validate_material, val
 from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
-from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.types import ClothState, PairCapacity, PastState, Scene, Trajectory
+from eslr_jax.simulation.stepper import make_stepper, past_state
+from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
 
 _HEADROOM = 1.25  # of a buffer made larger: with it, cloth moves on a little differently and may need more
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
@@ -170,7 +170,7 @@ def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothStat
     position, velocity = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)  # or a file's
     past = scene.initial_state.past
     if past is not None and frame > 0:
-        past = PastState(position[frame - 1], velocity[frame - 1], jnp.ones((), bool))
+        past = past_state(position[frame - 1], velocity[frame - 1], trajectory.residuals[frame])
     state = initial_state(position[frame], velocity[frame])
     load = jnp.asarray(trajectory.friction_loads[frame])
     return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)

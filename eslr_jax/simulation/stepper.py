@@ -31,6 +31,8 @@ class FrameReport(NamedTuple):
     pair_demand: Int[Array, " capacities"] | None  # see Trajectory
 
 
+MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
+
 Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
 """Advances the cloth by one frame; the one contract of the solver, of networks, and of both."""
 
@@ -65,13 +67,14 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
             start, status = find_start(params, problem, state, config)
             minimum = Minimum(*start.point, iterations=jnp.int32(0))
         position = pin(problem, minimum.position)
+        residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
             terms=potential_terms(position, problem),
-            residual=safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem),
+            residual=residual,
             iterations=minimum.iterations,
             pair_demand=_pair_demand(problem),
         )
-        return next_state(position, problem, state, status), report
+        return next_state(position, problem, state, status, residual), report
 
     return step
 
@@ -117,7 +120,11 @@ def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:
 
 
 def next_state(
-    position: Float[Array, "vertices 3"], problem: FrameProblem, state: ClothState, status: Int[Array, ""]
+    position: Float[Array, "vertices 3"],
+    problem: FrameProblem,
+    state: ClothState,
+    status: Int[Array, ""],
+    residual: Float[Array, ""] | float = 0.0,
 ) -> ClothState:
     """Return the state at t + 1, with the velocity that brought the cloth there.
 
@@ -126,6 +133,7 @@ def next_state(
         problem: The frame's problem.
         state: Cloth at t.
         status: Bits that the frame has raised so far.
+        residual: Force norm over weight that the frame ended with.
     """
     status = state.status | status | problem_status(problem) | _finiteness(position)
     frame = state.frame + 1
@@ -137,8 +145,24 @@ def next_state(
         frame=frame,
         status=status,
         first_bad_frame=jnp.where((state.status == 0) & (status != 0), frame, state.first_bad_frame),
-        past=None if state.past is None else PastState(state.position, state.velocity, jnp.ones((), bool)),
+        past=None if state.past is None else past_state(state.position, state.velocity, residual),
     )
+
+
+def past_state(
+    position: Float[Array, ...], velocity: Float[Array, ...], residual: Float[Array, ...] | float
+) -> PastState:
+    """Return what BDF2 remembers of the state before a frame, and whether it may be trusted.
+
+    A frame that ends far from its minimum leaves an error, which BDF2 would carry on and amplify: a garment of
+    which 20 iterations leave 40 weights flew apart. The next frame is then stepped by implicit Euler.
+
+    Args:
+        position: At the beginning of the frame [m].
+        velocity: There [m/s].
+        residual: Force norm over weight that the frame ended with.
+    """
+    return PastState(position, velocity, jnp.asarray(residual) <= MOST_RESIDUAL)
 
 
 def problem_status(problem: FrameProblem) -> Int[Array, ""]:

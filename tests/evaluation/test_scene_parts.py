@@ -5,19 +5,23 @@ import pytest
 
 from eslr_jax.evaluation.scene_parts import describe_scene, take_turns, time_parts
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.types import Air
 
 
 def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene, small_config):
     parts = describe_scene(small_scene, small_poses, small_config)
     assert set(parts.modelled) == {"stretch", "bending", "inertia and gravity", "collision and friction"}
-    assert set(parts.left_out) == {"pins", "ground", "self-contact", "fabric by part", "network"}
+    assert set(parts.left_out) == {
+        "pins", "ground", "air", "damping", "self-contact", "fabric by part", "network",
+    }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
-    options = SceneOptions(has_body=False, self_contact=True)
+    options = SceneOptions(has_body=False, self_contact=True, air=Air((3.0, 0.0, 4.0)), damping=0.01)
     bare = describe_scene(
         prepare_scene(small_garment, small_poses, options=options), small_poses, small_config
     )
     assert bare.left_out["collision and friction"] == "no body in reach"
     assert "self-contact" in bare.modelled
+    assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
 
 
 def multiply(x):

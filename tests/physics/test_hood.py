@@ -190,7 +190,7 @@ def weight_of(problem):
 
 def losses(step, criterion="postcvpr"):
     with jax.enable_x64(True):
-        return PotentialTerms(*evaluate(step, criterion)[0], 0.0, 0.0)
+        return PotentialTerms(*evaluate(step, criterion)[0], 0.0, 0.0, 0.0, 0.0)
 
 
 def test_friction_reaches_to_five_centimetres_and_a_half():
