@@ -239,6 +239,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "motion": motion,
             "self_contact": options.self_contact,
             "integrator": integrator,
+            "skin_contacts": modelled.has_skin,
             "wind_m_s": options.wind,
             "gust": options.gust,
             "damping_s": options.damping,

@@ -17,7 +17,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.gap import find_friction_loads, map_frames, past_states
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
@@ -128,7 +128,8 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
     if has_contact and trajectory.body is not None and len(trajectory.body.contact_faces):
         track = trajectory.body
         surface = prepare_surface(track.rest_positions, track.contact_faces, boundary=track.contact_boundary)
-        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids])
+        has_skin = bool(run.report.get("skin_contacts"))
+        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids], has_skin=has_skin)
     has_layers = has_contact and bool(run.report.get("self_contact"))
     return Scene(
         garment=garment,
@@ -257,11 +258,7 @@ def _distances(run: Run) -> Field:
     values = np.empty(trajectory.positions.shape[:2], np.float32)
     faces = trajectory.body.faces
     for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body.positions, strict=True)):
-        normals = np.zeros_like(body)
-        crosses = face_cross_products(body, faces)
-        for corner in range(3):
-            np.add.at(normals, faces[:, corner], crosses)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        normals = vertex_normals(body, faces)
         _, nearest = cKDTree(body).query(cloth)
         values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
     return Field(values, 0.0, 0.06, "m")

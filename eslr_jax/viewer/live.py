@@ -341,6 +341,7 @@ def _save(live: Live, cast: Cast) -> None:
         "garment": cast.choice.garment,
         "motion": cast.choice.motion,
         "integrator": "bdf2",
+        "skin_contacts": True,
         "wind_m_s": _wind(live),
     }
     write_run(live.out, track, scene, (cast.rig, poses, cast.stored), report=report)

@@ -15,7 +15,9 @@ from PIL import Image
 from eslr_jax.assets import load_motion
 from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.config import TrainConfig
+from eslr_jax.evaluation.fields import run_field
 from eslr_jax.evaluation.words import describe_report
+from eslr_jax.io.run import read_run
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 
@@ -110,6 +112,32 @@ def test_a_run_goes_to_other_programs(fallen, eslr, tmp_path):
     cache = (tmp_path / "cache.pc2").read_bytes()
     points = np.frombuffer(cache[32:], "<f4").reshape(61, -1, 3)
     np.testing.assert_allclose(points, run["positions"], atol=1e-6)
+
+
+def test_a_skirt_flies_in_the_wind_and_its_gap_is_that_of_the_windy_frames(eslr, tmp_path):
+    """Gap, as a picture, is measured on the frames' own problems: with their wind, gusts and damping."""
+    words = (
+        "--simulator",
+        "physics",
+        "--iterations",
+        40,
+        "--motion",
+        "turn",
+        "--frames",
+        20,
+        "--no-pictures",
+    )
+    garment, ends = write_obj(tmp_path / "skirt.obj", skirt()), {}
+    for name, air in (("still", ()), ("windy", ("--wind", 0, 0, 8, "--gust", 0.2, "--damping", 0.002))):
+        done = eslr("simulate", "--garment", garment, *words, *air, "--out", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        with np.load(tmp_path / name / "trajectory.npz") as arrays:
+            ends[name] = arrays["positions"][-1]
+    assert (ends["windy"] - ends["still"])[:, 2].mean() > 0.02
+    report = json.loads((tmp_path / "windy" / "report.json").read_text())
+    assert (report["wind_m_s"], report["gust"], report["damping_s"]) == ([0.0, 0.0, 8.0], 0.2, 0.002)
+    gap = run_field(read_run(tmp_path / "windy"), "gap").values.sum(axis=1)
+    assert gap.min() > -1e-3, "above the optimum of another problem"
 
 
 def test_a_run_without_ground_falls_below_the_feet(fallen, eslr, tmp_path):

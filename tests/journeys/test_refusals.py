@@ -175,6 +175,12 @@ BODIES = {
     "a body that is an image": ({"a.glb": b"\x89PNG\r\n\x1a\n" + b"\0" * 40}, ""),
 }  # fmt: skip
 OPTIONS = {
+    "gusts without wind": (("--gust", "0.3"), "wind"),
+    "gusts that are negative": (("--wind", "3", "0", "0", "--gust", "-1"), "gusts"),
+    "a wind of nan": (("--wind", "nan", "0", "0"), "wind"),
+    "a hurricane": (("--wind", "0", "0", "500"), "wind"),
+    "damping of two seconds": (("--damping", "2"), "damping"),
+    "negative damping": (("--damping", "-0.1"), "damping"),
     "minus three frames": (("--frames", "-3"), "two frames"),
     "no frame": (("--frames", "0"), "two frames"),
     "a start behind the end": (("--start", "99s"), "start"),
