@@ -1,4 +1,4 @@
-"""Waistbands: the boundary loops that hold up a garment which does not hang from the shoulders."""
+"""What holds a garment up: waistbands where it does not hang from the shoulders, and the neckline of a cape."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from eslr_jax.fit.postures import shoulder_height
 from eslr_jax.geometry.topology import boundary_loops, vertex_components
 from eslr_jax.types import Body
 
+_OPEN = np.deg2rad(150.0)  # a gap in the cloth around the neck, from which on it slips off the shoulders
 WAISTBAND = 0.03  # [m] width of the band below the loop that is held, as an elastic waistband
 _CROTCH = 0.45  # of the body's height: a loop below it goes around legs
 _PART_SHARE = 0.02  # of the vertices; a smaller part is a button or a label
@@ -21,7 +22,7 @@ _PART_SHARE = 0.02  # of the vertices; a smaller part is a button or a label
 class Waist:
     """What holds a garment up."""
 
-    is_held: Bool[np.ndarray, " vertices"]  # vertices of waistbands
+    is_held: Bool[np.ndarray, " vertices"]  # vertices of waistbands and open necklines
     reason: str  # why they are held, or why nothing is
     is_falling: bool  # a part hangs neither from the shoulders nor from a waistband
 
@@ -29,9 +30,11 @@ class Waist:
 def find_waist(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], body: Body
 ) -> Waist:
-    """Find the waistbands of the parts of a garment that do not reach above the shoulder joints.
+    """Find what holds up the parts of a garment.
 
-    A waistband is a part's highest boundary loop around the trunk, and the cloth up to 3 cm from it.
+    A part that reaches above the shoulder joints hangs from them, unless it leaves more than 150 degrees around
+    the neck open, as a cape does: its upper 3 cm are then held, as by a clasp. The others have a waistband: their
+    highest boundary loop around the trunk, and the cloth up to 3 cm from it.
 
     Args:
         positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
@@ -41,10 +44,15 @@ def find_waist(
     shoulders = shoulder_height(body)
     count, component = vertex_components(faces, len(positions))
     loops = [loop for loop in boundary_loops(faces) if _is_around_trunk(positions[loop], body)]
-    is_held, falling, heights = np.zeros(len(positions), bool), False, []
+    is_held, falling, is_open, heights = np.zeros(len(positions), bool), False, False, []
     for part in range(count):
         own = np.flatnonzero(component == part)
-        if positions[own, 1].max() > shoulders or len(own) < _PART_SHARE * len(positions):
+        top = positions[own, 1].max()
+        if len(own) < _PART_SHARE * len(positions):
+            continue
+        if top > shoulders:
+            if _gap_around_neck(positions[own[positions[own, 1] > shoulders]], body) > _OPEN:
+                is_held[own[positions[own, 1] > top - WAISTBAND]] = is_open = True
             continue
         around = [loop for loop in loops if component[loop[0]] == part]
         if not around:
@@ -57,11 +65,27 @@ def find_waist(
     if heights:
         places = " and ".join(f"{height:.2f} m" for height in heights)
         reason = f"waistband at {places} above the floor, since no cloth reaches above the shoulder joints"
+    elif is_open:
+        reason = "neckline, since the cloth on the shoulders is open around the neck"
     elif falling:
         reason = "no cloth reaches above the shoulder joints, and no open edge goes around the trunk"
     else:
         reason = "it hangs from the shoulders"
     return Waist(is_held, reason, falling)
+
+
+def _gap_around_neck(points: np.ndarray, body: Body) -> float:
+    """Return the largest angle around the neck that no point covers [rad]."""
+    rest = np.asarray(body.rest_positions, np.float64)
+    center = _trunk_center(rest, shoulder_height(body))
+    angle = np.sort(np.arctan2(*(points[:, [0, 2]] - center).T))
+    return float(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max())
+
+
+def _trunk_center(rest: np.ndarray, height: float) -> np.ndarray:
+    """Return x and z of the middle of the trunk at a height [m]."""
+    near = rest[(np.abs(rest[:, 1] - height) < 0.03) & (np.abs(rest[:, 0]) < 0.1 * np.ptp(rest[:, 1]))]
+    return near[:, [0, 2]].mean(axis=0) if len(near) else np.zeros(2)
 
 
 def _is_around_trunk(ring: np.ndarray, body: Body) -> bool:
@@ -70,8 +94,6 @@ def _is_around_trunk(ring: np.ndarray, body: Body) -> bool:
     height, low = ring[:, 1].mean(), rest[:, 1].min()
     if height < low + _CROTCH * np.ptp(rest[:, 1]):
         return False
-    near = rest[(np.abs(rest[:, 1] - height) < 0.03) & (np.abs(rest[:, 0]) < 0.1 * np.ptp(rest[:, 1]))]
-    center = near[:, [0, 2]].mean(axis=0) if len(near) else np.zeros(2)
-    angle = np.arctan2(*(ring[:, [0, 2]] - center).T)
+    angle = np.arctan2(*(ring[:, [0, 2]] - _trunk_center(rest, height)).T)
     turns = np.diff(np.append(angle, angle[0]))
     return abs(np.sum((turns + np.pi) % (2 * np.pi) - np.pi)) > np.pi

@@ -35,9 +35,17 @@ def test_waistband_is_the_top_of_what_has_no_shoulders(body, shape):
     assert "waistband" in waist.reason
 
 
-@pytest.mark.parametrize("shape", [poncho, cape])
-def test_what_lies_on_the_shoulders_is_not_held(body, shape):
-    waist = find_waist(*standing(shape, body), body)
+def test_a_cape_is_held_at_its_neckline(body):
+    positions, faces = standing(cape, body)
+    waist = find_waist(positions, faces, body)
+    below = positions[:, 1].max() - positions[:, 1]
+    np.testing.assert_array_equal(waist.is_held, below < WAISTBAND)
+    assert "open around the neck" in waist.reason
+    assert not waist.is_falling
+
+
+def test_what_lies_on_the_shoulders_is_not_held(body):
+    waist = find_waist(*standing(poncho, body), body)
     assert not waist.is_held.any()
     assert waist.reason == "it hangs from the shoulders"
 

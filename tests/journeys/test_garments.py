@@ -60,7 +60,7 @@ def test_kept_place_is_not_refused(tmp_path, fit_report, shape, suffix):
     report = fit_report(path, *GIVEN)
     assert report["placement"]["moved_m"] == pytest.approx([0.0, -0.8184, 0.0], abs=1e-4)
     assert report["placement"]["confidence"] == 1.0 or report["warnings"]
-    assert report["pinned"] == 0
+    assert (report["pinned"] > 0) == (shape is cape)  # which would slip off
 
 
 def test_a_skirt_in_metres_is_not_put_on_the_head(tmp_path, body):
