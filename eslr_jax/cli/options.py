@@ -38,7 +38,7 @@ class Options:
     betas: tuple[float, ...]
     start: str | None
     loop: str | None
-    settle: int
+    settle: int | None
     self_contact: bool
     ground: Literal["auto", "on", "off"] = "auto"
     integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began

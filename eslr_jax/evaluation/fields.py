@@ -165,7 +165,7 @@ def _problem_values(
         position=positions[:-1],
         velocity=velocities[:-1],
         friction_load=jnp.asarray(loads)[:-1],
-        frame=jnp.arange(len(positions) - 1, dtype=jnp.int32),
+        frame=run.report.get("settle", 0) + jnp.arange(len(positions) - 1, dtype=jnp.int32),
         past=past_states(positions, velocities, scene),
     )
     values = np.asarray(_every_frame(name, positions[1:], states, scene))
