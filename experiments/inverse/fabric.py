@@ -128,7 +128,8 @@ def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, s
         curve.semilogy(evaluations, lowest, f"C{index}-", label=f"L-BFGS, start {STARTS[index]}")
         curve.semilogy(np.sqrt(np.minimum.accumulate(simplex.losses)), f"C{index}:", label="Nelder-Mead")
     curve.set(xlabel="evaluations of the loss (a gradient counts by its time)", ylabel="distance, rms [mm]")
-    curve.legend()
+    curve.set_ylim(top=300)  # room for the legend
+    curve.legend(ncols=3, loc="upper right")
     return figure
 
 
