@@ -35,7 +35,7 @@ FRAMES = 6
 ITERATIONS = (50, 100, 200, 400, 800, 1600)  # of a frame, without a tolerance
 TOLERANCES = (1e-2, 1e-4, 1e-7)  # of a frame, with at most MOST iterations
 MOST = 1600
-LINEAR = (1e-1, 1e-2, 1e-4)  # of the linear system, besides the default
+LINEAR = (1e-2, 1e-3, 1e-5)  # of the linear system, besides the default
 
 
 def losses(

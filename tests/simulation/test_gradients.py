@@ -21,7 +21,7 @@ from eslr_jax.physics.solve import solve_hessian
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import tree_cast
+from eslr_jax.types import Air, tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends
 STEP = 1e-2  # of differences; positive numbers change by that share, places by ten micrometres
@@ -66,6 +66,12 @@ def grounded_scene(num_frames):
     return scene.replace(initial_state=start, ground=ground, pin_targets=None)
 
 
+def windy_scene(num_frames):
+    """A hanging sheet of a fabric with damping, in the wind."""
+    scene = small_scene(num_frames, has_body=False)
+    return wide(scene.replace(air=Air(wind=jnp.array([1.0, 0.2, 3.0])), damping=jnp.asarray(0.01)))
+
+
 def layered_scene(num_frames):
     """Two sheets, one three millimetres above the other, which hangs from its corners."""
     sheet = square(4, 0.08)
@@ -108,6 +114,8 @@ def directions(scene, seed=0):
         shapes["body"] = scene.body.positions.shape
     if scene.ground is not None:
         shapes["ground"] = ()
+    if scene.air is not None:
+        shapes |= {"wind": (3,), "air_density": (), "damping": ()}
     if scene.self_contact is not None:
         shapes |= dict.fromkeys(OF_LAYERS, ())
     if scene.pin_targets is not None:
@@ -141,6 +149,10 @@ def changed(scene, change):
         scene = scene.replace(body=body.replace(positions=body.positions + 1e-3 * change["body"]))
     if "ground" in change:
         scene = scene.replace(ground=scene.ground + 1e-3 * change["ground"])
+    if "wind" in change:
+        air = scene.air
+        air = air.replace(wind=air.wind + change["wind"], density=air.density * (1 + change["air_density"]))
+        scene = scene.replace(air=air, damping=scene.damping * (1 + change["damping"]))
     if "pins" in change:
         scene = scene.replace(pin_targets=scene.pin_targets + 1e-3 * change["pins"])
     return scene
@@ -175,7 +187,7 @@ def check_every_parameter(scene, frames=(-1,), *, step=STEP, noise=_NOISE):
             slope = float(jnp.sum(slopes[name] * direction))
             assert slope == pytest.approx(expected, rel=1e-3, abs=noise), (name, frame)
             unseen += [(name, frame)] * (abs(slope) < 10 * noise)
-    assert len(unseen) < 3, unseen  # else the noise hides what is checked
+    assert len(unseen) <= len(along) // 3, unseen  # else the noise hides what is checked
 
 
 def test_hanging_frames_have_right_gradients_by_every_parameter():
@@ -187,11 +199,12 @@ SCENES = {
     "friction": lambda: small_scene(4, has_body=True),
     "bdf2": lambda: small_scene(4, has_body=True, integrator="bdf2"),
     "skin": lambda: small_scene(3, has_body=True, has_skin=True),
+    "air": lambda: windy_scene(4),
     "ground": lambda: grounded_scene(4),
     "layers": lambda: layered_scene(3),
 }
-# With skin contacts the solver leaves more, and larger steps change which contacts touch.
-ROUGH = {"skin": {"step": 2e-3, "noise": 6e-6}}
+# Here the solver leaves more in a frame; of skin contacts, larger steps change which touch.
+ROUGH = {"skin": {"step": 2e-3, "noise": 1e-5}, "air": {"noise": 1e-6}, "layers": {"noise": 1e-6}}
 
 
 @pytest.mark.slow
