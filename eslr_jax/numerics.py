@@ -63,11 +63,11 @@ class TrueEntries(NamedTuple):
         last_row = self.running.shape[0] - 1
         row = jnp.minimum(jnp.searchsorted(self.running, number, side="right"), last_row)
         counts = jax.lax.population_count(self.words)
-        left = number - (self.running - jnp.sum(counts, axis=1))[row]
+        left = number - (self.running - jnp.sum(counts, axis=1, dtype=counts.dtype))[row]
         column = jnp.zeros_like(row)
         # Halve the span again and again: first in words, then in bits of the word.
         before = (jnp.cumsum(counts, axis=1) - counts)[row]
-        word = jnp.sum(before <= left[:, None], axis=1) - 1
+        word = jnp.sum(before <= left[:, None], axis=1, dtype=row.dtype) - 1
         left = left - jnp.take_along_axis(before, word[:, None], axis=1)[:, 0]
         bits = self.words[row, word].astype(jnp.uint32)
         for width in (16, 8, 4, 2, 1):
@@ -85,7 +85,7 @@ def true_entries(mask: Bool[Array, "rows columns"]) -> TrueEntries:
     bits = jnp.left_shift(jnp.uint32(1), jnp.arange(32, dtype=jnp.uint32))
     words = jnp.sum(jnp.where(padded, bits[None, None], jnp.uint32(0)), axis=2, dtype=jnp.uint32)
     counts = jnp.sum(jax.lax.population_count(words), axis=1, dtype=jnp.uint32).astype(jnp.int32)
-    return TrueEntries(words.astype(jnp.int32), jnp.cumsum(counts))
+    return TrueEntries(words.astype(jnp.int32), jnp.cumsum(counts, dtype=jnp.int32))
 
 
 def segment_sum(

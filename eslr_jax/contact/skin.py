@@ -104,10 +104,10 @@ def lift_off_skin(
         # Corner k moves by w_k / |w|^2 times the depth, so that the place does by the depth; a corner of several
         # places by the largest that they ask for.
         share = skin.weights / jnp.sum(skin.weights**2, axis=1, keepdims=True) * depth[:, None]
-        highest = jnp.zeros(count).at[skin.corners].max(share)
+        highest = jnp.zeros(count, position.dtype).at[skin.corners].max(share)
         is_highest = (share > 0) & (share == highest[skin.corners])
         moves = jnp.where(is_highest[..., None], share[..., None] * skin.next_normals[:, None], 0.0)
-        times = jnp.zeros(count).at[skin.corners].add(is_highest.astype(position.dtype))
+        times = jnp.zeros(count, position.dtype).at[skin.corners].add(is_highest.astype(position.dtype))
         move = jnp.zeros_like(position).at[skin.corners].add(moves) / jnp.maximum(times, 1.0)[:, None]
         return position + jnp.where(garment.is_pinned[:, None], 0.0, move)
 

@@ -56,7 +56,7 @@ def fabric(logs: jax.Array, scene: Scene) -> Material:
 def main() -> None:
     """Recover the fabric from three wrong starts, by gradients and without."""
     options = parse_options(__doc__)
-    steps, turns, iterations = (3, 1, 30) if options.smoke else (25, 5, 150)
+    steps, turns, iterations = (3, 1, 30) if options.smoke else (25, 25, 150)
     scene = make_scene()
 
     def simulate(logs: jax.Array) -> jax.Array:
@@ -125,10 +125,11 @@ def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, s
     for index, (by_gradient, simplex) in enumerate(runs):
         evaluations = cost * np.arange(1, len(by_gradient.losses) + 1)
         lowest = np.sqrt(np.minimum.accumulate(by_gradient.losses))
-        curve.semilogy(evaluations, lowest, f"C{index}-", label=f"L-BFGS, start {STARTS[index]}")
-        curve.semilogy(np.sqrt(np.minimum.accumulate(simplex.losses)), f"C{index}:", label="Nelder-Mead")
+        curve.semilogy(evaluations, lowest, f"C{index}-", label=f"start {STARTS[index]}")
+        curve.semilogy(np.sqrt(np.minimum.accumulate(simplex.losses)), f"C{index}:")
     curve.set(xlabel="evaluations of the loss (a gradient counts by its time)", ylabel="distance, rms [mm]")
-    curve.legend()
+    curve.set_title("solid: L-BFGS, dotted: Nelder-Mead")
+    curve.legend(loc="lower left")
     return figure
 
 

@@ -64,7 +64,7 @@ def make_scene(num_frames: int) -> Scene:
 def main() -> None:
     """Let the shirt out by gradients and by Nelder-Mead, and keep both."""
     options = parse_options(__doc__)
-    frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 3)
+    frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 9)
     config = SimConfig(iterations=20 if options.smoke else 100)
     scene = make_scene(frames)
     garment = scene.garment

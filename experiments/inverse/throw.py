@@ -65,7 +65,7 @@ def loss(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
 def main() -> None:
     """Throw by gradients and by Nelder-Mead, and keep both."""
     options = parse_options(__doc__)
-    steps, turns = (3, 1) if options.smoke else (30, 5)
+    steps, turns = (3, 1) if options.smoke else (30, 25)
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
 
     def value_and_grad(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
