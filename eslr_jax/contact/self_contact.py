@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.contact.crossing import sides_where_crossed
 from eslr_jax.contact.search import box_gaps
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.errors import Status
@@ -57,7 +58,7 @@ class FacePairs:
     vertices: Int[Array, " pairs"]  # the points' rows
     corners: Int[Array, "pairs 3"]  # vertices of the face
     weights: Float[Array, "pairs 3"]  # barycentric, of the place on the face nearest to the point at t
-    side: Float[Array, " pairs"]  # 1 where the point is on the side of the face's normal at t, -1 behind
+    side: Float[Array, " pairs"]  # 1 where the point is kept on the side of the face's normal, -1 behind
     areas: Float[Array, " pairs"]  # of cloth that the point stands for [m^2]
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
@@ -90,9 +91,9 @@ def find_self_contacts(
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
     A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
-    must stand over the face rather than beside it. Which side it is on is decided at t, where layers are
-    taken to be in order. Faces around the vertex are no pairs: those that hold it, and those within two edges
-    of it that are also within 2 cm in the rest mesh.
+    must stand over the face rather than beside it. Which side it is on is decided at t, and in the rest mesh
+    where the cloth passes through itself at t. Faces around the vertex are no pairs: those that hold it, and
+    those within two edges of it that are also within 2 cm in the rest mesh.
 
     Args:
         position: Vertices at t [m], shape [vertices, 3].
@@ -103,7 +104,9 @@ def find_self_contacts(
     """
     blocks = garment.vertex_blocks
     points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, blocks)
-    return _find_pairs(points, _Cloth(position, predicted, garment, has_points=True), radius, capacity)
+    pairs = _find_pairs(points, _Cloth(position, predicted, garment, has_points=True), radius, capacity)
+    rows = (pairs.vertices, pairs.corners, pairs.weights)
+    return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment, radius))
 
 
 def find_tip_contacts(
