@@ -166,7 +166,28 @@ class _FaceTable(NamedTuple):
 
 
 def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
-    """Return pairs of points and faces; see `find_self_contacts`.
+    """Return pairs of points and faces; see `find_self_contacts`."""
+    # What is found has no derivative, where it is found has one.
+    still = _Cloth(*jax.lax.stop_gradient(cloth[:3]), has_points=cloth.has_points)
+    point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
+    pairs = _exactly(point, face, points, cloth, radius)
+    is_used = jnp.arange(capacity.pairs) < count
+    is_full = count > capacity.pairs
+    return pairs.replace(
+        vertices=jnp.where(is_used, point, points.position.shape[0] - 1),
+        corners=jnp.where(is_used[:, None], pairs.corners, cloth.position.shape[0] - 1),
+        weights=jnp.where(is_used[:, None], pairs.weights, 1.0 / 3.0),
+        side=jnp.where(is_used, pairs.side, 0.0),
+        areas=jnp.where(is_used, pairs.areas, 0.0),
+        count=count,
+        status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
+    )
+
+
+def _search(
+    points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity
+) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"], Int[Array, ""]]:
+    """Return points and faces of the pairs, and their number, which may be more than there are rows.
 
     First boxes around blocks of points against boxes around blocks of faces, then every point against every face
     in two such blocks by a cheap test that loses none, then exactly.
@@ -190,60 +211,33 @@ def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCap
             pair, column = candidates.find(number)
             point = points.blocks[block[pair], column // 32]
             face = garment.face_blocks[faces[pair], column % 32]
-            kept = _exactly(point, face, points, cloth, radius)
-            is_pair = (kept.side != 0) & (number < candidates.count)
-            return first + rows, _append(found, kept, is_pair, capacity.pairs)
+            side = _exactly(point, face, points, cloth, radius).side
+            is_pair = (side != 0) & (number < candidates.count)
+            return first + rows, _append(found, (point, face), is_pair, capacity.pairs)
 
         _, found = jax.lax.while_loop(lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found))
         return first + size, found
 
-    nothing = _no_pairs(points, cloth, capacity.pairs + rows)
-    _, found = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, (jnp.int32(0), nothing))
-    is_used = jnp.arange(capacity.pairs) < found.count
-    unused = _no_pairs(points, cloth, capacity.pairs)
-    used = jax.tree.map(
-        lambda leaf, other: (
-            leaf
-            if leaf.ndim == 0
-            else jnp.where(is_used.reshape(-1, *[1] * (leaf.ndim - 1)), leaf[: capacity.pairs], other)
-        ),
-        found,
-        unused,
-    )
-    is_full = found.count > capacity.pairs
-    status = jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
-    return used.replace(status=status)
+    nobody = jnp.zeros(capacity.pairs + rows, jnp.int32)
+    start = (jnp.int32(0), (nobody, nobody, jnp.int32(0)))
+    _, (point, face, count) = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, start)
+    return point[: capacity.pairs], face[: capacity.pairs], count
 
 
-def _no_pairs(points: _Points, cloth: _Cloth, capacity: int) -> FacePairs:
-    """Return rows that are not used."""
-    dtype = points.position.dtype
-    return FacePairs(
-        vertices=jnp.full(capacity, points.position.shape[0] - 1, jnp.int32),
-        corners=jnp.full((capacity, 3), cloth.position.shape[0] - 1, jnp.int32),
-        weights=jnp.full((capacity, 3), 1.0 / 3.0, dtype),
-        side=jnp.zeros(capacity, dtype),
-        areas=jnp.zeros(capacity, dtype),
-        count=jnp.int32(0),
-        status=jnp.int32(Status.OK),
-    )
-
-
-def _append(found: FacePairs, rows: FacePairs, is_pair: Bool[Array, " rows"], capacity: int) -> FacePairs:
-    """Return pairs with some more behind them; beyond the capacity they are counted alone."""
+def _append(
+    found: tuple[Array, Array, Array], rows: tuple[Array, Array], is_pair: Bool[Array, " rows"], capacity: int
+) -> tuple[Array, Array, Array]:
+    """Return points, faces and their number with some more behind; beyond the capacity they are counted alone."""
+    *before, count = found
     width = is_pair.shape[0]
-    padded = jnp.pad(is_pair, (0, -width % 32)).reshape(-1, 32)
-    entries = true_entries(padded)
+    entries = true_entries(jnp.pad(is_pair, (0, -width % 32)).reshape(-1, 32))
     row, column = entries.find(jnp.arange(width, dtype=jnp.int32))
     order = jnp.minimum(32 * row + column, width - 1)
-    start = jnp.minimum(found.count, capacity)
-
-    def put(before: Array, new: Array) -> Array:
-        if before.ndim == 0:
-            return before
-        return jax.lax.dynamic_update_slice(before, new[order], (start, *[0] * (before.ndim - 1)))
-
-    return jax.tree.map(put, found, rows).replace(count=found.count + entries.count)
+    start = jnp.minimum(count, capacity)
+    point, face = (
+        jax.lax.dynamic_update_slice(old, new[order], (start,)) for old, new in zip(before, rows, strict=True)
+    )
+    return point, face, count + entries.count
 
 
 def _are_close(points: _Points, cloth: _Cloth, radius: float) -> Bool[Array, "blocks face_blocks"]:

@@ -277,3 +277,21 @@ def test_a_tip_between_vertices_meets_the_face_over_it():
     assert set(np.asarray(pairs.vertices)[np.asarray(pairs.side) != 0]) == {0}, "the other point is far"
     height, _ = pair_heights(x, pairs, body)
     np.testing.assert_allclose(height[0], 5e-3, rtol=1e-4)
+
+
+def test_the_place_on_the_face_has_the_derivative_that_central_differences_have():
+    positions, faces = make_sheet(7, 7, 0.012, jitter=0)
+    offset = np.array([3.1e-3, 5e-3, 1.7e-3])
+    both = np.concatenate([positions, positions + offset])
+    garment = make_garment(both, np.concatenate([faces, faces + len(positions)]))
+    upper = jnp.asarray(np.arange(len(both)) >= len(positions), jnp.float32)[:, None]
+
+    @jax.jit
+    def place(step):
+        x = jnp.asarray(both, jnp.float32) + step * upper * jnp.array([[1.0, 0.0, 0.3]])
+        return jnp.sum(self_contact.find_self_contacts(x, x, garment, AMPLE).weights ** 2)
+
+    step = jnp.float32(1e-4)
+    difference = float((place(step) - place(-step)) / (2 * step))
+    assert abs(difference) > 100.0
+    assert float(jax.jit(jax.grad(place))(0.0)) == pytest.approx(difference, rel=0.02)
