@@ -62,8 +62,9 @@ def plan_scene(
 ) -> ScenePlan:
     """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
-    Self-contact is modelled where two pieces come close to each other. Within one piece it has to be asked for:
-    it does not undo what crosses in the first frame (experiments/self_contact.py).
+    Self-contact is modelled where two pieces come close to each other; within one piece it has to be asked for.
+    Its buffer starts small, since `simulate` enlarges it. A pure `rollout` needs `default_capacity` in its place,
+    or a look at the trajectory's status.
 
     Args:
         garment: A prepared garment.
