@@ -59,9 +59,8 @@ def _sides_at_rest(
     """
     rest = components(garment.rest_positions)
     a, b, c = (take3(rest, corners[:, k]) for k in range(3))
-    foot = [sum(weights[:, k] * corner[axis] for k, corner in enumerate((a, b, c))) for axis in range(3)]
-    offset = sub3(take3(rest, vertices), (foot[0], foot[1], foot[2]))
-    x, y, z = safe_normalize(jnp.stack(offset), axis=0)
+    foot = jnp.sum(weights[None] * jnp.stack([jnp.stack(corner) for corner in (a, b, c)], axis=-1), axis=-1)
+    x, y, z = safe_normalize(jnp.stack(take3(rest, vertices)) - foot, axis=0)
     face = safe_normalize(jnp.stack(cross3(sub3(b, a), sub3(c, a))), axis=0)
     normals = vertex_normals(garment.rest_positions, garment.faces, garment.face_incidence)
     at_face = dot3((x, y, z), (face[0], face[1], face[2]))

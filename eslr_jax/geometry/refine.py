@@ -33,7 +33,7 @@ def refine(faces: Int[np.ndarray, "faces 3"], num_vertices: int, scheme: str) ->
     identity = _matrix([(everyone, everyone, np.ones(num_vertices))], (num_vertices, num_vertices))
     whole = Refinement(np.asarray(faces, np.int64), np.arange(len(faces)), identity, identity)
     for letter in scheme:
-        finer = step[letter](whole.faces, whole.smooth.shape[0])
+        finer = step[letter](whole.faces, np.shape(whole.smooth)[0])
         whole = Refinement(
             finer.faces,
             whole.parents[finer.parents],
