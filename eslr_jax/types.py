@@ -62,6 +62,7 @@ class Garment:
     face_incidence: Int[Array, "vertices face_degree"]  # see numerics.gather_corners
     hinge_incidence: Int[Array, "vertices hinge_degree"]
     vertex_blocks: Int[Array, "vertex_blocks block"]  # compact groups of all vertices; some may be repeated
+    face_blocks: Int[Array, "face_blocks face_block"]  # likewise of all faces
     edge_mask: Bool[Array, " edges"]
     vertex_mask: Bool[Array, " vertices"]
     geodesic_embedding: Float[Array, "vertices embedding"]  # [m]
@@ -184,10 +185,9 @@ class SceneBody:
 
 @dataclasses.dataclass(frozen=True)
 class PairCapacity:
-    """Sizes of the buffers of self-contact; static, so a change compiles anew."""
+    """Size of the buffer of self-contact; static, so a change compiles anew."""
 
     pairs: int  # rows for pairs of a vertex and a face
-    faces: int  # faces looked at in a column of search cells
 
 
 @struct.dataclass
@@ -250,8 +250,7 @@ class Trajectory:
     iterations: Int[Array, " frames"]  # of the solver
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # -1 while status is OK
-    pair_demand: Int[Array, "frames 2"] | None = None
-    """What self-contact needed of `PairCapacity.pairs` and `.faces`; None where it is not modelled."""
+    pair_demand: Int[Array, " frames"] | None = None  # of `PairCapacity.pairs`; None without self-contact
 
     @property
     def num_frames(self) -> int:

@@ -22,7 +22,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
-from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.contact.self_contact import starting_capacity
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.io.atomic import atomic_write
@@ -31,6 +31,7 @@ from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parent / "results"
@@ -43,7 +44,13 @@ def layered_skirt(num_frames: int) -> Scene:
     """Return the hard case's skirt over trousers, whose layers collide."""
     from hard_cases import find_case
 
-    return first_frames(find_case("layers").build({})["skirt over trousers"].scene, num_frames)
+    scene = find_case("layers").build({})["skirt over trousers"].scene
+    return with_room(first_frames(scene, num_frames))
+
+
+def with_room(scene: Scene) -> Scene:
+    """Return a scene whose layers collide with buffers that suffice."""
+    return simulate(None, scene, config=SimConfig(iterations=ITERATIONS)).scene
 
 
 def without_layers(scene: Scene) -> Scene:
@@ -53,7 +60,7 @@ def without_layers(scene: Scene) -> Scene:
 
 def with_layers(scene: Scene) -> Scene:
     """Return a scene in which layers of cloth collide."""
-    return scene.replace(self_contact=default_capacity(scene.garment.vertex_mask.shape[0]))
+    return with_room(scene.replace(self_contact=starting_capacity(scene.garment.vertex_mask.shape[0])))
 
 
 def compare_steps(pair: Pair, turns: int) -> dict[str, float]:

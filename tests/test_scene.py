@@ -99,3 +99,17 @@ def test_cloth_touches_nothing_else_than_what_was_searched(body, name):
         assert touches.sum() > 50
         assert np.mean(contacts.is_near[touches]) > 0.999
         np.testing.assert_array_less(-0.005, np.where(contacts.is_near, contacts.distances, 0.0))
+
+
+def test_two_pieces_that_meet_are_kept_apart(small_poses):
+    from cloth import make_garment, make_sheet
+
+    positions, faces = make_sheet(6, 6, 0.02, jitter=0)
+    both = np.concatenate([faces, faces + len(positions)])
+    for gap, meets in ((0.02, True), (0.3, False)):
+        rest = np.concatenate([positions, positions + np.array([0.0, gap, 0.0])])
+        garment = make_garment(rest, both)
+        options = SceneOptions(has_body=False)
+        assert (prepare_scene(garment, small_poses, options=options).self_contact is not None) == meets
+        off = SceneOptions(has_body=False, self_contact=False)
+        assert prepare_scene(garment, small_poses, options=off).self_contact is None

@@ -23,6 +23,7 @@ from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.geometry.prepare import prepare_garment, to_device
+from eslr_jax.geometry.refine import refine
 from eslr_jax.geometry.validate import validate_body
 from eslr_jax.io.asf import read_amc
 from eslr_jax.io.body import read_body
@@ -46,7 +47,8 @@ from eslr_jax.types import Body, Garment
 
 DEFAULT_MOTION = "cmu_016_32"
 START_MODEL = "smooth-small"  # the network that was trained to give the solver an initial guess
-Resolution = Literal["1k", "4k", "10k"]
+Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
+_REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices, see `geometry.refine`
 
 
 def _is_path(name: str) -> bool:
@@ -134,7 +136,7 @@ def load_garment(
     Args:
         name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
             or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
-        vertices: Resolution of a bundled garment.
+        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
         body: Body that a mesh is fitted to; the bundled one by default.
         fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
@@ -162,13 +164,15 @@ def load_garment_file(
 
     Args:
         name: Garment; see `load_garment`, also for the other arguments.
-        vertices: Resolution of a bundled garment.
+        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
         body: Body that a mesh is fitted to.
         fit: Options of the fit.
         cache: Keep the result for the next time.
         on_source: Function that is told of a mesh before it is fitted.
     """
     if not _is_path(str(name)):
+        if vertices in _REFINED:
+            return _refined(read_garment_npz(find_asset("garment", f"{name}_4k")), _REFINED[vertices])
         return read_garment_npz(find_asset("garment", f"{name}_{vertices}"))
     path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
     if path.is_file() and is_garment_file(path):
@@ -182,6 +186,29 @@ def load_garment_file(
     key = content_key("fit", path.read_bytes(), str(name), options, *_body_arrays(rig))
     arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
     return garment_from_arrays(arrays, source.name)
+
+
+def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:
+    """Return a bundled garment on a finer mesh; vertices between pinned ones are pinned."""
+    count = len(stored.rest_positions)
+    finer = refine(stored.faces, count, scheme)
+    rows = np.repeat(np.arange(count), stored.skin_indices.shape[1])
+    dense = np.zeros((count, stored.skin_indices.max() + 1))
+    np.add.at(dense, (rows, stored.skin_indices.ravel()), stored.skin_weights.ravel())
+    weights = finer.linear @ dense
+    chosen = np.argsort(-weights, axis=1)[:, : stored.skin_indices.shape[1]]
+    weights = np.take_along_axis(weights, chosen, axis=1)
+    return GarmentFile(
+        rest_positions=finer.smooth @ stored.rest_positions,
+        faces=finer.faces,
+        skin_weights=weights / weights.sum(axis=1, keepdims=True),
+        skin_indices=chosen,
+        is_pinned=finer.linear @ stored.is_pinned > 0.99,
+        sewn_positions=None if stored.sewn_positions is None else finer.smooth @ stored.sewn_positions,
+        face_parts=None if stored.face_parts is None else stored.face_parts[finer.parents],
+        part_names=stored.part_names,
+        metadata=stored.metadata,
+    )
 
 
 def prepare_stored(

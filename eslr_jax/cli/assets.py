@@ -112,7 +112,7 @@ def info(
     model: str = "eslr-15",
     scene: str | None = None,
     motion: str = "cmu_016_32",
-    vertices: Literal["1k", "4k", "10k"] = "1k",
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
     simulator: Literal["network", "physics"] = "physics",
     self_contact: bool = False,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -123,9 +123,9 @@ def info(
         model: Name of an architecture, or of a bundled network, or an exported file.
         scene: A garment, by name or file, on the bundled body.
         motion: Motion of the scene.
-        vertices: Resolution of a bundled garment.
+        vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         simulator: Simulator of the scene; the network is the default one.
-        self_contact: Keep layers of cloth apart.
+        self_contact: Keep layers of cloth apart, also within one piece.
         json_: Print as JSON.
     """
     if scene is not None:
@@ -155,7 +155,7 @@ def info(
 def _show_scene(
     garment: str,
     motion: str,
-    vertices: Literal["1k", "4k", "10k"],
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"],
     simulator: Literal["network", "physics"],
     self_contact: bool,
     as_json: bool,
@@ -171,7 +171,7 @@ def _show_scene(
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
     config = SimConfig(model=architecture)
-    options = SceneOptions(self_contact=self_contact)
+    options = SceneOptions(self_contact=self_contact or None)
     with stderr.status("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))

@@ -24,7 +24,7 @@ class Options:
     body: str
     simulator: Literal["network", "physics"] | None
     model: str | None
-    vertices: Literal["1k", "4k", "10k"]
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"]
     fabric: tuple[str, ...]
     frames: int | None
     iterations: int | None
@@ -40,11 +40,25 @@ class Options:
     loop: str | None
     settle: int | None
     self_contact: bool
+    no_self_contact: bool = False
     ground: Literal["auto", "on", "off"] = "auto"
     integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
     wind: tuple[float, float, float] | None = None
     gust: float = 0.0
     damping: float | None = None
+
+
+def wanted_self_contact(options: Options) -> bool | None:
+    """Return whether self-contact is asked for, or None where the scene decides.
+
+    Raises:
+        ConfigError: It is asked for both ways.
+    """
+    if options.self_contact and options.no_self_contact:
+        raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
+    if options.no_self_contact:
+        return False
+    return True if options.self_contact else None
 
 
 def interrupted_record(

@@ -16,7 +16,13 @@ from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
-from eslr_jax.cli.options import Options, check_same_scene, interrupted_record, read_interrupted
+from eslr_jax.cli.options import (
+    Options,
+    check_same_scene,
+    interrupted_record,
+    read_interrupted,
+    wanted_self_contact,
+)
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -39,7 +45,7 @@ def simulate(
     body: str = "anny",
     simulator: Literal["network", "physics"] | None = None,
     model: str | None = None,
-    vertices: Literal["1k", "4k", "10k"] = "1k",
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
     fabric: tuple[str, ...] = (),
     frames: int | None = None,
     iterations: int | None = None,
@@ -55,7 +61,8 @@ def simulate(
     loop: str | None = None,
     settle: int | None = None,
     integrator: Literal["euler", "bdf2"] | None = None,
-    self_contact: bool = False,
+    self_contact: tyro.conf.FlagCreatePairsOff[bool] = False,
+    no_self_contact: tyro.conf.FlagCreatePairsOff[bool] = False,
     ground: Literal["auto", "on", "off"] = "auto",
     wind: tuple[float, float, float] | None = None,
     gust: float = 0.0,
@@ -81,7 +88,7 @@ def simulate(
         simulator: The solver alone (physics), or with a trained network in front (network).
         model: Name of a bundled network or an exported file; the default network if a network is asked for and
             none is named.
-        vertices: Resolution of a bundled garment.
+        vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
             density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
         frames: Simulate this many frames, the start included; all if not given.
@@ -104,7 +111,9 @@ def simulate(
             default 15, and 0 for a network alone.
         integrator: How time is stepped: bdf2 keeps swinging cloth in motion; euler, the paper's, loses two thirds
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
-        self_contact: Keep layers of cloth apart.
+        self_contact: Keep layers of cloth apart, also within one piece; two pieces that can meet are kept apart
+            anyway.
+        no_self_contact: Let layers of cloth pass through each other.
         ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
         wind: Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
         gust: Strength of gusts, as a share of the wind's speed.
@@ -189,7 +198,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         settling = with_settling(poses, settle)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
         modelled = SceneOptions(
-            self_contact=options.self_contact,
+            self_contact=wanted_self_contact(options),
             ground=options.ground,
             has_skin=method.config.iterations > 0,
             integrator=integrator,
@@ -240,7 +249,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "garment": options.garment,
             "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
-            "self_contact": options.self_contact,
+            "self_contact": scene.self_contact is not None,
             "integrator": integrator,
             "settle": settle,
             "skin_contacts": modelled.has_skin,

@@ -153,14 +153,23 @@ def _bounds(values: Vector3) -> tuple[Vector3, Vector3]:
     return low, (jnp.max(x, axis=1), jnp.max(y, axis=1), jnp.max(z, axis=1))
 
 
+Range = tuple[Array, Array]
+"""The lowest and the highest of one component in every group, each of shape [groups]."""
+
+
+def box_gaps(own: list[Range], others: list[Range]) -> Float[Array, "own others"]:
+    """Return all squared distances between two sets of boxes [m^2], given by their ranges along the axes."""
+    squared = 0.0
+    for (low, high), (other_low, other_high) in zip(own, others, strict=True):
+        gap = jnp.maximum(low[:, None] - other_high[None], other_low[None] - high[:, None])
+        squared = squared + jnp.square(jnp.maximum(gap, 0.0))
+    return squared  # type: ignore[return-value]
+
+
 def _gaps(points: Vector3, members: Vector3) -> Float[Array, "blocks patches"]:
     """Return the squared distances between the boxes around blocks and around patches [m^2]."""
-    (low, high), (patch_low, patch_high) = _bounds(points), _bounds(members)
-    squared = 0.0
-    for a, b, c, d in zip(low, high, patch_low, patch_high, strict=True):
-        gap = jnp.maximum(jnp.maximum(a[:, None] - d[None], c[None] - b[:, None]), 0.0)
-        squared = squared + gap * gap
-    return squared  # type: ignore[return-value]
+    own, others = (list(zip(*_bounds(values), strict=True)) for values in (points, members))
+    return box_gaps(own, others)
 
 
 def _may_oppose(

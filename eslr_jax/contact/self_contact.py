@@ -1,17 +1,30 @@
-"""Where points come close to faces of cloth: pairs of fixed capacity, found in sorted cells."""
+"""Where points come close to faces of cloth: pairs of fixed capacity, found by blocks of points and of faces."""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.contact.crossing import sides_where_crossed
+from eslr_jax.contact.search import box_gaps
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.errors import Status
-from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_norm, sub3, true_rows
+from eslr_jax.numerics import (
+    TrueEntries,
+    Vector3,
+    components,
+    cross3,
+    dot3,
+    safe_norm,
+    safe_normalize,
+    sub3,
+    take3,
+    true_entries,
+)
 from eslr_jax.types import Garment, PairCapacity
 
 TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
@@ -20,11 +33,17 @@ TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
 SEARCH_RADIUS = 0.04
 _NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to approach (ContourCraft)
 _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a hem there is nothing to hit
+_MAX_SLOPE = 0.75  # the same as sideways distance over height: sin / cos
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
-_CELLS_PER_SIDE = 1024  # so that a cell's key fits 30 bits
-CELL_CAPACITY = 96  # faces in each of the nine columns of three cells around a vertex; default
-_TIP_CELL_CAPACITY = 512  # likewise around a tip, whose cells are larger
-PAIRS_PER_VERTEX = 8  # default capacity, a mean over vertices
+_SLACK = 1e-5  # [m] by which the cheap test is wider than the exact one: rounding
+_BLOCK_PAIRS = (
+    2048  # pairs of blocks that are looked at together; what is read of them then stays in the cache
+)
+_CANDIDATES = 1024  # pairs of a point and a face that are tested exactly at a time
+PAIRS_PER_VERTEX = 8  # rows that hold any cloth in the hard cases, a mean over vertices; the most was 6.9
+_FEWEST_PAIRS = 64  # rows to begin with, at least
+_BEGINNING = 8  # vertices for a row to begin with: a walking T-shirt has a pair for 20 to 130 vertices
+_PIECES_BEGINNING = 2  # likewise for layers of several pieces; a skirt over trousers has a pair for 2.6
 PAIRS_PER_TIP = 8  # likewise for tips, over the vertices of both; cloth bunched around a needle took 4.7
 
 
@@ -39,25 +58,26 @@ class FacePairs:
     vertices: Int[Array, " pairs"]  # the points' rows
     corners: Int[Array, "pairs 3"]  # vertices of the face
     weights: Float[Array, "pairs 3"]  # barycentric, of the place on the face nearest to the point at t
-    side: Float[Array, " pairs"]  # 1 where the point is on the side of the face's normal at t, -1 behind
+    side: Float[Array, " pairs"]  # 1 where the point is kept on the side of the face's normal, -1 behind
     areas: Float[Array, " pairs"]  # of cloth that the point stands for [m^2]
     count: Int[Array, ""]  # pairs found, which may be more than there are rows
-    listed: Int[Array, ""]  # the cell capacity that would have held all faces looked at
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
-class _Grid(NamedTuple):
-    """Faces sorted by the cell of their centroid."""
-
-    keys: Int[Array, " faces"]  # ascending
-    faces: Int[Array, " faces"]
-    origin: Float[Array, " axes"]  # [m], shape [3]
-    cell_size: Float[Array, ""]  # [m]
-
-
 def default_capacity(num_vertices: int) -> PairCapacity:
-    """Return the buffers that self-contact starts with, for a garment of so many vertices."""
-    return PairCapacity(pairs=PAIRS_PER_VERTEX * num_vertices, faces=CELL_CAPACITY)
+    """Return the buffers that hold the self-contact of nearly any garment of so many vertices."""
+    return PairCapacity(pairs=PAIRS_PER_VERTEX * num_vertices)
+
+
+def starting_capacity(num_vertices: int, pieces: int = 1) -> PairCapacity:
+    """Return a small buffer, for those who enlarge it where it overflows: every row costs in every iteration.
+
+    Args:
+        num_vertices: Of the garment.
+        pieces: Pieces of cloth that it consists of.
+    """
+    share = _BEGINNING if pieces == 1 else _PIECES_BEGINNING
+    return PairCapacity(pairs=max(num_vertices // share, _FEWEST_PAIRS))
 
 
 def find_self_contacts(
@@ -71,9 +91,9 @@ def find_self_contacts(
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
     A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
-    must stand over the face rather than beside it. Which side it is on is decided at t, where layers are
-    taken to be in order. Faces around the vertex are no pairs: those that hold it, and those within two edges
-    of it that are also within 2 cm in the rest mesh.
+    must stand over the face rather than beside it. Which side it is on is decided at t, and in the rest mesh
+    where the cloth passes through itself at t. Faces around the vertex are no pairs: those that hold it, and
+    those within two edges of it that are also within 2 cm in the rest mesh.
 
     Args:
         position: Vertices at t [m], shape [vertices, 3].
@@ -82,10 +102,11 @@ def find_self_contacts(
         capacity: Sizes of the buffers; static.
         radius: Radius of the search [m].
     """
-    points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, is_cloth=True)
-    pairs = _find_pairs(points, _Cloth(position, predicted, garment), radius, capacity)
-    is_around = _is_around(pairs.vertices, pairs.corners, garment)
-    return dataclasses.replace(pairs, side=jnp.where(is_around, 0.0, pairs.side))
+    blocks = garment.vertex_blocks
+    points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, blocks)
+    pairs = _find_pairs(points, _Cloth(position, predicted, garment, has_points=True), radius, capacity)
+    rows = (pairs.vertices, pairs.corners, pairs.weights)
+    return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment, radius))
 
 
 def find_tip_contacts(
@@ -93,6 +114,7 @@ def find_tip_contacts(
     predicted: Float[Array, "vertices 3"],
     body: Float[Array, "surface_vertices 3"],
     next_body: Float[Array, "surface_vertices 3"],
+    blocks: Int[Array, "blocks rows"],
     garment: Garment,
 ) -> FacePairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
@@ -105,13 +127,14 @@ def find_tip_contacts(
         predicted: A guess of the cloth vertices at t + 1 [m], shape [vertices, 3].
         body: Body vertices at t [m], shape [surface_vertices, 3].
         next_body: Body vertices at t + 1 [m], shape [surface_vertices, 3].
+        blocks: Compact groups of body vertices, as in `BodySurface.patch_vertices`.
         garment: Rest mesh.
     """
     count = body.shape[0]
-    capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count), _TIP_CELL_CAPACITY)
+    capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count))
     area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), is_cloth=False)
-    return _find_pairs(points, _Cloth(position, predicted, garment), TIP_RADIUS, capacity)
+    points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), blocks)
+    return _find_pairs(points, _Cloth(position, predicted, garment, has_points=False), TIP_RADIUS, capacity)
 
 
 class _Points(NamedTuple):
@@ -121,7 +144,7 @@ class _Points(NamedTuple):
     predicted: Float[Array, "points 3"]  # at t + 1 [m]
     mask: Bool[Array, " points"]
     areas: Float[Array, " points"]  # of cloth [m^2]
-    is_cloth: bool  # the points are the vertices of the faces
+    blocks: Int[Array, "blocks rows"]  # compact groups of points
 
 
 class _Cloth(NamedTuple):
@@ -130,128 +153,210 @@ class _Cloth(NamedTuple):
     position: Float[Array, "vertices 3"]  # at t [m]
     predicted: Float[Array, "vertices 3"]  # at t + 1 [m]
     garment: Garment
+    has_points: bool  # the points are the vertices of the faces
+
+
+class _FaceTable(NamedTuple):
+    """What the cheap test reads of the faces in their blocks, member by member."""
+
+    # Planes x, y, z, offset: of the face at t, of the face at t + 1, and of its three sides, upright on the face
+    # and positive inside. Shape [members, 5, 4, face_blocks], in metres.
+    planes: Float[Array, "members planes numbers face_blocks"]
+    corners: Int[Array, "members corners face_blocks"]
 
 
 def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
-    garment = cloth.garment
-    num_points, num_vertices = points.position.shape[0], cloth.position.shape[0]
-    corners = [_gather(cloth.position, garment.faces[:, k]) for k in range(3)]
-    centroid = _mean(corners)
-    reach = _largest_reach(corners, centroid, garment.rest_areas > 0)
-    grid = _sort_faces(centroid, garment.rest_areas > 0, radius + reach)
-    faces, is_listed, most = _listed_faces(points.position, grid, capacity.faces)
-    # First by distance of centroids, which is cheap, then exactly.
-    x, y, z = components(points.position)
-    listed = (centroid[0][faces], centroid[1][faces], centroid[2][faces])
-    squared = _squared_distance((x[:, None], y[:, None], z[:, None]), listed)
-    is_close = is_listed & points.mask[:, None] & (squared < grid.cell_size**2)
-    limit = capacity.faces * num_points
-    rows, num_close = true_rows(is_close.ravel(), limit)
-    point = jnp.minimum(rows // faces.shape[1], num_points - 1)
-    face = faces.ravel()[jnp.minimum(rows, faces.size - 1)]
-    is_pair, weights, side = _is_pair(point, face, points, cloth, radius)
-    rows, count = true_rows(is_pair & (jnp.arange(limit) < num_close), capacity.pairs)
+    # What is found has no derivative, where it is found has one.
+    still = _Cloth(*jax.lax.stop_gradient(cloth[:3]), has_points=cloth.has_points)
+    point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
+    pairs = _exactly(point, face, points, cloth, radius)
     is_used = jnp.arange(capacity.pairs) < count
-    rows = jnp.minimum(rows, limit - 1)
-    point = jnp.where(is_used, point[rows], num_points - 1)
-    listed = jnp.maximum(most, -(-num_close // num_points))
-    is_full = (listed > capacity.faces) | (count > capacity.pairs)
-    return FacePairs(
-        vertices=point,
-        corners=jnp.where(is_used[:, None], garment.faces[face[rows]], num_vertices - 1),
-        weights=weights[rows],
-        side=jnp.where(is_used, side[rows], 0.0),
-        areas=jnp.where(is_used, points.areas[point], 0.0),
+    is_full = count > capacity.pairs
+    return pairs.replace(
+        vertices=jnp.where(is_used, point, points.position.shape[0] - 1),
+        corners=jnp.where(is_used[:, None], pairs.corners, cloth.position.shape[0] - 1),
+        weights=jnp.where(is_used[:, None], pairs.weights, 1.0 / 3.0),
+        side=jnp.where(is_used, pairs.side, 0.0),
+        areas=jnp.where(is_used, pairs.areas, 0.0),
         count=count,
-        listed=listed,
         status=jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK)),
     )
 
 
-def _mean(points: list[Vector3]) -> Vector3:
-    """Return the mean of points given by components."""
-    x, y, z = (sum(point[k] for point in points) / len(points) for k in range(3))
-    return x, y, z  # type: ignore[return-value]
+def _search(
+    points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity
+) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"], Int[Array, ""]]:
+    """Return points and faces of the pairs, and their number, which may be more than there are rows.
+
+    First boxes around blocks of points against boxes around blocks of faces, then every point against every face
+    in two such blocks by a cheap test that loses none, then exactly.
+    """
+    garment = cloth.garment
+    table = _face_table(cloth)
+    boxes = true_entries(_are_close(points, cloth, radius))
+    size, rows = _BLOCK_PAIRS, _CANDIDATES
+
+    def look(carry):
+        first, found = carry
+        number = first + jnp.arange(size, dtype=jnp.int32)
+        block, faces = boxes.find(number)
+        words = _candidates(points.blocks[block], faces, points, table, (radius, cloth.has_points))
+        words = jnp.where((number < boxes.count)[:, None], words, 0)
+        candidates = TrueEntries(words, jnp.cumsum(jnp.sum(jax.lax.population_count(words), axis=1)))
+
+        def test(carry):
+            first, found = carry
+            number = first + jnp.arange(rows, dtype=jnp.int32)
+            pair, column = candidates.find(number)
+            point = points.blocks[block[pair], column // 32]
+            face = garment.face_blocks[faces[pair], column % 32]
+            side = _exactly(point, face, points, cloth, radius).side
+            is_pair = (side != 0) & (number < candidates.count)
+            return first + rows, _append(found, (point, face), is_pair, capacity.pairs)
+
+        _, found = jax.lax.while_loop(lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found))
+        return first + size, found
+
+    nobody = jnp.zeros(capacity.pairs + rows, jnp.int32)
+    start = (jnp.int32(0), (nobody, nobody, jnp.int32(0)))
+    _, (point, face, count) = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, start)
+    return point[: capacity.pairs], face[: capacity.pairs], count
 
 
-def _largest_reach(corners: list[Vector3], centroid: Vector3, is_real: Bool[Array, " faces"]) -> Array:
-    """Return the largest distance from a face's centroid to its corners [m]."""
-    squared = [jnp.max(jnp.where(is_real, _squared_distance(corner, centroid), 0.0)) for corner in corners]
-    return jnp.sqrt(jnp.max(jnp.stack(squared)))
+def _append(
+    found: tuple[Array, Array, Array], rows: tuple[Array, Array], is_pair: Bool[Array, " rows"], capacity: int
+) -> tuple[Array, Array, Array]:
+    """Return points, faces and their number with some more behind; beyond the capacity they are counted alone."""
+    *before, count = found
+    width = is_pair.shape[0]
+    entries = true_entries(jnp.pad(is_pair, (0, -width % 32)).reshape(-1, 32))
+    row, column = entries.find(jnp.arange(width, dtype=jnp.int32))
+    order = jnp.minimum(32 * row + column, width - 1)
+    start = jnp.minimum(count, capacity)
+    point, face = (
+        jax.lax.dynamic_update_slice(old, new[order], (start,)) for old, new in zip(before, rows, strict=True)
+    )
+    return point, face, count + entries.count
 
 
-def _squared_distance(a: Vector3, b: Vector3) -> Array:
-    """Return squared distances between points given by components."""
-    difference = sub3(a, b)
-    return dot3(difference, difference)
+def _are_close(points: _Points, cloth: _Cloth, radius: float) -> Bool[Array, "blocks face_blocks"]:
+    """Return which blocks of points and of faces have boxes closer than the radius."""
+    garment = cloth.garment
+    is_real = (garment.rest_areas > 0)[garment.face_blocks]
+    corners = garment.faces[garment.face_blocks]  # [face_blocks, members, 3]
+    is_point = points.mask[points.blocks]
+    own, others = [], []
+    for x, y in zip(components(points.position), components(cloth.position), strict=True):
+        at, values = x[points.blocks], y[corners]
+        own.append((jnp.where(is_point, at, jnp.inf).min(1), jnp.where(is_point, at, -jnp.inf).max(1)))
+        low, high = values.min(2), values.max(2)
+        others.append((jnp.where(is_real, low, jnp.inf).min(1), jnp.where(is_real, high, -jnp.inf).max(1)))
+    return box_gaps(own, others) < radius**2
 
 
-def _cell_key(cell: Int[Array, "... 3"]) -> Int[Array, ...]:
-    """Return one number per cell; cells that differ in the last coordinate alone are in sequence."""
-    cell = jnp.clip(cell, 0, _CELLS_PER_SIDE - 1)
-    return (cell[..., 0] * _CELLS_PER_SIDE + cell[..., 1]) * _CELLS_PER_SIDE + cell[..., 2]
+def _face_table(cloth: _Cloth) -> _FaceTable:
+    """Return the planes of every face; none is within reach of faces without area."""
+    garment = cloth.garment
 
+    def plane(normal: Array, through: Array) -> Array:
+        return jnp.concatenate([normal, jnp.sum(normal * through, axis=0, keepdims=True)])
 
-def _sort_faces(centroid: Vector3, is_real: Bool[Array, " faces"], cell_size: Array) -> _Grid:
-    """Sort faces by cell; padded faces come last, in a cell of their own."""
-    points = jnp.stack(centroid, axis=-1)
-    origin = jnp.min(jnp.where(is_real[:, None], points, jnp.inf), axis=0)
-    cell = jnp.floor((points - origin[None]) / cell_size).astype(jnp.int32) + 1
-    key = jnp.where(is_real, _cell_key(cell), _CELLS_PER_SIDE**3)
-    order = jnp.argsort(key)
-    return _Grid(key[order], order, origin, cell_size)
-
-
-def _listed_faces(
-    position: Float[Array, "points 3"], grid: _Grid, capacity: int
-) -> tuple[Int[Array, "points listed"], Bool[Array, "points listed"], Int[Array, ""]]:
-    """Return the faces in the 27 cells around every point, which slots are real, and the longest column."""
-    cell = jnp.floor((position - grid.origin[None]) / grid.cell_size).astype(jnp.int32) + 1
-    steps = jnp.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], jnp.int32)
-    columns = cell[:, None, :] + jnp.pad(steps, ((0, 0), (0, 1)))[None]  # [points, 9, 3]
-    up = jnp.array([[[0, 0, 1]]], jnp.int32)
-    first = jnp.searchsorted(grid.keys, _cell_key(columns - up), side="left")
-    last = jnp.searchsorted(grid.keys, _cell_key(columns + up), side="right")
-    slot = first[..., None] + jnp.arange(capacity, dtype=first.dtype)[None, None]  # [points, 9, capacity]
-    is_listed = slot < last[..., None]
-    faces = grid.faces[jnp.minimum(slot, grid.faces.shape[0] - 1)]
-    num_points = position.shape[0]
-    return (
-        faces.reshape(num_points, -1),
-        is_listed.reshape(num_points, -1),
-        jnp.max(last - first),
+    here, ahead = (
+        [jnp.stack(take3(components(x), garment.faces[:, k])) for k in range(3)]
+        for x in (cloth.position, cloth.predicted)
     )
 
+    def upright(corners: list[Array]) -> Array:
+        return safe_normalize(jnp.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0)
 
-def _is_pair(
-    point: Int[Array, " rows"],
-    face: Int[Array, " rows"],
+    normal = upright(here)
+    own = plane(normal, here[0])
+    is_flat = (garment.rest_areas <= 0) | (jnp.sum(normal * normal, axis=0) == 0)
+    planes = [own.at[3].set(jnp.where(is_flat, jnp.inf, own[3])), plane(upright(ahead), ahead[0])]
+    for k in range(3):
+        inwards = jnp.cross(normal, here[(k + 1) % 3] - here[k], axis=0)
+        planes.append(plane(safe_normalize(inwards, axis=0), here[k]))
+    blocks = garment.face_blocks.T
+    in_blocks = jnp.moveaxis(jnp.stack(planes)[:, :, blocks], 2, 0)
+    return _FaceTable(in_blocks, jnp.moveaxis(garment.faces.T[:, blocks], 1, 0))
+
+
+def _candidates(
+    ids: Int[Array, "pairs rows"],
+    faces: Int[Array, " pairs"],
     points: _Points,
-    cloth: _Cloth,
-    radius: float,
-) -> tuple[Bool[Array, " rows"], Float[Array, "rows 3"], Float[Array, " rows"]]:
-    """Return which rows are pairs, the barycentric weights of the nearest place, and the point's side."""
-    corner = cloth.garment.faces[face]
-    here = _gather(points.position, point)
-    a, b, c = (_gather(cloth.position, corner[:, k]) for k in range(3))
+    table: _FaceTable,
+    scope: tuple[float, bool],
+) -> Int[Array, "pairs rows"]:
+    """Return for every point which faces of a block may be its partners, as bits.
+
+    The point stands over the face: sideways it is beyond no edge by more than its slope allows. It is near, or
+    comes near. Faces that hold it are no partners.
+
+    Args:
+        ids: Points.
+        faces: A block of faces for each row of points.
+        points: Where they are.
+        table: Of the faces.
+        scope: Radius of the search [m], and whether the points are vertices of the faces.
+    """
+    radius, has_points = scope
+    at, ahead = take3(components(points.position), ids), take3(components(points.predicted), ids)
+    is_point = points.mask[ids]
+
+    def add_member(k: Array, words: Int[Array, "pairs rows"]) -> Int[Array, "pairs rows"]:
+        planes, corners = table.planes[k][..., faces], table.corners[k][:, faces]
+
+        def height(number: int, point: Vector3) -> Array:
+            x, y, z, offset = planes[number][:, :, None]
+            return dot3(point, (x, y, z)) - offset
+
+        now = height(0, at)
+        size = jnp.abs(now)
+        later = jnp.where(now < 0, -1.0, 1.0) * height(1, ahead)
+        is_kept = is_point & (size < radius + _SLACK)
+        is_kept = is_kept & ((size < _NEAR + _SLACK) | (later < _NEAR + _SLACK))
+        for side in (2, 3, 4):
+            is_kept = is_kept & (height(side, at) >= -_MAX_SLOPE * size - _SLACK)
+        if has_points:
+            for corner in corners:
+                is_kept = is_kept & (corner[:, None] != ids)
+        return words | jnp.where(is_kept, jnp.left_shift(jnp.int32(1), k), 0)
+
+    # In a loop: XLA would gather the planes anew for every point in a longer function.
+    members = table.planes.shape[0]
+    return jax.lax.fori_loop(0, members, add_member, jnp.zeros(ids.shape, jnp.int32))
+
+
+def _exactly(
+    point: Int[Array, " rows"], face: Int[Array, " rows"], points: _Points, cloth: _Cloth, radius: float
+) -> FacePairs:
+    """Return candidates with the place on the face and the side; the side is zero where they are no pair."""
+    garment = cloth.garment
+    corner = garment.faces[face]
+    here = take3(components(points.position), point)
+    a, b, c = (take3(components(cloth.position), corner[:, k]) for k in range(3))
     squared, u, v = point_triangle(here, a, b, c)
     weights = (1.0 - u - v, u, v)
     height, size = _height(here, (a, b, c), weights)
-    moved = [_gather(cloth.predicted, corner[:, k]) for k in range(3)]
-    predicted_height, _ = _height(_gather(points.predicted, point), moved, weights)
+    moved = [take3(components(cloth.predicted), corner[:, k]) for k in range(3)]
+    predicted_height, _ = _height(take3(components(points.predicted), point), moved, weights)
     side = jnp.where(height < 0, -1.0, 1.0).astype(squared.dtype)
     is_over = jnp.abs(height) >= _MIN_COSINE * jnp.sqrt(squared)
     is_reached = (squared < _NEAR**2) | (side * predicted_height < _NEAR)
     is_pair = (squared < jnp.square(radius)) & is_over & is_reached & (size > 0)
-    if points.is_cloth:
-        is_pair = is_pair & ~jnp.any(corner == point[:, None], axis=1)
-    return is_pair, jnp.stack(weights, axis=-1), side
-
-
-def _gather(x: Float[Array, "vertices 3"], rows: Int[Array, " rows"]) -> Vector3:
-    """Return rows of `x` by components."""
-    return x[rows, 0], x[rows, 1], x[rows, 2]
+    if cloth.has_points:
+        is_pair = is_pair & ~_is_around(point, corner, garment)
+    return FacePairs(
+        vertices=point,
+        corners=corner,
+        weights=jnp.stack(weights, axis=-1),
+        side=jnp.where(is_pair, side, 0.0),
+        areas=points.areas[point],
+        count=jnp.int32(0),
+        status=jnp.int32(Status.OK),
+    )
 
 
 def _height(point: Vector3, corners, weights) -> tuple[Array, Array]:

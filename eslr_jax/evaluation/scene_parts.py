@@ -69,7 +69,12 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     sort("damping", scene.damping is not None, f"{float(scene.damping or 0.0):g} s", "not asked for")
     if scene.energies:
         modelled["own terms"] = f"{len(scene.energies)}"
-    sort("self-contact", scene.self_contact is not None, "layers of cloth keep apart", "not asked for")
+    sort(
+        "self-contact",
+        scene.self_contact is not None,
+        "layers of cloth keep apart",
+        "one piece, or pieces that don't meet; see --self-contact",
+    )
     varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
     sort("network", config.model is not None, "before the solver", "solver alone")

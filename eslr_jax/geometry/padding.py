@@ -12,6 +12,7 @@ from eslr_jax.errors import CapacityError
 from eslr_jax.types import Garment
 
 BLOCK = 8  # vertices that a search handles together, see `Garment.vertex_blocks`
+FACE_BLOCK = 16  # likewise faces; at most 32
 STEPS_PER_OCTAVE = 16  # a size is rounded up by at most a sixteenth
 
 
@@ -121,9 +122,12 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     padded["hinge_incidence"] = _pad_incidence(
         leaves["hinge_incidence"], 4, (have.hinges, bucket.hinges), (bucket.vertices, bucket.hinge_degree)
     )
-    blocks = leaves["vertex_blocks"]
-    spare = -(-bucket.vertices // BLOCK) - len(blocks)
-    padded["vertex_blocks"] = np.pad(blocks, ((0, spare), (0, 0)), constant_values=bucket.vertices - 1)
+    for name, size, count in (
+        ("vertex_blocks", BLOCK, bucket.vertices),
+        ("face_blocks", FACE_BLOCK, bucket.faces),
+    ):
+        spare = -(-count // size) - len(leaves[name])
+        padded[name] = np.pad(leaves[name], ((0, spare), (0, 0)), constant_values=count - 1)
     return dataclasses.replace(garment, **padded)
 
 

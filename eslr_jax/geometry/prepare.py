@@ -14,7 +14,7 @@ from eslr_jax.errors import MeshError
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
 from eslr_jax.geometry.groups import compact_groups
-from eslr_jax.geometry.padding import BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
+from eslr_jax.geometry.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
 from eslr_jax.geometry.validate import validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 
@@ -95,6 +95,7 @@ def prepare_garment(
         face_incidence=topology.incidence_table(faces, num_vertices),
         hinge_incidence=topology.incidence_table(hinges, num_vertices),
         vertex_blocks=compact_groups(positions, BLOCK),
+        face_blocks=compact_groups(positions[faces].mean(axis=1), FACE_BLOCK),
         edge_mask=np.ones(len(senders), bool),
         vertex_mask=np.ones(num_vertices, bool),
         geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode),

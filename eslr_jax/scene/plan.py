@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.contact.self_contact import SEARCH_RADIUS, starting_capacity
 from eslr_jax.errors import MotionError
 from eslr_jax.fit.postures import SHOULDERS
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
@@ -28,7 +28,7 @@ from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
 REACH = 0.08
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
-_SAMPLED_FRAMES = 12  # frames in which the reachable faces are looked for
+_SAMPLED_FRAMES = 12  # frames in which reachable faces, and pieces that meet, are looked for
 _build = jax.jit(build_scene)
 _skin = jax.jit(skin_garment)
 
@@ -40,7 +40,7 @@ class SceneOptions:
     reach: float = REACH  # [m], besides how far the garment hangs from the body at rest
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
-    self_contact: bool = False  # keep layers of cloth apart
+    self_contact: bool | None = None  # keep layers of cloth apart; None: where two pieces can meet
     has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
     integrator: Integrator = "euler"
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
@@ -62,6 +62,10 @@ def plan_scene(
 ) -> ScenePlan:
     """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
+    Self-contact is modelled where two pieces come close to each other; within one piece it has to be asked for.
+    Its buffer starts small, since `simulate` enlarges it. A pure `rollout` needs `default_capacity` in its place,
+    or a look at the trajectory's status.
+
     Args:
         garment: A prepared garment.
         poses: The body in motion.
@@ -78,23 +82,28 @@ def plan_scene(
     if num_frames < 2:
         raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
     skinned, radii = np.empty(0), np.empty(0)
+    pieces, has_layers = count_pieces(garment), options.self_contact
+    is_undecided = has_layers is None and pieces > 1
     needs_surface = options.has_body and surface is None
-    if needs_surface or (options.has_body and options.ground == "auto"):
+    needs_ground = options.has_body and options.ground == "auto"
+    if is_undecided or needs_surface or needs_ground:
         skinned = np.asarray(_skin(garment, poses.joint_transforms))
         radii = options.reach + _looseness(garment, poses)
+    if is_undecided:
+        has_layers = pieces_meet(garment, skinned)
     if not options.has_body:
         surface = None
     elif surface is None:
         surface = _surface_near(reachable_vertices(garment, skinned, poses, radii), poses)
     has_ground = options.ground == "on"
-    if options.has_body and options.ground == "auto":
+    if needs_ground:
         has_ground = _could_fall(garment, poses) or _reaches_ground(garment, skinned, poses, radii)
     return ScenePlan(
         surface=surface,
         constants=constants or PhysicsConstants(),
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
-        self_contact=default_capacity(garment.vertex_mask.shape[0]) if options.self_contact else None,
+        self_contact=starting_capacity(garment.vertex_mask.shape[0], pieces) if has_layers else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
@@ -142,8 +151,8 @@ def prepare_scenes(
 ) -> list[Scene]:
     """Return scenes that can be stacked: padded to one bucket, over one part of the body.
 
-    What one of them needs, all of them model: pins, a ground, and the body faces near any garment at rest,
-    whatever the motion. Other motions of the same garments then run the same compiled rollout.
+    What one of them needs, all of them model: pins, self-contact, a ground, and the body faces near any garment
+    at rest, whatever the motion. Other motions of the same garments then run the same compiled rollout.
 
     Args:
         garments: Unpadded garments of like sizes.
@@ -167,8 +176,10 @@ def prepare_scenes(
         plans = [
             plan.replace(ground=ground_height(motion)) for plan, motion in zip(plans, poses, strict=True)
         ]
+    capacities = [plan.self_contact for plan in plans if plan.self_contact is not None]
+    layers = max(capacities, key=lambda capacity: capacity.pairs, default=None)
     return [
-        _build(garment, motion, material, plan.replace(has_pins=has_pins))
+        _build(garment, motion, material, plan.replace(has_pins=has_pins, self_contact=layers))
         for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
     ]
 
@@ -186,13 +197,13 @@ def ground_height(poses: BodyMotion) -> Float[Array, ""]:
 
 def _could_fall(garment: Garment, poses: BodyMotion) -> bool:
     """Tell whether a part of a garment has no pin, and no cloth above the shoulders that it could hang from."""
-    rest, body = np.asarray(garment.rest_positions), np.asarray(poses.rest_positions)[:, 1]
+    is_real = np.asarray(garment.vertex_mask)
+    height = np.asarray(garment.rest_positions)[is_real, 1]
+    body = np.asarray(poses.rest_positions)[:, 1]
     shoulders = body.min() + SHOULDERS * np.ptp(body)
-    is_real, is_pinned = np.asarray(garment.vertex_mask), np.asarray(garment.is_pinned)
-    faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
-    _, part = vertex_components(faces, len(rest))
-    is_held = is_pinned | (rest[:, 1] > shoulders)
-    return bool(np.setdiff1d(part[is_real], part[is_held]).size)
+    piece = _piece_of_vertices(garment)
+    is_held = np.asarray(garment.is_pinned)[is_real] | (height > shoulders)
+    return bool(np.setdiff1d(piece, piece[is_held]).size)
 
 
 def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray) -> bool:
@@ -206,6 +217,34 @@ def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, ra
 def _sampled(num_frames: int) -> np.ndarray:
     """Return the frames that are looked at to decide what is modelled."""
     return np.unique(np.linspace(0, num_frames - 1, _SAMPLED_FRAMES).astype(int))
+
+
+def count_pieces(garment: Garment) -> int:
+    """Return how many pieces of cloth a garment consists of, which no edge joins."""
+    return int(_piece_of_vertices(garment).max()) + 1
+
+
+def _piece_of_vertices(garment: Garment) -> np.ndarray:
+    """Return the piece of every real vertex."""
+    faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
+    return vertex_components(faces, int(np.sum(garment.vertex_mask)))[1]
+
+
+def pieces_meet(garment: Garment, skinned: np.ndarray) -> bool:
+    """Return whether two pieces of a garment come close enough to touch, in a sample of skinned frames.
+
+    Args:
+        garment: A garment of several pieces.
+        skinned: Positions [m], shape [frames, vertices, 3].
+    """
+    piece, is_real = _piece_of_vertices(garment), np.asarray(garment.vertex_mask)
+    for frame in _sampled(len(skinned)):
+        points = np.asarray(skinned[frame])[is_real]
+        for number in range(1, piece.max() + 1):
+            one, others = points[piece == number], points[piece < number]
+            if np.isfinite(cKDTree(others).query(one, distance_upper_bound=SEARCH_RADIUS)[0]).any():
+                return True
+    return False
 
 
 def reachable_vertices(

@@ -135,7 +135,9 @@ def _body_contact(
         cloth = (problem.position, problem.inertial_guess)
         skin = find_skin_contacts(cloth, (step.start, step.end), nearest, body.surface, garment)
     if body.is_sharp:
-        pairs = find_tip_contacts(problem.position, problem.inertial_guess, step.start, step.end, garment)
+        pairs = find_tip_contacts(
+            problem.position, problem.inertial_guess, *step, body.surface.patch_vertices, garment
+        )
         tips = TipContact(pairs, step.end)
     return BodyContact(
         nearest=nearest,

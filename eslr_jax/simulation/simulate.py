@@ -22,7 +22,7 @@ from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
 
-_HEADROOM = 1.25  # of a buffer made larger: with it, cloth moves on a little differently and may need more
+_HEADROOM = 1.5  # of a buffer made larger: later frames may need more, and every size compiles anew
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
 Pace = Callable[[int, float], int]
@@ -85,7 +85,9 @@ def simulate(
         trajectory, timing = _in_chunks(
             jax.tree.map(jnp.asarray, params), scene, config, _Loop(pace, on_frames, is_stopping), done
         )
-        larger, done = None if is_stopping() else enlarge_buffers(scene, trajectory), None
+        larger = None if is_stopping() else enlarge_buffers(scene, trajectory)
+        kept = good_frames(trajectory)
+        done = kept if kept.num_frames > 1 else None  # what fitted stands; rows without a pair change nothing
     if raises:
         raise_for_status(trajectory)
     return Simulation(trajectory, timing, scene)
@@ -207,7 +209,7 @@ def _compile(config: SimConfig, structure: Any, shapes: tuple) -> Callable:
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
     """Return the scene with larger buffers where a rollout had too little room for self-contact, else None.
 
-    A buffer gets what the fullest frame asked for and a quarter more.
+    The buffer gets what the fullest frame asked for and half as much again.
 
     Args:
         scene: The scene that was simulated.
@@ -220,19 +222,10 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
         or scene.self_contact is None
     ):
         return None
-    pairs, faces = _peak_demand(trajectory.pair_demand)
-    before = scene.self_contact
-    capacity = PairCapacity(
-        pairs=math.ceil(_HEADROOM * pairs) if pairs > before.pairs else before.pairs,
-        faces=math.ceil(_HEADROOM * faces) if faces > before.faces else before.faces,
-    )
-    return None if capacity == before else scene.replace(self_contact=capacity)
-
-
-def _peak_demand(demand: Int[Array, "frames 2"]) -> tuple[int, int]:
-    """Return what the fullest frame asked for: pairs and faces."""
-    pairs, faces = np.max(np.asarray(demand), axis=0)
-    return int(pairs), int(faces)
+    pairs = int(np.max(np.asarray(trajectory.pair_demand)))
+    if pairs <= scene.self_contact.pairs:
+        return None
+    return scene.replace(self_contact=PairCapacity(pairs=math.ceil(_HEADROOM * pairs)))
 
 
 def good_frames(trajectory: Trajectory) -> Trajectory:
@@ -279,8 +272,7 @@ def raise_for_status(trajectory: Trajectory) -> None:
         return
     message = f"frame {int(trajectory.first_bad_frame)}: {status.describe()}"
     if Status.SELF_CONTACT_OVERFLOW in status and trajectory.pair_demand is not None:
-        pairs, faces = _peak_demand(trajectory.pair_demand)
-        message += f": {pairs} pairs and {faces} faces or more"
+        message += f": {int(np.max(np.asarray(trajectory.pair_demand)))} pairs or more"
     error: type[EslrError] = CapacityError
     if Status.NON_FINITE in status:
         error = NonFiniteError

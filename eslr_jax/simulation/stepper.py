@@ -28,7 +28,7 @@ class FrameReport(NamedTuple):
     terms: PotentialTerms  # energies that it ended with [J]
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
-    pair_demand: Int[Array, " capacities"] | None  # see Trajectory
+    pair_demand: Int[Array, ""] | None  # see Trajectory
 
 
 MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
@@ -72,7 +72,7 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
             terms=potential_terms(position, problem),
             residual=residual,
             iterations=minimum.iterations,
-            pair_demand=_pair_demand(problem),
+            pair_demand=None if problem.layers is None else problem.layers.pairs.count,
         )
         return next_state(position, problem, state, status, residual), report
 
@@ -105,13 +105,6 @@ def find_start(
         guess = initial_guess(problem)
     # A solver that starts elsewhere would hide a prediction that is not a number.
     return Start(point, guess.inertial_energy, prediction.previous), _finiteness(prediction.position)
-
-
-def _pair_demand(problem: FrameProblem) -> Int[Array, " capacities"] | None:
-    """Return the capacities that self-contact needed, for pairs and for faces in a search column."""
-    if problem.layers is None:
-        return None
-    return jnp.stack([problem.layers.pairs.count, problem.layers.pairs.listed])
 
 
 def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:

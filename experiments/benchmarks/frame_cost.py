@@ -40,7 +40,7 @@ from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parents[1] / "results"
-SIZES = ("1k", "4k", "10k")
+SIZES = ("1k", "4k", "10k", "50k")
 CLIP = "cmu_016_32"
 FRAMES = 12  # simulated before the one that is timed
 ITERATIONS = 20  # of the whole frame, as in scene_needs.py

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
-from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.contact.self_contact import starting_capacity
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
@@ -246,5 +246,5 @@ def make_scene(
         body=obstacle,
         pin_targets=pins,
         num_frames=num_frames,
-        self_contact=default_capacity(len(start)) if self_contact else None,
+        self_contact=starting_capacity(len(start)) if self_contact else None,
     )

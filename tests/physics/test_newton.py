@@ -112,7 +112,6 @@ def one_pair(case):
         side=np.array([-1.0, 0.0]),
         areas=np.asarray(case.problem.garment.vertex_areas)[vertices],
         count=np.int32(1),
-        listed=np.int32(1),
         status=np.int32(0),
     )
 

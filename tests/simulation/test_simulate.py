@@ -155,10 +155,10 @@ def crossing_sheets():
 @pytest.mark.slow
 def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     scene = crossing_sheets()
-    few = scene.replace(self_contact=PairCapacity(pairs=20, faces=scene.self_contact.faces))
+    few = scene.replace(self_contact=PairCapacity(pairs=20))
     short = rollout_scene(None, few, SOLVER)
     assert Status.SELF_CONTACT_OVERFLOW in Status(int(short.status))
-    with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ pairs and \d+ faces or more"):
+    with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ pairs or more"):
         raise_for_status(short)
     assert enlarge_buffers(few, short).self_contact.pairs > 20
     found = simulate(None, few, config=SOLVER)
@@ -168,13 +168,13 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     assert enlarge_buffers(scene, expected) is None
 
 
-def test_buffers_grow_to_what_the_fullest_frame_asked_for_and_a_quarter_more(scene, whole):
-    tight = scene.replace(self_contact=PairCapacity(pairs=20, faces=96))
-    demand = jnp.array([[0, 0]] * 5 + [[40, 12]] + [[10, 3]] * 8)
+def test_buffers_grow_to_what_the_fullest_frame_asked_for_and_half_as_much_again(scene, whole):
+    tight = scene.replace(self_contact=PairCapacity(pairs=20))
+    demand = jnp.array([0] * 5 + [40] + [10] * 8)
     full = whole.replace(pair_demand=demand, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
-    assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=50, faces=96)
+    assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=60)
     assert enlarge_buffers(tight, full.replace(status=jnp.int32(Status.OK))) is None
-    with pytest.raises(CapacityError, match="40 pairs and 12 faces or more"):
+    with pytest.raises(CapacityError, match="40 pairs or more"):
         raise_for_status(full)
 
 

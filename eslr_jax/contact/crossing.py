@@ -1,0 +1,110 @@
+"""On which side a vertex belongs of a face that its own cloth already passes through."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, sub3, take3, vertex_normals
+from eslr_jax.types import Garment
+
+# Of a direction along a normal (cosine) at rest, below which it says nothing. A T-shirt's sleeve and trunk, which
+# cross at the armpit where an arm hangs down, have .2 to 1.2 for the sum of both.
+_LEAST_COSINE = 0.2
+_FACE_PER_EDGE = 3**0.5 / 4  # area of an equilateral triangle over its squared edge
+
+
+def sides_where_crossed(
+    position: Float[Array, "vertices 3"],
+    pairs: tuple[Int[Array, " pairs"], Int[Array, "pairs 3"], Float[Array, "pairs 3"]],
+    side: Float[Array, " pairs"],
+    garment: Garment,
+    radius: float,
+) -> Float[Array, " pairs"]:
+    """Return the sides of pairs; near cloth that passes through cloth they are those of the rest mesh.
+
+    Elsewhere layers are in order, and stay as they are. Where they cross, whatever keeps them so would lock them
+    together. A pair that the rest mesh says nothing about is left out there: its cloth may slide free.
+
+    Args:
+        position: Vertices [m].
+        pairs: Vertices, corners of faces, and barycentric weights of the places on the faces.
+        side: 1 in front of the face, -1 behind, 0 where a row is not used.
+        garment: Rest mesh.
+        radius: Distance along the cloth from where it crosses [m].
+    """
+    vertices, corners, weights = pairs
+    is_crossed = (side != 0) & _are_crossed(position, vertices, corners, garment)
+    marks = jnp.zeros(position.shape[0], bool)
+    marks = marks.at[vertices].max(is_crossed).at[corners].max(is_crossed[:, None])
+    is_real = garment.rest_areas > 0
+    area = jnp.sum(garment.rest_areas) / jnp.maximum(jnp.sum(is_real, dtype=garment.rest_areas.dtype), 1.0)
+    rings = jnp.ceil(radius / jnp.sqrt(jnp.maximum(area / _FACE_PER_EDGE, 1e-12))).astype(jnp.int32)
+    marks = jax.lax.fori_loop(0, rings, lambda _, m: m | jnp.any(m[garment.neighbors], axis=1), marks)
+    is_near = marks[vertices] | jnp.any(marks[corners], axis=1)
+    return jnp.where(is_near & (side != 0), _sides_at_rest(vertices, corners, weights, garment), side)
+
+
+def _sides_at_rest(
+    vertices: Int[Array, " pairs"],
+    corners: Int[Array, "pairs 3"],
+    weights: Float[Array, "pairs 3"],
+    garment: Garment,
+) -> Float[Array, " pairs"]:
+    """Return the sides of pairs in the rest mesh, zero where they are not clear.
+
+    Along the line from the face to the vertex: in front where the normals look at each other, behind where they
+    look away from each other. Layers that look the same way are on the side that the line points to.
+    """
+    rest = components(garment.rest_positions)
+    a, b, c = (take3(rest, corners[:, k]) for k in range(3))
+    foot = jnp.sum(weights[None] * jnp.stack([jnp.stack(corner) for corner in (a, b, c)], axis=-1), axis=-1)
+    x, y, z = safe_normalize(jnp.stack(take3(rest, vertices)) - foot, axis=0)
+    face = safe_normalize(jnp.stack(cross3(sub3(b, a), sub3(c, a))), axis=0)
+    normals = vertex_normals(garment.rest_positions, garment.faces, garment.face_incidence)
+    at_face = dot3((x, y, z), (face[0], face[1], face[2]))
+    at_vertex = dot3((x, y, z), take3(components(normals), vertices))
+    is_stacked = at_face * at_vertex > _LEAST_COSINE**2
+    clearness = jnp.where(is_stacked, at_face, at_face - at_vertex)
+    return jnp.where(jnp.abs(clearness) > _LEAST_COSINE, jnp.sign(clearness), 0.0)
+
+
+def _are_crossed(
+    position: Float[Array, "vertices 3"],
+    vertices: Int[Array, " pairs"],
+    corners: Int[Array, "pairs 3"],
+    garment: Garment,
+) -> Bool[Array, " pairs"]:
+    """Return where an edge of the vertex pierces the face, or an edge of the face a face of the vertex."""
+    x = components(position)
+    face = [take3(x, corners[:, k, None]) for k in range(3)]
+    ends = garment.neighbors[vertices]  # [pairs, degree], padded with the vertex itself
+    is_apart = ~jnp.any(ends[:, :, None] == corners[:, None, :], axis=2)
+    pierced = is_apart & _pierces(take3(x, vertices[:, None]), take3(x, ends), face)
+    slots = garment.face_incidence[vertices]
+    around = garment.faces[slots % garment.faces.shape[0]]  # [pairs, degree, 3]
+    is_real = slots < garment.faces.size
+    faces = [take3(x, around[:, :, k]) for k in range(3)]
+    crossed = jnp.any(pierced, axis=1)
+    for k in range(3):
+        first, second = corners[:, k, None], corners[:, (k + 1) % 3, None]
+        is_apart = is_real & ~jnp.any((around == first[:, None]) | (around == second[:, None]), axis=2)
+        pierced = is_apart & _pierces(take3(x, first), take3(x, second), faces)
+        crossed = crossed | jnp.any(pierced, axis=1)
+    return crossed
+
+
+def _pierces(start: Vector3, end: Vector3, corners: list[Vector3]) -> Bool[Array, ...]:
+    """Return which segments pass through which triangles."""
+    a, b, c = corners
+    normal = cross3(sub3(b, a), sub3(c, a))
+    before, after = dot3(sub3(start, a), normal), dot3(sub3(end, a), normal)
+    is_inside = before * after < 0
+    span = before - after
+    share = before / jnp.where(span == 0, 1.0, span)
+    x, y, z = (u + share * (v - u) for u, v in zip(start, end, strict=True))
+    for first, second in ((a, b), (b, c), (c, a)):
+        inwards = dot3(cross3(sub3(second, first), sub3((x, y, z), first)), normal)
+        is_inside = is_inside & (inwards >= 0)
+    return is_inside
