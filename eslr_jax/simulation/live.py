@@ -11,6 +11,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
+from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, without_tracks
@@ -73,6 +74,8 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
         has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), energies=(Partial(_pull, no_hand()),)
     )
     scene = prepare_scene(garment, poses, material=material, options=options)
+    if scene.self_contact is not None:  # nobody enlarges its buffers here
+        scene = scene.replace(self_contact=default_capacity(garment.vertex_mask.shape[0]))
     inputs = frame_inputs(scene)
     back = (
         inputs
