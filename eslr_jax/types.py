@@ -196,7 +196,7 @@ class Air:
 
     # Velocity [m/s], shape [3]; or a function of points [m], shape [points, 3], and the time since the first
     # frame [s] to velocities, shape [points, 3] or [3], such as `physics.air.gusts`.
-    wind: Float[Array, " 3"] | Partial
+    wind: Float[Array, " 3"] | tuple[float, float, float] | Partial
     density: Float[Array, ""] | float = 1.2  # [kg/m^3], at 20 degrees and sea level
     normal_drag: Float[Array, ""] | float = 1.17  # of a square plate across the flow (Hoerner 1965, 3-15)
     tangential_drag: Float[Array, ""] | float = (

@@ -105,7 +105,7 @@ def blowing(wind: Sequence[float] | None, gust: float = 0.0) -> Air | None:
         ConfigError: There are gusts without a wind, or their strength is negative.
     """
     if not gust:
-        return None if wind is None else Air(wind)  # type: ignore[arg-type]: a sequence, until it is checked
+        return None if wind is None else Air(tuple(wind))  # type: ignore[arg-type]: of any length, until checked
     if wind is None or not gust > 0:
         raise ConfigError(
             f"gusts of {gust:g} need a wind, and a strength above 0; give both, such as 3 0 0 and 0.3"

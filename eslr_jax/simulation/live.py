@@ -91,7 +91,7 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
 
 def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
-    air = stage.constant.air.replace(wind=jnp.asarray(wind, jnp.float32))
+    air = Air(jnp.asarray(wind, jnp.float32))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
     constant = stage.constant.replace(material=material, air=air, energies=(Partial(_pull, hand),))
     return stage._replace(constant=constant)
