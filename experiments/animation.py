@@ -28,8 +28,8 @@ CLIP = "cmu_069_23"
 WORN = (
     ("tshirt", "jersey", (0.30, 0.50, 0.70)),
     ("dress", "satin", (0.70, 0.28, 0.36)),
-    ("longsleeve", "cotton", (0.36, 0.58, 0.42)),
-    ("pants", "suiting", (0.36, 0.36, 0.55)),
+    ("longsleeve", "ponte", (0.36, 0.58, 0.42)),
+    ("pants", "cotton", (0.36, 0.36, 0.55)),
 )
 _FRAMES, _EVERY = 91, 2  # of the motion, simulated; and shown, one in so many
 _SIZE = (190, 340)  # of one garment, width and height [pixels]
