@@ -46,6 +46,7 @@ from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
 
 DEFAULT_MOTION = "cmu_016_32"
+DEFAULT_MODEL = "eslr-small"
 START_MODEL = "smooth-small"  # the network that was trained to give the solver an initial guess
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
 _REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices, see `geometry.refine`
@@ -402,4 +403,4 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
 
 def default_model() -> str:
     """Return the name of the model that `eslr simulate` uses when none is named."""
-    return asset_names("model")[0]
+    return DEFAULT_MODEL
