@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from eslr_jax.assets.cache import cached_arrays, content_key
-from eslr_jax.assets.catalog import asset_names, find_asset
+from eslr_jax.assets.catalog import find_asset
 from eslr_jax.body.motion import Motion, shape_body
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_body, make_motion, skeleton_motion

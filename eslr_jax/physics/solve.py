@@ -30,8 +30,7 @@ from eslr_jax.physics.problem import FrameProblem
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
 # Residual of the linear system to reach, relative to its right side, and the most iterations. In float32 1e-4
-# leaves less than 1 % of a T-shirt's gradient through five frames, 1e-3 leaves 3 %
-# (experiments/inverse/accuracy.py).
+# puts a T-shirt's gradient through five frames off by 0.7 %, 1e-3 by 3 % (experiments/inverse/accuracy.py).
 _LINEAR_STOP = {"float32": (1e-4, 500), "float64": (1e-9, 3000)}
 _LINEAR_STALL = 1e-2  # residual above which the derivative is refused
 

@@ -50,7 +50,10 @@ def test_a_foreign_garment_is_worn_on_a_foreign_motion(tmp_path, worn, slip, mot
     loop = ("--loop", 40) if motion.startswith("makehuman") else ()  # it has 17 frames
     report, run = worn(path, tmp_path / "run", "--motion", motions / motion, *loop, frames=40)
     cloth, wearer = run["positions"], run["body_positions"]
-    assert abs(slip(run)) < 0.05, "it falls off"
+    above = cloth[..., 1].mean(axis=1) - wearer[..., 1].mean(axis=1)
+    assert abs(above[-1] - above[0]) < 0.1, "it falls off"
+    # A poncho lies on arms that move; the others have a top that stays where it is.
+    assert shape is poncho or abs(slip(run)) < 0.05, "it slips"
     assert np.ptp(wearer[0, :, 1]) * 0.9 > cloth[0, :, 1].max() - wearer[0, :, 1].min(), "it is on the head"
     assert np.linalg.norm(np.diff(cloth, axis=0), axis=-1).max() < 0.3, "it jumps"
     warnings = " ".join(describe_report(report).warnings)

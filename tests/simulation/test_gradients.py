@@ -306,7 +306,7 @@ def test_a_hundred_frames_have_right_gradients_in_the_memory_of_their_states():
 
 @pytest.mark.slow
 def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshirt, body):
-    """Five frames of a walk at 1k vertices; here contacts may switch."""
+    """Five frames of a walk at 1k vertices; contacts switch within steps ten times as large."""
     with jax.enable_x64(False):
         poses = pose_body(body, load_motion("cmu_016_32"), num_frames=6)
         scene = prepare_scene(tshirt, poses)
@@ -332,9 +332,9 @@ def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshir
 
     zeros = dict.fromkeys(("fabric", "body", "rest"), jnp.zeros(()))
     gradient = jax.jit(jax.grad(loss))(zeros)
-    for name, step in (("fabric", 1e-3), ("body", 1e-5), ("rest", 1e-4)):
+    for name, step in (("fabric", 1e-4), ("body", 1e-6), ("rest", 1e-5)):
         ends = [float(loss({**zeros, name: jnp.asarray(sign * step)})) for sign in (1.0, -1.0)]
-        assert float(gradient[name]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02), name
+        assert float(gradient[name]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=2e-3), name
 
 
 BY_A_COUNT = """
