@@ -68,7 +68,7 @@ def fallen(tmp_path_factory, eslr):
     path = write_obj(folder / "skirt.obj", skirt())
     fit = eslr("fit", path, "--pin", "none", "--out", folder / "skirt.npz", "--no-picture")
     assert fit.returncode == 0, fit.stderr
-    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--no-pictures")
+    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--settle", 0, "--no-pictures")
     done = eslr("simulate", "--garment", folder / "skirt.npz", *words, "--out", folder / "run")
     assert done.returncode == 0, done.stderr
     with np.load(folder / "run" / "trajectory.npz") as arrays:
@@ -145,7 +145,18 @@ def test_a_skirt_flies_in_the_wind_and_its_gap_is_that_of_the_windy_frames(eslr,
 
 def test_a_run_without_ground_falls_below_the_feet(fallen, eslr, tmp_path):
     folder, _, _ = fallen
-    words = ("--simulator", "physics", "--iterations", 20, "--frames", 61, "--no-pictures", "--json")
+    words = (
+        "--simulator",
+        "physics",
+        "--iterations",
+        20,
+        "--frames",
+        61,
+        "--settle",
+        0,
+        "--no-pictures",
+        "--json",
+    )
     garment = ("--garment", folder.parent / "skirt.npz", "--ground", "off")
     result = eslr("simulate", *garment, *words, "--out", tmp_path)
     report = json.loads(result.stdout)
