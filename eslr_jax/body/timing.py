@@ -119,6 +119,18 @@ def _level_turn(end: NDArray, start: NDArray) -> Rotation:
     return Rotation.from_euler("y", np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2]))
 
 
+def check_length(poses: BodyMotion) -> None:
+    """Check that a body in motion has frames to simulate.
+
+    Raises:
+        MotionError: It has fewer than two.
+    """
+    if len(poses.joint_transforms) < 2:
+        raise MotionError(
+            f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
+        )
+
+
 def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
     """Return a moving body with frames before its first, in which a garment comes to rest on it.
 
@@ -130,13 +142,12 @@ def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
         num_frames: Number of frames to put before it; drop as many from the result.
 
     Raises:
-        MotionError: The number is negative.
+        MotionError: The number is negative, or the motion has fewer than two frames.
     """
+    check_length(poses)
     if num_frames < 0:
         raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
-    step = (
-        (poses.positions[1] - poses.positions[0]).mean(axis=0) if len(poses.positions) > 1 else jnp.zeros(3)
-    )
+    step = (poses.positions[1] - poses.positions[0]).mean(axis=0)
     shifts = jnp.arange(-num_frames, 0, dtype=step.dtype)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
     held = jnp.repeat(poses.joint_transforms[:1], num_frames, axis=0)
     return poses.replace(

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator
 
@@ -21,7 +22,8 @@ def leave_at_once() -> Iterator[None]:
 
     Python handles a signal between two of its own instructions, but a compilation is a single one. A thread
     therefore waits for the signal, and ends the process if Python has not done so within a second. Where a
-    function other than Python's own handles Ctrl-C, it leaves the process alone.
+    function other than Python's own handles Ctrl-C, it leaves the process alone. An interrupt that Python drops,
+    since it came while an object was deleted, is not printed: the thread acts on it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -43,9 +45,12 @@ def leave_at_once() -> Iterator[None]:
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    report = sys.unraisablehook
+    sys.unraisablehook = lambda lost: None if lost.exc_type is KeyboardInterrupt else report(lost)
     try:
         yield
     finally:
+        sys.unraisablehook = report
         is_over.set()
         signal.set_wakeup_fd(before)
         sender.close()

@@ -223,7 +223,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
     count = kept.num_frames - settle
     try:
-        raise_for_status(whole.replace(first_bad_frame=whole.first_bad_frame - settle))
+        raise_for_status(whole, settle=settle)
     except EslrError as raised:
         if count < 2:
             raise

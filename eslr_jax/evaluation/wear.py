@@ -102,7 +102,8 @@ def _sides(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return how far skin is in front of cloth [m], negative behind it, how far off it is [m], and the face.
 
-    The first is zero at a hem, and where the two face each other: there the cloth is another limb's.
+    The first is measured along the cloth's normal: skin beside a fold is far off it, but not in front of it. It
+    is zero at a hem, and where the two face each other: there the cloth is another limb's.
     """
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]
@@ -110,5 +111,5 @@ def _sides(
     normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
     distance = np.linalg.norm(offset, axis=1)
     is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= 0)
-    sign = np.sign(np.einsum("px,px->p", offset, normals))
-    return np.where(is_other, 0.0, sign * distance), distance, nearest
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return np.where(is_other, 0.0, np.einsum("px,px->p", offset, normals)), distance, nearest

@@ -13,8 +13,8 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
+from eslr_jax.body.timing import check_length
 from eslr_jax.contact.self_contact import SEARCH_RADIUS, starting_capacity
-from eslr_jax.errors import MotionError
 from eslr_jax.fit.postures import SHOULDERS
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
@@ -78,9 +78,7 @@ def plan_scene(
         MotionError: The motion has fewer than two frames.
     """
     options = options or SceneOptions()
-    num_frames = poses.joint_transforms.shape[0]
-    if num_frames < 2:
-        raise MotionError(f"a simulation needs two frames or more; this motion has {num_frames}")
+    check_length(poses)
     skinned, radii = np.empty(0), np.empty(0)
     pieces, has_layers = count_pieces(garment), options.self_contact
     is_undecided = has_layers is None and pieces > 1

@@ -259,8 +259,12 @@ def check_scene(scene: Scene) -> None:
     validate_timestep(scene.timestep)
 
 
-def raise_for_status(trajectory: Trajectory) -> None:
+def raise_for_status(trajectory: Trajectory, *, settle: int = 0) -> None:
     """Raise the error that a trajectory's status bits stand for.
+
+    Args:
+        trajectory: What was simulated.
+        settle: Its first frames in which the garment settled; the message counts from the frame behind them.
 
     Raises:
         NonFiniteError: Positions became NaN or infinite.
@@ -270,7 +274,9 @@ def raise_for_status(trajectory: Trajectory) -> None:
     status = Status(int(jax.device_get(trajectory.status)))
     if status == Status.OK:
         return
-    message = f"frame {int(trajectory.first_bad_frame)}: {status.describe()}"
+    frame = int(trajectory.first_bad_frame) - settle
+    when = f"frame {frame}" if frame >= 0 else "before frame 0, while the garment settled"
+    message = f"{when}: {status.describe()}"
     if Status.SELF_CONTACT_OVERFLOW in status and trajectory.pair_demand is not None:
         message += f": {int(np.max(np.asarray(trajectory.pair_demand)))} pairs or more"
     error: type[EslrError] = CapacityError

@@ -7,8 +7,9 @@ from draped_ball import RADIUS, drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.report import trajectory_report
-from eslr_jax.evaluation.wear import wear_report
+from eslr_jax.evaluation.wear import _sides, wear_report
 from eslr_jax.evaluation.words import describe_report
+from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
@@ -88,3 +89,17 @@ def test_cloth_that_slides_or_falls_is_told(worn):
     assert report["below_feet_at"] == 1
     assert report["coverage"] == 0.0
     assert "the garment fell off: in frame 1 it is below the feet" in describe_report(report).warnings
+
+
+def test_skin_beside_a_fold_does_not_show_through_it():
+    # A strip bent like a hairpin, seen from the side: the bend lies at x = 0, and looks towards +x.
+    profile = np.array([[-0.1, 0.0], [0.0, 0.0], [-0.1, 0.005]])
+    strip = np.array([[x, y, z] for x, y in profile for z in (-0.1, 0.0, 0.1)])
+    corner = np.array([0, 1, 3, 4])[:, None]
+    faces = np.concatenate([np.array([a, b, c]) + corner for a, b, c in ((0, 3, 1), (3, 4, 1))])
+    outward = vertex_normals(strip, faces)[4:5]
+    assert outward[0, 0] == pytest.approx(1.0, abs=0.01)
+    beside, before = np.array([[1e-4, -0.005, 0.0]]), np.array([[0.005, 0.0, 0.0]])
+    hem = np.zeros(len(strip), bool)
+    assert _sides(beside, outward, strip, faces, hem)[0] == pytest.approx(1e-4, abs=2e-4)
+    assert _sides(before, outward, strip, faces, hem)[0] == pytest.approx(0.005, rel=0.01)

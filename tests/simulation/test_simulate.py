@@ -176,6 +176,11 @@ def test_buffers_grow_to_what_the_fullest_frame_asked_for_and_half_as_much_again
     assert enlarge_buffers(tight, full.replace(status=jnp.int32(Status.OK))) is None
     with pytest.raises(CapacityError, match="40 pairs or more"):
         raise_for_status(full)
+    full = full.replace(first_bad_frame=jnp.int32(5))
+    with pytest.raises(CapacityError, match=r"^frame 3: "):
+        raise_for_status(full, settle=2)
+    with pytest.raises(CapacityError, match=r"^before frame 0, while the garment settled: "):
+        raise_for_status(full, settle=6)
 
 
 def test_a_body_too_fast_to_follow_is_told(scene):
