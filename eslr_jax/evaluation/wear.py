@@ -17,6 +17,7 @@ _COVER = 0.03  # [m] under cloth up to which skin counts as covered
 _NEAR = 0.1  # [m] from cloth up to which skin stays covered
 _OWN = 0.05  # [m] from skin in the rest pose up to which cloth is its own; other cloth there is a fold
 _POKING = 0.015  # [m] in front of cloth up to which skin pokes through it; farther off it is another limb
+_ALIKE = 0.5  # cosine between the normals of skin and cloth up to which the cloth is a fold or another limb's
 _VISIBLE = 1e-3  # [m] in front of the cloth from which skin counts as showing
 
 
@@ -30,7 +31,8 @@ def wear_report(
 
     Skin is covered where a face of the cloth lies in front of it in the rest pose, at most 3 cm away. It shows
     through where it is later in front of the nearest face. Faces at a hem don't count, since skin passes
-    under them, nor do faces turned towards the skin or far from it in the rest pose, which cover other skin.
+    under them, nor do faces turned away by more than 60 degrees, which are folds or cover another limb, nor
+    faces far from the skin in the rest pose.
     Every tenth frame and the last are looked at.
 
     Args:
@@ -102,14 +104,16 @@ def _sides(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return how far skin is in front of cloth [m], negative behind it, how far off it is [m], and the face.
 
-    The first is measured along the cloth's normal: skin beside a fold is far off it, but not in front of it. It
-    is zero at a hem, and where the two face each other: there the cloth is another limb's.
+    The first is measured along the normals of both, and the smaller one counts: skin beside a fold is far off
+    it, but not in front of it. It is zero where they disagree, at a hem, and where the two don't face the same way.
     """
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]
     offset = points - np.einsum("pk,pkx->px", weights, positions[corners])
     normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
     distance = np.linalg.norm(offset, axis=1)
-    is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= 0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return np.where(is_other, 0.0, np.einsum("px,px->p", offset, normals)), distance, nearest
+    is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= _ALIKE)
+    along = np.stack([np.einsum("px,px->p", offset, axis) for axis in (outward, normals)])
+    is_other |= along.prod(axis=0) <= 0
+    return np.where(is_other, 0.0, np.sign(along[0]) * np.abs(along).min(axis=0)), distance, nearest
