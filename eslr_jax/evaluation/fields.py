@@ -22,6 +22,7 @@ from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.air import blowing
+from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import evaluate, potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
@@ -32,7 +33,6 @@ from eslr_jax.types import (
     ClothState,
     Garment,
     Material,
-    PhysicsConstants,
     PotentialTerms,
     Scene,
     SceneBody,
@@ -134,7 +134,7 @@ def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool)
     return Scene(
         garment=garment,
         material=material,
-        constants=PhysicsConstants(),
+        constants=constants_for(material),
         initial_state=start_integrator(
             initial_state(positions[0], velocities[0]), run.report.get("integrator", "euler")
         ),

@@ -105,7 +105,7 @@ def _sides(
     """Return how far skin is in front of cloth [m], negative behind it, how far off it is [m], and the face.
 
     The first is measured along the normals of both, and the smaller one counts: skin beside a fold is far off
-    it, but not in front of it. It is zero where they disagree, at a hem, and where the two don't face the same way.
+    it, but not in front of it. It is zero where they disagree, at a hem, and where the two face different ways.
     """
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]

@@ -20,7 +20,7 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.materials import COTTON, constants_for
 from eslr_jax.physics.validate import validate_air, validate_damping
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
@@ -69,7 +69,7 @@ def plan_scene(
     Args:
         garment: A prepared garment.
         poses: The body in motion.
-        constants: Physical constants.
+        constants: Physical constants; a fabric stiffer than HOOD's wants `constants_for` it.
         options: What to leave out or add.
         surface: Body faces to search instead of those in reach, so that several scenes share one compiled
             rollout; see `shared_surface`.
@@ -128,13 +128,14 @@ def prepare_scene(
         garment: A prepared garment.
         poses: The body in motion.
         material: Fabric.
-        constants: Physical constants.
+        constants: Physical constants; by default those for the fabric, see `physics.materials.constants_for`.
         options: What to leave out or add.
         surface: Body faces to search, see `plan_scene`.
 
     Raises:
         MotionError: The motion has fewer than two frames.
     """
+    constants = constants or constants_for(material)
     plan = plan_scene(garment, poses, constants=constants, options=options, surface=surface)
     return _build(garment, poses, material, plan)
 
@@ -156,7 +157,7 @@ def prepare_scenes(
         garments: Unpadded garments of like sizes.
         poses: As many motions of bodies with the same faces and of the same length.
         materials: As many fabrics.
-        constants: Physical constants of all.
+        constants: Physical constants of all; by default those for each fabric.
         options: What to leave out or add.
 
     Raises:
@@ -166,8 +167,10 @@ def prepare_scenes(
     padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
     surface = shared_surface(padded, poses[0]) if options.has_body else None
     plans = [
-        plan_scene(garment, motion, constants=constants, options=options, surface=surface)
-        for garment, motion in zip(padded, poses, strict=True)
+        plan_scene(
+            garment, motion, constants=constants or constants_for(fabric), options=options, surface=surface
+        )
+        for garment, motion, fabric in zip(padded, poses, materials, strict=True)
     ]
     has_pins = any(plan.has_pins for plan in plans)
     if any(plan.ground is not None for plan in plans):

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, without_tracks
@@ -93,7 +94,9 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
     air = Air(jnp.asarray(wind, jnp.float32))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
-    constant = stage.constant.replace(material=material, air=air, energies=(Partial(_pull, hand),))
+    constants = jax.tree.map(jnp.asarray, constants_for(material))
+    energies = (Partial(_pull, hand),)
+    constant = stage.constant.replace(material=material, constants=constants, air=air, energies=energies)
     return stage._replace(constant=constant)
 
 
