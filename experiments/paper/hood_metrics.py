@@ -69,7 +69,7 @@ def hood_metrics(
         gradient, terms = jax.grad(total, has_aux=True)(position, problem)
         depth = criterion_depths(position, problem, criterion)
         is_real = garment.vertex_mask
-        count = jnp.sum(is_real)
+        count = jnp.sum(is_real).astype(position.dtype)
         inside = jnp.sum(is_real & (depth > 0)) / count
         return HoodMetrics(terms, inside, masked_sum(safe_norm(gradient), is_real) / count)
 
