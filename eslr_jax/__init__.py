@@ -28,6 +28,7 @@ _PUBLIC = {
     "plan_scene": "eslr_jax.scene.plan",
     "prepare_scene": "eslr_jax.scene.plan",
     "rollout": "eslr_jax.simulation.rollout",
+    "score_trajectory": "eslr_jax.evaluation.score",
     "simulate": "eslr_jax.simulation.simulate",
     "simulate_batch": "eslr_jax.simulation.batch",
 }
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import ModelConfig, SimConfig, TrainConfig
     from eslr_jax.errors import EslrError
+    from eslr_jax.evaluation.score import score_trajectory
     from eslr_jax.geometry.prepare import prepare_garment
     from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch

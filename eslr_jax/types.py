@@ -11,6 +11,7 @@ import dataclasses
 from typing import NamedTuple
 
 import jax
+import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
@@ -256,6 +257,16 @@ class Trajectory:
     def num_frames(self) -> int:
         """Number of frames, frame 0 included."""
         return self.positions.shape[0]
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Return plain NumPy arrays by name, for `numpy.savez` or xarray; energies are `stretch_energy`, ... [J].
+
+        Their axes are frames, vertices and xyz, as many as an array has. What was not modelled is left out.
+        """
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        terms = values.pop("terms")._asdict()
+        values |= {f"{name}_energy": track for name, track in terms.items()}
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
 def tree_cast(tree: object, dtype) -> object:

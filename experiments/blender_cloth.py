@@ -26,11 +26,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from hard_cases import Simulator, foreign_trajectory
+from hard_cases import Simulator
 from jaxtyping import Float
 from newton_cloth import prepare_cloth, springs, strip_stiffness
 
 from eslr_jax.errors import EslrError, MissingExtraError
+from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.io.point_cache import write_pc2
 from eslr_jax.physics.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory

@@ -31,10 +31,11 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from hard_cases import Simulator, foreign_trajectory
+from hard_cases import Simulator
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError
+from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.extras import require
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.problem import contact_thickness
@@ -376,7 +377,8 @@ def newton_simulator(setting: Setting) -> Simulator:
             raise EslrError(f"{setting.name} refused the scene: {error}") from error
         positions = np.stack([state.position for state in states])
         velocities = np.stack([state.velocity for state in states])
-        return foreign_trajectory(positions, scene, velocities, cloth.substeps * setting.iterations)
+        iterations = cloth.substeps * setting.iterations
+        return foreign_trajectory(positions, scene, velocities=velocities, iterations=iterations)
 
     effort = f"{setting.substeps}x" if setting.substeps else "as many substeps as needed, "
     return Simulator(f"{setting.name}, {effort}{setting.iterations}", run)

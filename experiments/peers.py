@@ -34,18 +34,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
-from hard_cases import drop_scene, foreign_trajectory
-from hard_cases.referee import judge
+from hard_cases import drop_scene
 from newton_cloth import NewtonCloth, Setting, require_newton
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.errors import MissingExtraError
+from eslr_jax.errors import MissingExtraError, NonFiniteError
 from eslr_jax.evaluation.calibrate import example_scene
 from eslr_jax.evaluation.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.score import score_trajectory
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import rollout_scene, scan_frames
@@ -68,6 +66,13 @@ SETTINGS = (
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
 BLENDER = ((5, 2), (15, 2), (45, 2))  # steps per frame, rounds of collision per step
 OURS = ((1, 10), (1, 20), (1, 50), (1, 100), (5, 50))  # substeps, iterations of L-BFGS
+SCORE = {  # measure of `score_trajectory` -> column
+    "stretch_p99": "stretch_p99",
+    "penetration_p999_mm": "penetration_p999_mm",
+    "gap_relative_median": "gap_relative_own",
+    "intersections_cloth": "intersections_cloth",
+    "intersections_body": "intersections_body",
+}
 EVERY = 6  # frames between those whose gap is measured
 TIMED_FRAMES = 20  # of `peer_points`
 
@@ -196,50 +201,13 @@ def teach(
     return gap, np.asarray(ends.initial_gap)
 
 
-@jax.jit
-def _shapes(positions, scene: Scene):
-    """Return largest principal stretches of every frame and face, and distances [m] of every frame and vertex."""
-
-    def measure(frame):
-        position, body = frame
-        stretch = principal_stretches(position, scene.garment)[0]
-        if body is None:
-            return stretch, None
-        return stretch, find_contacts(position, body, body, scene.body.surface).distances
-
-    body = None if scene.body is None else scene.body.positions
-    return jax.lax.map(measure, (positions, body))
-
-
-def count_intersections(position: np.ndarray, scene: Scene) -> dict[str, int | None]:
-    """Return the pairs of triangles that intersect in the last frame; None without the referee's package."""
-    names = ("intersections_cloth", "intersections_body")
-    is_face = np.asarray(scene.garment.rest_areas) > 0
-    body = body_faces = None
-    if scene.body is not None:
-        body, body_faces = np.asarray(scene.body.positions[-1]), np.asarray(scene.body.surface.faces)
-    try:
-        verdict = judge(position, np.asarray(scene.garment.faces)[is_face], body, body_faces)
-    except MissingExtraError:
-        return dict.fromkeys(names)
-    return dict(zip(names, (verdict.cloth_cloth, verdict.cloth_body), strict=True))
-
-
 def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[str, Any]:
     """Return the measures of a free rollout, gap every so many frames; None where it did not stay finite."""
-    is_finite = bool(np.isfinite(positions).all())
-    row: dict[str, Any] = {"finite": is_finite, "stretch_p99": None, "penetration_p999_mm": None}
-    row["gap_relative_own"] = None
-    if not is_finite:
-        return row
-    ends = trajectory_gap(foreign_trajectory(positions, scene), scene, every=every)
-    row["gap_relative_own"] = float(np.median(ends.share(ends.reached)))
-    stretch, distances = jax.device_get(_shapes(jnp.asarray(positions), scene))
-    is_face, is_vertex = np.asarray(scene.garment.rest_areas) > 0, np.asarray(scene.garment.vertex_mask)
-    row["stretch_p99"] = float(np.quantile(stretch[1:, is_face], 0.99))
-    if distances is not None:
-        row["penetration_p999_mm"] = float(max(np.quantile(-distances[1:, is_vertex], 0.999), 0.0) * 1e3)
-    return row | count_intersections(positions[-1], scene)
+    try:
+        score = score_trajectory(positions, scene, every=every)
+    except NonFiniteError:
+        return {"finite": False, **dict.fromkeys(SCORE.values())}
+    return {"finite": True, **{column: score[name] for name, column in SCORE.items()}}
 
 
 def measure_scene(

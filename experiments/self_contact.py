@@ -33,7 +33,7 @@ TURNS = 2  # of every rollout; the faster one counts
 
 def measure(garment: str, clip: str, vertices: str, frames: int) -> dict[str, Any]:
     """Return intersecting pairs of cloth faces over a rollout and milliseconds a frame, with and without."""
-    from hard_cases.referee import judge
+    from eslr_jax.evaluation.referee import judge
 
     cloth = load_garment(garment, vertices=vertices)
     poses = pose_body(load_body(), load_motion(clip), num_frames=frames)

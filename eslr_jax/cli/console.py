@@ -15,6 +15,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.table import Table
 
 app = tyro.extras.SubcommandApp()
 stderr = Console(stderr=True)
@@ -45,3 +46,34 @@ def use_compile_cache() -> None:
         cache.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
+    """Print what a person wants to know of a trajectory first: words, then figures.
+
+    Args:
+        report: Of `trajectory_report` with `wear_report`, see `describe_report`.
+        more: Other figures by name; they come last.
+    """
+    from eslr_jax.evaluation.words import describe_report
+
+    words = describe_report(report)
+    for text in words.good:
+        print(f"good: {text}")
+    for text in words.warnings:
+        print(f"warning: {text}")
+    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
+    rows = {
+        "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
+        "energy": f"{report['total']:.4f} J a frame ({terms})",
+        "stretch": f"{report['p99_principal_stretch']:.3f} (99 %), {report['max_principal_stretch']:.3f} at most",
+    }
+    if report["penetration_max_mm"] is not None:
+        rows["penetration"] = (
+            f"{report['penetration_p999_mm']:.2f} mm (99.9 %), {report['penetration_max_mm']:.2f} mm at most, "
+            f"{report['penetrating_share'] * 100:.2f} % of vertices"
+        )
+    table = Table(show_header=False, box=None)
+    for label, text in (rows | more).items():
+        table.add_row(label, text)
+    Console().print(table, markup=False, highlight=False)

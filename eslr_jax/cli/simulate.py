@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.budget import describe_load, parse_request
-from eslr_jax.cli.console import app, progress, say, stderr, use_compile_cache
+from eslr_jax.cli.console import app, print_report, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
 from eslr_jax.cli.options import (
     Options,
@@ -414,28 +412,7 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
 
 
 def _print_report(report: dict[str, Any], out: Path) -> None:
-    """Print what a person wants to know first: words, then figures."""
-    from eslr_jax.evaluation.words import describe_report
-
-    words = describe_report(report)
-    for text in words.good:
-        print(f"good: {text}")
-    for text in words.warnings:
-        print(f"warning: {text}")
-    table = Table(show_header=False, box=None)
-    terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
-    rows = {
-        "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
-        "time": f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation",
-        "energy": f"{report['total']:.4f} J a frame ({terms})",
-        "stretch": f"{report['p99_principal_stretch']:.3f} (99 %), {report['max_principal_stretch']:.3f} at most",
-    }
-    if report["penetration_max_mm"] is not None:
-        rows["penetration"] = (
-            f"{report['penetration_p999_mm']:.2f} mm (99.9 %), {report['penetration_max_mm']:.2f} mm at most, "
-            f"{report['penetrating_share'] * 100:.2f} % of vertices"
-        )
-    rows["files"] = ", ".join(str(path) for path in sorted(out.iterdir()) if path.is_file())
-    for label, text in rows.items():
-        table.add_row(label, text)
-    Console().print(table, markup=False, highlight=False)
+    """Print what a person wants to know, and where the files are."""
+    time = f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation"
+    files = ", ".join(str(path) for path in sorted(out.iterdir()) if path.is_file())
+    print_report(report, {"time": time, "files": files})

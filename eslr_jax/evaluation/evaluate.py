@@ -14,7 +14,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, s
 from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, measure_gap
+from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
@@ -154,27 +154,11 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
 
 def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
     """Return medians over all frames of all scenes: joules, and relative to the frame's own initial gap."""
-
-    def join(pick: Callable[[OptimalityGap], Any]) -> np.ndarray:
-        return np.concatenate([np.asarray(pick(entry)) for entry in measured])
-
-    optimum = join(lambda entry: entry.optimum)
-    initial_gap = join(lambda entry: entry.initial_gap)
-
-    def medians(energy: np.ndarray) -> dict[str, float]:
-        gap = energy - optimum
-        return {
-            "gap_median_j": float(np.median(gap)),
-            "gap_relative_median": float(np.median(gap / initial_gap)),
-            "gap_mean_j": float(np.mean(gap)),
-            "gap_p90_j": float(np.quantile(gap, 0.9)),
-        }
-
-    lbfgs = {str(count): medians(join(lambda entry, k=count: entry.solver[k])) for count in ITERATIONS}
+    whole: OptimalityGap = jax.tree.map(lambda *parts: np.concatenate(parts), *measured)
     return {
-        "frames": len(optimum),
-        **medians(join(lambda entry: next(iter(entry.refined.values())))),
-        "lbfgs": lbfgs,
+        "frames": len(whole.optimum),
+        **gap_medians(whole, next(iter(whole.refined.values()))),
+        "lbfgs": {str(count): gap_medians(whole, whole.solver[count]) for count in ITERATIONS},
     }
 
 

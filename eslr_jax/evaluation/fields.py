@@ -11,23 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from eslr_jax.assets import prepare_stored
-from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.gap import find_friction_loads, map_frames, past_states
-from eslr_jax.fabric import garment_material
-from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.evaluation.gap import map_frames, trajectory_states
+from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
 from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
-from eslr_jax.physics.air import blowing
-from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import evaluate, potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.build import initial_state, start_integrator
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.types import (
     ClothState,
@@ -35,7 +28,6 @@ from eslr_jax.types import (
     Material,
     PotentialTerms,
     Scene,
-    SceneBody,
 )
 
 # No file holds functions of one's own; what air and damping take away is of a frame, not of a shape.
@@ -78,7 +70,7 @@ def run_field(run: Run, name: str) -> Field:
         raise AssetError(f"{run.name} has no {name}: it was simulated without --self-contact")
     if name == "distance":
         return _distances(run)
-    garment, material = _prepared(run)
+    garment, material = run_garment(run)
     if name == "stretch":
         values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
@@ -89,20 +81,6 @@ def run_field(run: Run, name: str) -> Field:
         (0.0, np.quantile(values, 0.99)) if name in _CONTACT_FIELDS else np.quantile(values, [0.001, 0.999])
     )
     return Field(values, min(float(low), 0.0), max(float(high), 1e-6), "J/m2")
-
-
-def _prepared(run: Run) -> tuple[Garment, Material]:
-    """Return the garment and fabric of a run; without its file, frame 0 is the shape at rest."""
-    stored = run.garment
-    if stored is None:
-        first, faces = run.trajectory.positions[0].astype(np.float64), run.trajectory.faces
-        one, zero = np.ones((len(first), 1)), np.zeros((len(first), 1), np.int64)
-        stored = GarmentFile(first, faces, one, zero, np.zeros(len(first), bool))
-    garment = prepare_stored(stored, name=run.name, allow_components=True)
-    material = run.trajectory.material
-    if material is None:  # a run of an older version
-        material = garment_material(run.report.get("fabric", ()), garment, stored)
-    return garment, material
 
 
 @jax.jit
@@ -120,55 +98,14 @@ def _stretches(
     return jax.lax.map(frame, positions)
 
 
-def _scene(run: Run, garment: Garment, material: Material, *, has_contact: bool) -> Scene:
-    """Return the scene of a run as its folder tells it: with the faces it searched, and pins as they moved."""
-    trajectory = run.trajectory
-    positions, velocities = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)
-    body = None
-    if has_contact and trajectory.body is not None and len(trajectory.body.contact_faces):
-        track = trajectory.body
-        surface = prepare_surface(track.rest_positions, track.contact_faces, boundary=track.contact_boundary)
-        has_skin = bool(run.report.get("skin_contacts"))
-        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids], has_skin=has_skin)
-    has_layers = has_contact and bool(run.report.get("self_contact"))
-    return Scene(
-        garment=garment,
-        material=material,
-        constants=constants_for(material),
-        initial_state=start_integrator(
-            initial_state(positions[0], velocities[0]), run.report.get("integrator", "euler")
-        ),
-        timestep=jnp.float32(trajectory.timestep),
-        body=body,
-        pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
-        num_frames=trajectory.num_frames,
-        self_contact=default_capacity(positions.shape[1]) if has_layers else None,
-        ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
-        air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
-        damping=run.report.get("damping_s"),
-    )
-
-
 def _problem_values(
     run: Run, name: str, garment: Garment, material: Material
 ) -> Float[np.ndarray, "frames vertices"]:
     """Return a value [J] of the frames' minimisation problems; the first frame has none."""
-    scene = _scene(run, garment, material, has_contact=name in _CONTACT_FIELDS)
-    positions, velocities = jnp.asarray(run.trajectory.positions), jnp.asarray(run.trajectory.velocities)
-    loads = run.trajectory.friction_loads
-    if loads is None:  # a run of an older version, or somebody else's
-        loads = find_friction_loads(positions, velocities, scene)
-    states = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (len(positions) - 1, *leaf.shape)), scene.initial_state
-    )
-    states = states.replace(
-        position=positions[:-1],
-        velocity=velocities[:-1],
-        friction_load=jnp.asarray(loads)[:-1],
-        frame=run.report.get("settle", 0) + jnp.arange(len(positions) - 1, dtype=jnp.int32),
-        past=past_states(positions, velocities, scene),
-    )
-    values = np.asarray(_every_frame(name, positions[1:], states, scene))
+    scene = run_scene(run, garment, material, has_contact=name in _CONTACT_FIELDS)
+    trajectory = run_trajectory(run, scene)
+    states, _ = trajectory_states(trajectory, scene)
+    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, scene))
     return np.concatenate([np.zeros_like(values[:1]), values])
 
 

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.physics.potential import contact_load, potential
+from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
@@ -52,6 +53,7 @@ def trajectory_states(trajectory: Trajectory, scene: Scene) -> tuple[ClothState,
         position=trajectory.positions[:-1],
         velocity=trajectory.velocities[:-1],
         friction_load=trajectory.friction_loads[:-1],
+        frame=scene.initial_state.frame + jnp.arange(count, dtype=jnp.int32),
         past=past_states(trajectory.positions, trajectory.velocities, scene, trajectory.residuals),
     )
     return states, frame_inputs(scene)
@@ -69,41 +71,15 @@ def past_states(
         positions: Vertex positions [m].
         velocities: Vertex velocities [m/s].
         scene: Its scene.
-        residuals: Force norm over weight at the end of every frame; if unknown, all ended in their minimum.
+        residuals: Force norm over weight at the end of every frame; where unknown, NaN or all of them None, a
+            frame counts as ended in its minimum.
     """
     first = scene.initial_state.past
     if first is None:
         return None
     left = jnp.zeros(len(positions) - 2) if residuals is None else residuals[1:-1]
-    tracks = past_state(positions[:-2], velocities[:-2], left)
+    tracks = past_state(positions[:-2], velocities[:-2], jnp.nan_to_num(left, nan=0.0))
     return jax.tree.map(lambda start, track: jnp.concatenate([start[None], track]), first, tracks)
-
-
-@jax.jit
-def find_friction_loads(
-    positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
-) -> Float[Array, "frames vertices"]:
-    """Return the friction loads [N] of somebody else's trajectory, which does not tell them.
-
-    Args:
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        velocities: Vertex velocities [m/s], shape [frames, vertices, 3].
-        scene: Its scene.
-    """
-
-    def advance(load, frame):
-        position, velocity, past, reached, inputs = frame
-        state = scene.initial_state.replace(
-            position=position, velocity=velocity, friction_load=load, past=past
-        )
-        load = contact_load(reached, frame_problem(scene, state, inputs))
-        return load, load
-
-    first = scene.initial_state.friction_load
-    past = past_states(positions, velocities, scene)
-    frames = (positions[:-1], velocities[:-1], past, positions[1:], frame_inputs(scene))
-    _, loads = jax.lax.scan(advance, first, frames)
-    return jnp.concatenate([first[None], loads])
 
 
 class GapOptions(NamedTuple):
@@ -174,6 +150,17 @@ def measure_gap(
     return jax.lax.map(measure, taken)
 
 
+def gap_medians(ends: OptimalityGap, energy: Float[Array, " frames"]) -> dict[str, float]:
+    """Return the gap of potentials [J], shape [frames]: in joules, and relative to the initial gap."""
+    gap, share = np.asarray(energy - ends.optimum), np.asarray(ends.share(energy))
+    return {
+        "gap_median_j": float(np.median(gap)),
+        "gap_relative_median": float(np.median(share)),
+        "gap_mean_j": float(np.mean(gap)),
+        "gap_p90_j": float(np.quantile(gap, 0.9)),
+    }
+
+
 def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> OptimalityGap:
     """Return where frames of a trajectory begin, end, and could have ended; nothing else is solved.
 
@@ -183,16 +170,16 @@ def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> Optim
 
 
 def map_frames(
-    measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Array],
+    measure: Callable[[Float[Array, "vertices 3"], FrameProblem], Any],
     reached: Float[Array, "frames vertices 3"],
     states: ClothState,
     inputs: FrameInput,
     scene: Scene,
-) -> Array:
+) -> Any:
     """State the problem of every frame and return what `measure` makes of where the cloth went.
 
     Args:
-        measure: From positions and their frame's problem to a value.
+        measure: From positions and their frame's problem to a value, or to several.
         reached: Anybody's positions at t + 1 [m], shape [frames, vertices, 3].
         states: Cloth at t, of `trajectory_states`.
         inputs: The frames' inputs.

@@ -13,7 +13,7 @@ import numpy as np
 from eslr_jax.errors import AssetError
 from eslr_jax.io.animated import BODY_COLOR, AnimatedMesh, check_meshes, split_seams
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
-from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.garment import GarmentFile, first_rows
 from eslr_jax.io.gltf import write_animated_glb
 from eslr_jax.io.mesh_sequence import frame_name, obj_text
 from eslr_jax.io.npz import write_arrays
@@ -96,8 +96,7 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
             raise AssetError("the garment file is not the one of this run; simulate again")
         uvs, order = garment.corner_uvs, garment.vertex_map
         if order is not None and len(order) and order.min() >= 0 and order.max() < len(places):
-            first = np.full(len(places), -1, np.int64)  # vertex of the garment's file for every vertex
-            first[order[::-1]] = np.arange(len(order))[::-1]
+            first = first_rows(order, len(places))
             if (first[faces] >= 0).all():
                 places, faces = order, first[faces]
     name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"

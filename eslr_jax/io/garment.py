@@ -10,11 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.mesh import MeshFile, read_mesh_file
+from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.pickle import read_pickle
 
+_SAME_EDGES = (
+    0.5  # share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds
+)
 _HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
 _LAYOUT = {
     "rest_positions": ("f", "vertices 3"),
@@ -191,3 +195,53 @@ def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
     if garment.metadata:
         arrays["metadata"] = np.array(json.dumps(garment.metadata))
     return arrays
+
+
+def first_rows(order: Int[np.ndarray, " rows"], count: int) -> Int[np.ndarray, " vertices"]:
+    """Return the first row of each of `count` vertices in a list of vertices; -1 of those that it lacks."""
+    rows = np.full(count, -1, np.int64)
+    is_known = order >= 0
+    rows[order[is_known][::-1]] = np.flatnonzero(is_known)[::-1]
+    return rows
+
+
+def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.ndarray, "frames vertices 3"]:
+    """Return the positions of a moving garment in the vertex order of its garment file.
+
+    The sequence may have that order, or the order of the mesh that the garment was fitted from, also where a
+    format has joined the vertices of a seam. It need not have the same faces, as long as most edges are the same.
+
+    Args:
+        sequence: The garment in motion.
+        garment: The garment.
+
+    Raises:
+        MeshError: The sequence has other vertices, or another order.
+    """
+    count, num_rows = len(garment.rest_positions), sequence.positions.shape[1]
+    orders = [np.arange(count)]
+    if garment.vertex_map is not None and garment.vertex_map.max(initial=-1) < count:
+        order = np.asarray(garment.vertex_map, np.int64)
+        orders += [order, np.array(list(dict.fromkeys(order[order >= 0])))]
+    fitting = [order for order in orders if len(order) == num_rows]
+    if not fitting:
+        known = " or ".join(dict.fromkeys(str(len(order)) for order in orders))
+        raise MeshError(
+            f"{sequence.name} has {num_rows} vertices, the garment {known}; give those of the garment"
+        )
+    wanted = _edges(garment.faces, count)
+    for order in fitting:
+        rows = first_rows(order, count)
+        is_joined = np.isin(wanted, _edges(order[sequence.faces], count))
+        if is_joined.mean() > _SAME_EDGES and (rows >= 0).all():
+            return sequence.positions[:, rows]
+    raise MeshError(
+        f"{sequence.name} has edges between other vertices than the garment: its vertices have another order, or "
+        "it is another garment; keep the order of the garment's file"
+    )
+
+
+def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:
+    """Return one number for every edge between known vertices."""
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique((ends @ [count, 1])[ends[:, 0] >= 0])

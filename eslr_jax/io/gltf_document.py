@@ -10,6 +10,7 @@ import base64
 import json
 import struct
 import urllib.parse
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from eslr_jax.errors import AssetError
+from eslr_jax.io.skeleton import MAX_FRAMES
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -245,15 +247,17 @@ class GltfDocument:
                 result[:, node] = result[:, self.parents[node]] @ result[:, node]
         return result
 
-    def key_frames(self, animation: dict[str, Any]) -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
-        """Return (node, path, interpolation, times [s], values) of each channel that moves a node."""
+    def key_frames(
+        self, animation: dict[str, Any], paths: Sequence[str] = ("translation", "rotation", "scale")
+    ) -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
+        """Return (node, path, interpolation, times [s], values) of each channel that animates these paths."""
         samplers = animation.get("samplers", [])
         result = []
         for entry in animation.get("channels", []):
             channel = _table(entry)
             target, index = _table(channel.get("target")), channel.get("sampler")
             node, path = target.get("node"), target.get("path")
-            if path not in ("translation", "rotation", "scale") or node is None:
+            if path not in paths or node is None:
                 continue
             if type(index) is not int or not 0 <= index < len(samplers):
                 raise self.fail("has an animation channel without a sampler")
@@ -262,6 +266,9 @@ class GltfDocument:
             kind = sampler.get("interpolation", "LINEAR")
             times, values = self.array(sampler.get("input")), self.array(sampler.get("output"))
             width, each = (4 if path == "rotation" else 3), (3 if kind == "CUBICSPLINE" else 1)
+            if path == "weights" and values.ndim == 1 and len(values) % (each * len(times)) == 0:
+                values = values.reshape(each * len(times), -1)  # one number a shape
+                width = values.shape[1]
             if (
                 kind not in ("LINEAR", "STEP", "CUBICSPLINE")
                 or times.ndim != 1
@@ -274,12 +281,23 @@ class GltfDocument:
             result.append((node, path, kind, times, values))
         return result
 
+    def sample_times(self, inputs: list[np.ndarray], fps: float | None = None) -> tuple[np.ndarray, float]:
+        """Return evenly spaced times over all keys [s], and their rate: by default that of the densest keys."""
+        start, end = min(times[0] for times in inputs), max(times[-1] for times in inputs)
+        steps = [float(np.median(np.diff(times))) for times in inputs if len(times) > 1]
+        if fps is None:
+            fps = float(np.clip(1.0 / min(steps), 1.0, 1000.0)) if steps else 30.0
+        count = np.floor((end - start) * fps + 1e-3) + 1
+        if not count <= MAX_FRAMES:
+            raise self.fail(f"has an animation of {end - start:.3g} s")
+        return start + np.arange(int(count)) / fps, fps
+
 
 def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Sample key frames at given times; before the first key and after the last one values are constant.
 
     Args:
-        path: "rotation" (quaternions x, y, z, w), "translation" or "scale".
+        path: "rotation" (quaternions x, y, z, w), "translation", "scale" or "weights".
         kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
         times: Times of the keys [s], ascending, shape [keys].
         values: Values of the keys, shape [keys, components], or [3 keys, components] for cubic splines.

@@ -17,7 +17,6 @@ from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.gltf_document import GltfDocument, sample_keys
 from eslr_jax.io.parsing import parsing
 from eslr_jax.io.skeleton import (
-    MAX_FRAMES,
     MAX_POSES,
     RiggedMesh,
     Skeleton,
@@ -119,7 +118,7 @@ def read_gltf_motion(path: str | Path, clip: str = "") -> SkeletonMotion:
         keys = document.key_frames(document.items("animations")[index])
         if not keys:
             raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")
-        times, fps = _sample_times(document, [key[3] for key in keys])
+        times, fps = document.sample_times([key[3] for key in keys])
         if len(times) * len(document.parents) > MAX_POSES:
             raise MotionError(f"{path}: {len(times)} frames of {len(document.parents)} nodes; cut the clip")
         animated = {
@@ -136,17 +135,6 @@ def _clip_names(document: GltfDocument) -> tuple[str, ...]:
     """Return the names of the animations; those without a name are numbered."""
     entries = document.items("animations")
     return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
-
-
-def _sample_times(document: GltfDocument, inputs: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return evenly spaced times over all keys [s], and their rate."""
-    start, end = min(times[0] for times in inputs), max(times[-1] for times in inputs)
-    steps = [float(np.median(np.diff(times))) for times in inputs if len(times) > 1]
-    fps = float(np.clip(1.0 / min(steps), 1.0, 1000.0)) if steps else 30.0
-    count = np.floor((end - start) * fps + 1e-3) + 1
-    if not count <= MAX_FRAMES:
-        raise document.fail(f"has an animation of {end - start:.3g} s")
-    return start + np.arange(int(count)) / fps, fps
 
 
 def _skinned_nodes(document: GltfDocument) -> list[tuple[int, list[str]]]:

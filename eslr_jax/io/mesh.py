@@ -227,12 +227,13 @@ def shared_vertices(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find vertices at bit-identical positions, which exporters split where normals or textures differ.
 
     Args:
-        positions: Vertex positions, shape [vertices, 3].
+        positions: Vertex positions, shape [vertices, 3], or in several shapes, [vertices, shapes, 3].
 
     Returns:
         Indices of the vertices to keep, in their order, and the place of every vertex among them.
     """
-    _, first, inverse = np.unique(positions.reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
+    rows = positions.reshape(len(positions), -1)
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return np.sort(first), rank[inverse.ravel()]

@@ -1,4 +1,4 @@
-"""Read a mesh that moves and keeps its faces: an npz archive, or a folder with one OBJ or PLY file per frame."""
+"""Read a mesh that moves and keeps its faces: an npz archive, a folder of meshes, or shapes of a glTF file."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.io.mesh import POSITION_KEYS, read_mesh
+from eslr_jax.io.gltf_document import GltfDocument, sample_keys
+from eslr_jax.io.mesh import POSITION_KEYS, read_mesh, shared_vertices
 from eslr_jax.io.motion import read_number
 from eslr_jax.io.npz import check_layout, read_arrays
+from eslr_jax.io.parsing import parsing
 from eslr_jax.io.skeleton import MAX_FRAMES
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
 SUFFIXES = (".obj", ".ply")
+GLTF_SUFFIXES = (".glb", ".gltf")
 DEFAULT_FPS = 30.0  # [1/s], where the files tell no frame rate
 _POSITION_KEYS = (*POSITION_KEYS, "verts")  # the last is HOOD's
 
@@ -54,8 +57,9 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
     Args:
         path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
             of an .npz with `faces` and positions [frames, vertices, 3], named rest_positions, positions, vertices
-            or verts, and optionally `fps` or `timestep`.
-        fps: Frame rate [1/s]; by default the archive's own, or 30.
+            or verts, and optionally `fps` or `timestep`; or of a .glb or .gltf with a mesh that shapes (morph
+            targets) move, `FILE#MESH` where there are several.
+        fps: Frame rate [1/s]; by default the file's own, or 30.
 
     Returns:
         The mesh in motion; positions as in the files, which must be in metres with Y up.
@@ -65,6 +69,9 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         MeshError: The faces change, or the arrays form no mesh.
         MotionError: The frame rate is impossible.
     """
+    file, _, mesh = str(path).partition("#")
+    if Path(file).suffix.lower() in GLTF_SUFFIXES:
+        return _read_gltf(Path(file), mesh, fps)
     path = Path(path)
     if path.is_dir():
         return _read_folder(path, fps or DEFAULT_FPS)
@@ -122,6 +129,52 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
         if len(frames) * len(points) > MAX_POINTS:
             raise AssetError(f"folder {folder} holds more than {MAX_POINTS} points; reduce the mesh")
     return MeshSequence(folder.name, np.stack(frames), faces, fps)
+
+
+def _read_gltf(path: Path, name: str, fps: float | None) -> MeshSequence:
+    """Read a mesh that morph targets and its nodes move; vertices that were split at seams become one again."""
+    with parsing(path, "mesh sequence") as file:
+        document = GltfDocument(file)
+        animations = document.items("animations")
+        shapes = {key[0]: key for entry in animations for key in document.key_frames(entry, ("weights",))}
+        nodes = {node: document.item("nodes", node) for node in shapes}
+        found = {
+            node: str(entry.get("name") or document.item("meshes", entry.get("mesh")).get("name"))
+            for node, entry in nodes.items()
+            if "skin" not in entry  # a body
+        }
+        chosen = [node for node, known in found.items() if name in ("", known)]
+        if len(chosen) != 1:
+            known = ", ".join(found.values()) or "none"
+            raise AssetError(
+                f"{path}: {len(chosen)} meshes{name and f' named {name!r}'} are moved by shapes, not one; it has "
+                f"{known}; name one, as in {path.name}#NAME, or export the garment with its shape keys"
+            )
+        _, _, kind, times, values = shapes[chosen[0]]
+        at, rate = document.sample_times([times], fps)
+        moves = [key for entry in animations for key in document.key_frames(entry)]
+        moved = {(node, path): sample_keys(path, *keys, at) for node, path, *keys in moves}
+        world = document.world_matrices(moved, len(at))[:, chosen[0]]
+        shapes_at, faces = _read_shapes(document, nodes[chosen[0]]["mesh"])
+        weights = sample_keys("weights", kind, times, values, at)
+        if weights.shape[1] != len(shapes_at) - 1 or len(at) * shapes_at.shape[1] > MAX_POINTS:
+            raise document.fail(f"has {weights.shape[1]} weights for {len(shapes_at) - 1} shapes of a mesh")
+        kept, place = shared_vertices(shapes_at.swapaxes(0, 1))
+        local = shapes_at[0, kept] + np.tensordot(weights, shapes_at[1:, kept], axes=1)
+        positions = np.einsum("fij,fvj->fvi", world[:, :3, :3], local) + world[:, None, :3, 3]
+        return MeshSequence(path.name, positions, place[faces], rate)
+
+
+def _read_shapes(document: GltfDocument, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mesh and the offsets of its shapes, [1 + shapes, vertices, 3], and its faces."""
+    parts, faces, count = [], [], 0
+    for primitive in document.item("meshes", index).get("primitives", []):
+        points, triangles = document.triangles(primitive)
+        offsets = [document.array(target["POSITION"]) for target in primitive.get("targets", [])]
+        parts.append(np.stack([points, *offsets]))
+        faces.append(triangles + count)
+        count += len(points)
+    return np.concatenate(parts, axis=1), np.concatenate(faces)
 
 
 def frame_name(stem: str, frame: int, num_frames: int, suffix: str) -> str:

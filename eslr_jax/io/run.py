@@ -15,6 +15,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
+from eslr_jax.io.npz import read_arrays
 from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.types import Body, BodyMotion, Scene
@@ -100,6 +101,16 @@ def _body_track(scene: Scene, rig: Body, poses: BodyMotion) -> BodyTrack:
         contact_faces=contact_faces,
         contact_boundary=contact_boundary,
         skin=skin,
+    )
+
+
+def is_run(path: str | Path) -> bool:
+    """Tell whether a path is the folder of a run or a trajectory file, and not a mesh in motion."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / "trajectory.npz").is_file()
+    return path.suffix.lower() == ".npz" and "format" in read_arrays(
+        path, content="trajectory", names=("format",)
     )
 
 

@@ -16,7 +16,7 @@ from hard_cases.free import BAD_START, FREE_FALL, HANG, PULL, TWIST
 from hard_cases.layers import LAYERS
 from hard_cases.limbs import FAST_LIMB, PINCH, TURNED
 from hard_cases.obstacles import NEEDLE, SLOPE
-from hard_cases.simulators import foreign_trajectory, network_simulator, solver_simulator
+from hard_cases.simulators import network_simulator, solver_simulator
 
 _ORDER = (
     *(FREE_FALL, TURNED, HANG, DROP, FAST_LIMB, START_INSIDE, BAD_START, PULL, STEPS_AND_FABRICS),
@@ -48,7 +48,6 @@ __all__ = [
     "Simulator",
     "drop_scene",
     "find_case",
-    "foreign_trajectory",
     "network_simulator",
     "run_case",
     "solver_simulator",

@@ -11,7 +11,7 @@ Writes `hard_cases_<simulator>.json` after every case (`hard_cases_<simulator>_<
 than the default one) and, with `--sheet`, a picture of all that ran beside it. A case of an earlier file stays
 until it is run again. `python -m hard_cases` does the same from within `experiments/`.
 
-Needs the IPC Toolkit (extra `dev`); `--sheet` needs the extra `render`.
+Needs the IPC Toolkit (extra `score`); `--sheet` needs the extra `render`.
 """
 
 from __future__ import annotations

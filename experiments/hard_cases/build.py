@@ -14,7 +14,7 @@ from eslr_jax.contact.self_contact import starting_capacity
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.materials import COTTON, constants_for
 from eslr_jax.scene.build import initial_state
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, SceneBody
 
@@ -240,7 +240,7 @@ def make_scene(
     return Scene(
         garment=garment,
         material=material,
-        constants=constants or PhysicsConstants(),
+        constants=constants or constants_for(material),
         timestep=jnp.float32(timestep),
         initial_state=initial_state(position, jnp.zeros_like(position)),
         body=obstacle,

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.evaluation.referee import judge
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.inertia import vertex_masses
@@ -21,7 +22,6 @@ from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Run
 from hard_cases.colliders import triangle_distances
-from hard_cases.referee import judge
 
 MM = 1e3  # millimetres per metre
 _SETTLED = 1e4  # [s], a step so long that inertia is nothing: its minimum is the equilibrium

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Float
-
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.evaluation.gap import find_friction_loads
 from eslr_jax.scene.build import Integrator
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import PotentialTerms, Scene, Trajectory
+from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Simulator
 
 
@@ -42,36 +37,3 @@ def network_simulator(name: str, params: Any, model: ModelConfig, iterations: in
 
     options = {"embedding_size": model.embedding_size, "embedding_mode": model.embedding_mode}
     return Simulator(f"{name}, {iterations} iterations" if iterations else name, run, options)
-
-
-def foreign_trajectory(
-    positions: Float[np.ndarray, "frames vertices 3"],
-    scene: Scene,
-    velocities: Float[np.ndarray, "frames vertices 3"] | None = None,
-    iterations: int = 0,
-) -> Trajectory:
-    """Return the trajectory of another simulator; energies and residuals, which it does not tell, are NaN.
-
-    Args:
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        scene: The scene that was simulated.
-        velocities: Vertex velocities [m/s], shape [frames, vertices, 3]; by default differences of positions.
-        iterations: Iterations that it spent on every frame.
-    """
-    x = jnp.asarray(positions, jnp.float32)
-    if velocities is None:
-        moved = jnp.diff(x, axis=0) / scene.timestep
-        v = jnp.concatenate([scene.initial_state.velocity[None], moved])
-    else:
-        v = jnp.asarray(velocities, jnp.float32)
-    unknown = jnp.full(len(x), jnp.nan)
-    return Trajectory(
-        positions=x,
-        velocities=v,
-        friction_loads=find_friction_loads(x, v, scene),
-        terms=PotentialTerms(*[unknown] * len(PotentialTerms._fields)),
-        residuals=unknown,
-        iterations=jnp.full(len(x), iterations, jnp.int32).at[0].set(0),
-        status=jnp.int32(0),
-        first_bad_frame=jnp.int32(-1),
-    )

@@ -13,7 +13,6 @@ from hard_cases import (
     Run,
     Simulator,
     find_case,
-    foreign_trajectory,
     run_case,
     solver_simulator,
 )
@@ -22,6 +21,7 @@ from hard_cases.colliders import Sphere
 from hard_cases.measures import depths, mechanical_energy, optimality_gaps, settle, triangle_depths
 
 from eslr_jax.errors import ConfigError, MeshError, Status
+from eslr_jax.evaluation.foreign import foreign_trajectory
 
 
 def kinematic(path):

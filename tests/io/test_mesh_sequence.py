@@ -1,6 +1,7 @@
 """Bodies that are meshes in motion: read from archives and folders, carried by patches that move rigidly."""
 
 import numpy as np
+import pygltflib as gltf
 import pytest
 import trimesh
 from broken import refuses
@@ -8,8 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.sequence import pose_sequence
 from eslr_jax.body.units import UnitsWarning
-from eslr_jax.errors import MotionError
+from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.io.animated import AnimatedMesh
+from eslr_jax.io.garment import GarmentFile, in_vertex_order
+from eslr_jax.io.gltf import TOLERANCE, write_animated_glb
 from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, obj_text, read_mesh_sequence
+from eslr_jax.io.skin import Skin
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
 FACES = np.asarray(CAPSULE.faces)
@@ -113,3 +118,81 @@ def test_broken_folders_are_named_in_one_line(tmp_path):
     write_folder(tmp_path / "broken")
     (tmp_path / "broken" / "body4.obj").write_text("v 1 2 three\n")
     refuses(read_mesh_sequence, tmp_path / "broken")
+
+
+def write_shapes(path, *names, turn=0.0):
+    """Write the capsule in motion as GLB files have it: seams split, a body with joints beside it."""
+    uvs = np.stack([np.repeat(np.arange(len(FACES)) % 2, 3).reshape(-1, 3), np.zeros(FACES.shape)], axis=-1)
+    cloths = [AnimatedMesh(name, MOVING, FACES, corner_uvs=uvs) for name in names]
+    one = np.ones((len(CAPSULE.vertices), 1))
+    skin = Skin(
+        one, 0 * one.astype(int), np.tile(np.eye(3, 4), (4, 1, 1, 1)), np.zeros((1, 3)), [-1], ["hip"]
+    )
+    body = AnimatedMesh("body", MOVING, FACES, rest_positions=MOVING[0], skin=skin)
+    write_animated_glb(path, [*cloths, body], 1 / 30)
+    document = gltf.GLTF2().load(str(path))
+    for node in document.nodes:
+        if node.mesh is not None and node.skin is None:
+            node.rotation = Rotation.from_euler("y", turn, degrees=True).as_quat().tolist()
+    document.save(str(path))
+
+
+def test_a_mesh_that_shapes_move_is_read_from_glb_with_its_own_vertices(tmp_path):
+    write_shapes(tmp_path / "a.glb", "shirt", turn=90.0)
+    sequence = read_mesh_sequence(tmp_path / "a.glb")
+    turned = Rotation.from_euler("y", 90, degrees=True).apply(MOVING.reshape(-1, 3)).reshape(MOVING.shape)
+    np.testing.assert_allclose(sequence.positions, turned, atol=TOLERANCE)
+    np.testing.assert_array_equal(sequence.faces, FACES)
+    assert sequence.fps == pytest.approx(30.0, rel=1e-4)
+    slow = read_mesh_sequence(tmp_path / "a.glb", fps=15.0)
+    np.testing.assert_allclose(slow.positions, turned[::2], atol=TOLERANCE)
+
+
+def test_one_of_several_moving_meshes_of_a_glb_is_named(tmp_path):
+    write_shapes(tmp_path / "a.glb", "shirt", "skirt")
+    with pytest.raises(AssetError, match=r"it has shirt, skirt; name one, as in a\.glb#NAME"):
+        read_mesh_sequence(tmp_path / "a.glb")
+    assert read_mesh_sequence(f"{tmp_path / 'a.glb'}#skirt").positions.shape == MOVING.shape
+    write_shapes(tmp_path / "body.glb")
+    with pytest.raises(AssetError, match="0 meshes are moved by shapes"):
+        read_mesh_sequence(tmp_path / "body.glb")
+
+
+def garment_of(order=None):
+    one = np.ones((len(CAPSULE.vertices), 1))
+    return GarmentFile(MOVING[0], FACES, one, 0 * one.astype(int), one[:, 0] > 1, vertex_map=order)
+
+
+def test_positions_come_in_the_order_of_the_garment_whichever_of_its_files_they_are_in():
+    order = np.random.default_rng(0).permutation(len(CAPSULE.vertices))
+    order = np.concatenate([order, order[:3], [-1]])  # a seam, and a loose vertex
+    own = MeshSequence("own", MOVING, FACES, 30.0)
+    np.testing.assert_array_equal(in_vertex_order(own, garment_of(order)), MOVING)
+    in_file, back = MOVING[:, order], np.argsort(order[: len(CAPSULE.vertices)])
+    source = MeshSequence("source", in_file, back[FACES], 30.0)
+    np.testing.assert_array_equal(in_vertex_order(source, garment_of(order)), MOVING)
+    joined = MeshSequence("joined", in_file[:, :-4], back[FACES], 30.0)
+    np.testing.assert_array_equal(in_vertex_order(joined, garment_of(order)), MOVING)
+
+
+def test_quads_cut_along_the_other_diagonal_are_the_same_mesh():
+    x, y = np.meshgrid(np.arange(6.0), np.arange(6.0))
+    points = np.stack([x, y, 0 * x], axis=-1).reshape(1, -1, 3)
+    index = np.arange(36).reshape(6, 6)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    one, other = ([[a, b, c], [a, c, d]], [[a, b, d], [b, c, d]])
+    one, other = (np.concatenate([np.stack(part, 1) for part in cut]) for cut in (one, other))
+    garment = GarmentFile(points[0], one, np.ones((36, 1)), np.zeros((36, 1), int), np.zeros(36, bool))
+    np.testing.assert_array_equal(
+        in_vertex_order(MeshSequence("quads", points, other, 30.0), garment), points
+    )
+
+
+def test_another_order_or_another_mesh_is_refused():
+    shuffled = np.random.default_rng(0).permutation(len(CAPSULE.vertices))
+    with pytest.raises(MeshError, match="its vertices have another order"):
+        in_vertex_order(
+            MeshSequence("mine", MOVING[:, shuffled], np.argsort(shuffled)[FACES], 30.0), garment_of()
+        )
+    with pytest.raises(MeshError, match=f"has 10 vertices, the garment {len(CAPSULE.vertices)}"):
+        in_vertex_order(MeshSequence("mine", MOVING[:, :10], FACES[:1] % 10, 30.0), garment_of())

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from hard_cases.build import sheet
-from hard_cases.referee import intersecting_pairs, judge
+
+from eslr_jax.evaluation.referee import intersecting_pairs, judge
 
 pytest.importorskip("ipctk")
 

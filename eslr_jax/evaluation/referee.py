@@ -1,4 +1,4 @@
-"""Count intersecting triangles with the IPC Toolkit (extra `dev`); shares no code with the simulator's search."""
+"""Count intersecting triangles with the IPC Toolkit (extra `score`), not with the simulator's own search."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def intersecting_pairs(
     Raises:
         MissingExtraError: The IPC Toolkit is not installed.
     """
-    ipctk = require("ipctk", extra="dev", purpose="the referee")
+    ipctk = require("ipctk", extra="score", purpose="counting intersections")
     positions, faces = np.asarray(cloth, np.float64), np.asarray(cloth_faces, np.int32)
     if body is not None and body_faces is not None:
         faces = np.concatenate([faces, np.asarray(body_faces, np.int32) + len(positions)])

@@ -1,0 +1,194 @@
+"""`eslr score`: anybody's trajectory, measured as our own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import tyro
+
+from eslr_jax.cli.actor import check_skin, load_actor
+from eslr_jax.cli.console import app, print_report, say, stderr, use_compile_cache
+from eslr_jax.cli.options import Options
+from eslr_jax.errors import ConfigError, MeshError, MotionError
+
+if TYPE_CHECKING:
+    from eslr_jax.io.garment import GarmentFile
+    from eslr_jax.io.mesh_sequence import MeshSequence
+    from eslr_jax.io.run import Run
+    from eslr_jax.types import BodyMotion, Scene, Trajectory
+
+_GARMENT = "tshirt"
+_FAR = (
+    0.5  # [m] on average from where the garment is worn, from which a first frame is in other units or axes
+)
+_SAME_RATE = 0.01  # relative
+
+
+@app.command
+def score(
+    file: tyro.conf.Positional[str],
+    run: Path | None = None,
+    garment: str | None = None,
+    motion: str | None = None,
+    body: str | None = None,
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"] | None = None,
+    fabric: tuple[str, ...] = (),
+    every: int = 4,
+    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Score anybody's simulation: optimality gap, energies, stretch, penetration, intersections.
+
+    Say what was simulated by a run of `eslr simulate`, or by garment, body and motion. The gap counts in our
+    energy; it is of the frame that each of the trajectory's own states leads to.
+
+    Args:
+        file: The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in
+            their order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a
+            folder of OBJ or PLY files. Or a run of `eslr simulate`, which tells its own scene.
+        run: Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
+        garment: Garment as for `eslr simulate`; tshirt if not given.
+        motion: Motion as for `eslr simulate`; cmu_016_32 if not given, from its first frame on.
+        body: Body as for `eslr simulate`; anny if not given.
+        vertices: Resolution of a bundled garment; 1k if not given.
+        fabric: Fabric as for `eslr simulate`; cotton if not given.
+        every: Measure gap and intersections in one of so many frames.
+        json_: Print as JSON.
+    """
+    from eslr_jax.evaluation.report import environment
+    from eslr_jax.evaluation.score import score_trajectory
+    from eslr_jax.io.mesh_sequence import read_mesh_sequence
+    from eslr_jax.io.run import is_run, read_run
+
+    use_compile_cache()
+    names = {"garment": garment, "motion": motion, "body": body, "vertices": vertices, "fabric": fabric}
+    given = {name: value for name, value in names.items() if value}
+    with stderr.status("reading"):
+        is_own = is_run(file)
+        if given and (is_own or run is not None):
+            raise ConfigError(f"{run or file} tells its own scene; leave out --{', --'.join(given)}")
+        if is_own and run is not None:
+            raise ConfigError(f"{file} tells its own scene; leave out --run")
+        if is_own:
+            task = _own_task(read_run(file))
+        else:
+            sequence = read_mesh_sequence(file)
+            task = _named_task(sequence, given) if run is None else _run_task(sequence, read_run(run))
+    with stderr.status("scoring"):
+        result = score_trajectory(
+            task.trajectory, task.scene, poses=task.poses, parts=_parts(task.stored), every=every
+        )
+    result = {"file": file, **task.label, **result, **environment()}
+    if result["intersections_cloth"] is None:
+        say('intersections are not counted: that needs ipctk: pip install "eslr-jax[score]"')
+    if json_:
+        print(json.dumps(result, indent=2))
+    else:
+        print_report({"error": None, "tolerance": None, **result}, _figures(result))
+
+
+class _Task(NamedTuple):
+    """A trajectory and what it is of."""
+
+    trajectory: Trajectory | np.ndarray
+    scene: Scene
+    poses: BodyMotion | None
+    stored: GarmentFile | None
+    label: dict[str, Any]
+
+
+def _own_task(run: Run) -> _Task:
+    """Return a run as the trajectory of its own scene."""
+    from eslr_jax.evaluation.run_scene import run_garment, run_poses, run_scene, run_trajectory
+
+    scene = run_scene(run, *run_garment(run))
+    return _Task(run_trajectory(run, scene), scene, run_poses(run, scene), run.garment, {"run": run.name})
+
+
+def _run_task(sequence: MeshSequence, run: Run) -> _Task:
+    """Return a trajectory in the scene of a run, cut to its length."""
+    from eslr_jax.io.garment import in_vertex_order
+    from eslr_jax.scene.plan import first_frames
+
+    task = _own_task(run)
+    if run.garment is None:
+        raise ConfigError(
+            f"{run.name} has no garment.npz, which tells its garment; give a run of `eslr simulate`"
+        )
+    positions = in_vertex_order(sequence, run.garment)
+    count = len(positions)
+    if count > task.scene.num_frames:
+        raise MotionError(
+            f"{sequence.name} has {count} frames, {run.name} only {task.scene.num_frames}; cut it"
+        )
+    scene, poses = first_frames(task.scene, count), task.poses
+    if poses is not None:
+        poses = poses.replace(
+            positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
+        )
+    _check_sequence(sequence, positions, scene)
+    return task._replace(trajectory=positions, scene=scene, poses=poses)
+
+
+def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
+    """Return a trajectory in the scene of a garment, a body and a motion."""
+    import inspect
+
+    from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.cli.simulate import simulate
+    from eslr_jax.fabric import garment_material
+    from eslr_jax.io.garment import in_vertex_order
+    from eslr_jax.scene.plan import prepare_scene
+
+    usual = {name: entry.default for name, entry in inspect.signature(simulate).parameters.items()}
+    usual = {field.name: usual[field.name] for field in dataclasses.fields(Options)}
+    options = Options(**usual | given | {"frames": len(sequence.positions)})
+    rig, poses, motion = load_actor(options)
+    stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
+    positions = in_vertex_order(sequence, stored)
+    cloth = prepare_stored(stored, name=Path(options.garment).name)
+    check_skin(options.garment, cloth, rig, options.body)
+    scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
+    _check_sequence(sequence, positions, scene)
+    label = {"garment": options.garment, "motion": motion, "body": options.body}
+    return _Task(positions, scene, poses, stored, label)
+
+
+def _check_sequence(sequence: MeshSequence, positions: np.ndarray, scene: Scene) -> None:
+    """Raise unless a sequence has the rate of its scene and begins where the garment is worn."""
+    rate = 1.0 / float(scene.timestep)
+    if abs(sequence.fps - rate) > _SAME_RATE * rate:
+        raise MotionError(
+            f"{sequence.name} has {sequence.fps:g} frames a second, the scene {rate:g}; write it with {rate:g}"
+        )
+    away = np.linalg.norm(positions[0] - np.asarray(scene.initial_state.position), axis=1).mean()
+    if away > _FAR:
+        raise MeshError(
+            f"{sequence.name} begins {away:.3g} m from where the garment is worn; give metres, Y up, "
+            "on the body"
+        )
+
+
+def _parts(stored: GarmentFile | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return the parts of a garment file, which the worst places are named by."""
+    return (None, ()) if stored is None else (stored.face_parts, stored.part_names)
+
+
+def _figures(result: dict[str, Any]) -> dict[str, str]:
+    """Return what a score has besides a run's report, as text."""
+    rows = {
+        "optimality gap": (
+            f"{100 * result['gap_relative_median']:.3g} % of what a frame has to gain, "
+            f"{100 * result['gap_relative_max']:.3g} % at most; {1e3 * result['gap_median_j']:.3g} mJ "
+            f"(median of {result['gap_frames']} frames)"
+        ),
+    }
+    if result["intersections_cloth"] is not None:
+        rows["intersections"] = (
+            f"{result['intersections_cloth']} pairs of cloth and {result['intersections_body']} with the body in "
+            f"the last frame, {result['intersections_cloth_max']} and {result['intersections_body_max']} at most"
+        )
+    return rows

@@ -1,0 +1,97 @@
+"""The scene of a run on disk, as its folder tells it."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from eslr_jax.assets import prepare_stored
+from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.evaluation.foreign import foreign_trajectory
+from eslr_jax.fabric import garment_material
+from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.run import Run
+from eslr_jax.physics.air import blowing
+from eslr_jax.physics.materials import constants_for
+from eslr_jax.scene.build import initial_state, start_integrator
+from eslr_jax.types import (
+    BodyMotion,
+    Garment,
+    Material,
+    Scene,
+    SceneBody,
+    Trajectory,
+)
+
+
+def run_garment(run: Run) -> tuple[Garment, Material]:
+    """Return the garment and fabric of a run; without its file, frame 0 is the shape at rest."""
+    stored = run.garment
+    if stored is None:
+        first, faces = run.trajectory.positions[0].astype(np.float64), run.trajectory.faces
+        one, zero = np.ones((len(first), 1)), np.zeros((len(first), 1), np.int64)
+        stored = GarmentFile(first, faces, one, zero, np.zeros(len(first), bool))
+    garment = prepare_stored(stored, name=run.name, allow_components=True)
+    material = run.trajectory.material
+    if material is None:  # a run of an older version
+        material = garment_material(run.report.get("fabric", ()), garment, stored)
+    return garment, material
+
+
+def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bool = True) -> Scene:
+    """Return the scene of a run: with the faces that it searched, and pins as they moved.
+
+    Args:
+        run: Of `read_run`.
+        garment: Its garment, see `run_garment`.
+        material: Its fabric.
+        has_contact: Model what the cloth met; without it energies of the cloth alone are cheaper.
+    """
+    trajectory = run.trajectory
+    positions, velocities = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)
+    body = None
+    if has_contact and trajectory.body is not None and len(trajectory.body.contact_faces):
+        track = trajectory.body
+        surface = prepare_surface(track.rest_positions, track.contact_faces, boundary=track.contact_boundary)
+        has_skin = bool(run.report.get("skin_contacts"))
+        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids], has_skin=has_skin)
+    has_layers = has_contact and bool(run.report.get("self_contact"))
+    start = initial_state(positions[0], velocities[0]).replace(frame=jnp.int32(run.report.get("settle", 0)))
+    return Scene(
+        garment=garment,
+        material=material,
+        constants=constants_for(material),
+        initial_state=start_integrator(start, run.report.get("integrator", "euler")),
+        timestep=jnp.float32(trajectory.timestep),
+        body=body,
+        pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
+        num_frames=trajectory.num_frames,
+        self_contact=default_capacity(positions.shape[1]) if has_layers else None,
+        ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
+        air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
+        damping=run.report.get("damping_s"),
+    )
+
+
+def run_trajectory(run: Run, scene: Scene) -> Trajectory:
+    """Return the trajectory of a run in its scene, without energies and residuals, which no file holds."""
+    track = run.trajectory
+    loads = track.friction_loads  # None: a run of an older version, or somebody else's
+    return foreign_trajectory(track.positions, scene, velocities=track.velocities, friction_loads=loads)
+
+
+def run_poses(run: Run, scene: Scene) -> BodyMotion | None:
+    """Return the body of a run in motion, all faces obstacles; None where the file lacks it or its joints."""
+    track = run.trajectory.body
+    if track is None or track.skin is None or scene.body is None:
+        return None
+    return BodyMotion(
+        positions=jnp.asarray(track.positions),
+        joint_transforms=jnp.asarray(track.skin.joint_transforms),
+        faces=jnp.asarray(track.faces),
+        is_obstacle=jnp.ones(len(track.faces), bool),
+        timestep=scene.timestep,
+        rest_positions=jnp.asarray(track.rest_positions),
+        surface=scene.body.surface,
+    )

@@ -1,0 +1,139 @@
+"""The Blender add-on: its process with this Python alone, and all of it where BLENDER_PYTHON has `bpy`."""
+
+import os
+import subprocess
+import sys
+import time
+import tomllib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from formats import write_walker
+
+from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.topology import vertex_normals
+
+ROOT = Path(__file__).parents[2]
+ADDON = ROOT / "integrations" / "blender"
+BLENDER = os.environ.get("BLENDER_PYTHON")
+needs_blender = pytest.mark.skipif(BLENDER is None, reason="BLENDER_PYTHON names no Python with bpy")
+
+sys.path.insert(0, str(ADDON))
+from build import build  # noqa: E402
+
+sys.path.insert(0, str(ADDON / "eslr_garments"))
+from job import Job, JobError, simulation_steps  # noqa: E402
+
+
+@pytest.fixture
+def folder(tmp_path, body):
+    """A job's folder: a character that walks, and its shirt."""
+    write_walker(tmp_path / "body.glb", tmp_path / "garment.obj", body)
+    return tmp_path
+
+
+def steps(folder, python=sys.executable, fabric="cotton"):
+    return simulation_steps(python, folder, fabric, "5%", False)
+
+
+def run(job):
+    """Poll until the job is done; return what it said and how far it was."""
+    seen = []
+    while not job.poll():
+        seen.append((job.text, job.share))
+        time.sleep(0.05)
+    return seen
+
+
+def test_the_zip_holds_an_extension_under_the_gpl_and_the_wheel_does_not_hold_it(tmp_path):
+    path = build(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+        assert manifest["license"] == ["SPDX:GPL-3.0-or-later"]
+        assert path.name == f"{manifest['id']}-{manifest['version']}.zip"
+        assert b"GNU GENERAL PUBLIC LICENSE" in archive.read("LICENSE")
+        for name in archive.namelist():
+            if name.endswith(".py"):
+                assert archive.read(name).startswith(b"# SPDX-License-Identifier: GPL-3.0-or-later\n")
+    again = build(tmp_path / ".")
+    assert again.read_bytes() == path.read_bytes()
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel["packages"] == ["eslr_jax"]
+    assert not any("integrations" in name for name in wheel["force-include"])
+
+
+def test_a_python_without_the_simulator_is_told_in_one_line(tmp_path):
+    with pytest.raises(JobError, match=r"can't be started .* preferences"):
+        run(Job(steps(tmp_path, python=str(tmp_path / "python")), tmp_path))
+    bare = tmp_path / "bare"
+    bare.write_text(f'#!/bin/sh\nexec {sys.executable} -S -E "$@"\n')
+    bare.chmod(0o755)
+    with pytest.raises(JobError, match="this Python has no eslr_jax"):
+        run(Job(steps(tmp_path, python=str(bare)), tmp_path))
+
+
+@pytest.mark.slow
+def test_the_job_shows_how_far_it_is(folder):
+    seen = run(Job(steps(folder), folder))
+    texts, shares = zip(*seen, strict=True)
+    assert "fitting the garment" in texts
+    assert any(text.startswith("simulating, ") for text in texts)
+    assert list(shares) == sorted(shares)
+    with np.load(folder / "motion.npz") as motion:
+        assert motion["positions"].shape[1:] == (1000, 3)
+
+
+@pytest.mark.slow
+def test_a_refusal_of_the_simulator_is_the_job_s(folder):
+    with pytest.raises(JobError, match="did you mean denim"):
+        run(Job(steps(folder, fabric="denin"), folder))
+
+
+@pytest.mark.slow
+def test_a_cancelled_job_leaves_no_process(folder):
+    job = Job(steps(folder), folder)
+    job.poll()
+    process = job._process
+    job.cancel()
+    assert process.wait(15) != 0
+    assert not (folder / "motion.npz").exists()
+
+
+@pytest.mark.slow
+@needs_blender
+def test_from_install_to_a_garment_that_moves_with_the_body_and_stays_out_of_it(folder):
+    character = folder / "body.glb"
+    worker = Path(__file__).with_name("blender_addon_worker.py")
+    user = folder / "blender"
+    user.mkdir()
+    arguments = [build(folder), character, folder / "garment.obj"]
+
+    def blender(out, python, *fabric):
+        environment = os.environ | {"BLENDER_USER_RESOURCES": str(user)}
+        command = [BLENDER, worker, *arguments, python, out, *fabric]
+        done = subprocess.run(
+            list(map(str, command)), capture_output=True, text=True, env=environment, timeout=900, check=False
+        )
+        assert out.exists(), done.stderr
+        return np.load(out)
+
+    # Blender's Python is another one than the simulator's, whose packages it must not see.
+    shown = blender(folder / "out.npz", sys.executable)
+    assert list(shown["result"]) == ["FINISHED"], str(shown["error"])
+    cloth, body, faces = shown["cloth"], shown["body"], shown["faces"]
+    moved, way = (np.linalg.norm(np.diff(track, axis=0), axis=2).mean(axis=1) for track in (cloth, body))
+    assert (moved > 0.2 * way).all()
+    assert (moved < 5 * way).all()
+    for points, skin in zip(cloth, body, strict=True):
+        nearest, weights = closest_points(points, skin, faces)
+        away = points - np.einsum("pk,pkx->px", weights, skin[faces[nearest]])
+        outward = np.einsum("pk,pkx->px", weights, vertex_normals(skin, faces)[faces[nearest]])
+        depth = -np.sign(np.sum(away * outward, axis=1)) * np.linalg.norm(away, axis=1)
+        assert np.quantile(depth, 0.99) < 0  # frames between those that are simulated are their mean
+        assert depth.max() < 2e-3
+    assert list(shown["modifiers"]) == ["ESLR Garments"]
+    refused = blender(folder / "refused.npz", sys.executable, "denin")
+    assert "did you mean denim" in str(refused["error"])
+    np.testing.assert_array_equal(refused["cloth"][-1], refused["before"])

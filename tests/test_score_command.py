@@ -1,0 +1,76 @@
+"""`eslr score`: what a run says of itself, what its files say, and what is refused."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from test_cli import eslr, refused
+
+from eslr_jax.scene.build import skin_garment
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A short run, and its garment as other programs write it."""
+    folder = tmp_path_factory.mktemp("score")
+    options = ("--simulator", "physics", "--iterations", 50, "--frames", 8, "--no-pictures")
+    done = eslr("simulate", *options, "--out", folder / "run")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def carried(tshirt, walk):
+    """A T-shirt that the joints carry."""
+    return np.asarray(jax.jit(skin_garment)(tshirt, walk.joint_transforms))
+
+
+def scored(*arguments):
+    done = eslr("score", *arguments, "--json", "--every", 2)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_a_run_its_glb_and_its_npz_score_as_the_run_s_report_says(folder):
+    report = json.loads((folder / "run" / "report.json").read_text())
+    assert eslr("export", folder / "run", "--out", folder / "own.npz").returncode == 0
+    own = scored(folder / "run")
+    for file in (None, "own.npz", "run/animation.glb"):
+        score = own if file is None else scored(folder / file, "--run", folder / "run")
+        for name in (
+            "num_frames", "num_vertices", "max_principal_stretch", "p99_principal_stretch", "rms_speed_m_s",
+            "penetration_max_mm", "penetrating_share", "slide_m", "coverage", "total",
+        ):  # fmt: skip
+            assert score[name] == pytest.approx(report[name], rel=5e-3, abs=1e-6), (file, name)
+        assert score["gap_relative_median"] < 0.01
+        assert score["intersections_cloth"] == own["intersections_cloth"]
+
+
+@pytest.mark.slow
+def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
+    np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
+    done = eslr("score", folder / "carried.npz", "--motion", "cmu_016_32")
+    assert done.returncode == 0, done.stderr
+    assert "optimality gap" in done.stdout
+    assert "the garment stays where it was put on" in done.stdout
+    assert scored(folder / "carried.npz")["gap_relative_median"] > 0.1
+
+
+@pytest.mark.slow
+def test_what_can_t_be_scored_is_refused_in_one_line(tmp_path, carried, tshirt):
+    faces = np.asarray(tshirt.faces)
+    for name, arrays, words in (
+        ("far", {"positions": 100 * carried}, ("far.npz begins", "metres, Y up")),
+        ("slow", {"positions": carried, "fps": 24}, ("24 frames a second",)),
+        ("few", {"positions": carried[:2]}, ("2 frames are too few",)),
+        ("other", {"positions": carried[:, :900]}, ("900 vertices, the garment 1000",)),
+    ):
+        np.savez(tmp_path / f"{name}.npz", faces=faces % arrays["positions"].shape[1], **arrays)
+        refused(eslr("score", tmp_path / f"{name}.npz"), *words)
+    refused(eslr("score", tmp_path / "no.npz"), "doesn't exist")
+    refused(
+        eslr("score", tmp_path / "few.npz", "--run", tmp_path, "--garment", "tank"), "leave out --garment"
+    )
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz"}
