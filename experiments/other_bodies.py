@@ -1,6 +1,6 @@
 """The bundled garments on five other bodies: what carrying them there costs in stretch, and pictures.
 
-    python experiments/other_bodies.py --out out/bodies            # nine garments, five bodies, 100 frames of a walk
+    python experiments/other_bodies.py [--smoke] [--out DIR]
 
 The bodies are synthetic, since no SMPL model and no bought character may ship: the bundled body in other
 proportions and on other rigs, in T-poses, and a figure of capsules with a surface of its own.
@@ -8,14 +8,11 @@ proportions and on other rigs, in T-poses, and a figure of capsules with a surfa
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import time
-import warnings
 from pathlib import Path
-from typing import Any
 
+import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
@@ -25,16 +22,14 @@ from eslr_jax.body.rig import body_skeleton, make_body
 from eslr_jax.body.timing import with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.metrics import measure_frames
-from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.wear import wear_report
 from eslr_jax.fit.clearance import body_heights
 from eslr_jax.fit.postures import find_arms, rest_posture
-from eslr_jax.geometry.padding import choose_bucket, common_bucket, pad_alike
-from eslr_jax.io.atomic import atomic_write
+from eslr_jax.geometry.padding import choose_bucket, common_bucket
+from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Body
 
@@ -332,7 +327,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
             )
             for poses in (still, with_settling(walk, SETTLE))
         ]
-        at_rest, moving = (measure_frames(run.trajectory, run.scene) for run in runs)
+        at_rest, moving = (jax.device_get(measure_frames(run.trajectory, run.scene)) for run in runs)
         positions = np.asarray(runs[1].trajectory.positions)[SETTLE:]
         skinned = np.asarray(skin_garment(cloth, walk.joint_transforms))
         wear = wear_report(positions, cloth, skinned, walk)
@@ -355,7 +350,11 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
                 "skin_through_mm": wear["skin_through_mm"],
             },
             (np.asarray(still.positions[STILL]), np.asarray(runs[0].trajectory.positions[STILL])),
-            (np.asarray(walk.positions), positions, np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]),
+            (
+                np.asarray(walk.positions),
+                positions,
+                np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0],
+            ),
         )
 
 

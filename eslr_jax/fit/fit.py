@@ -45,8 +45,8 @@ def fit_garment(
         source: Garment of `read_garment_source`.
         body: The body in its rest pose.
         options: What is given instead of recognised.
-        made_for: The body that it was modelled on, if that is another one: it is put on that body first and carried
-            from there; see `transfer_garment`.
+        made_for: The body that it was modelled on, if that is another one: it is put on that body first and
+            carried from there; see `transfer_garment`.
 
     Returns:
         The garment; `metadata["fit"]` reports what was recognised, done and doubted.

@@ -97,8 +97,8 @@ def carry_shape(
     """Carry a garment's shape from a posed body to another body in the same pose.
 
     A spline through the joints and the crotch leads from one body to the other. Then the cloth moves along the
-    skin's normals until its distance from the skin is what it was, in proportion to the bodies; loose cloth follows
-    the cloth around it.
+    skin's normals until its distance from the skin is what it was, in proportion to the bodies; loose cloth
+    follows the cloth around it.
 
     Args:
         mesh: Garment vertices on the source [m], and triangles.
@@ -110,8 +110,8 @@ def carry_shape(
     Raises:
         MeshError: The target lacks arms or legs of known names, or does not stand at rest.
 
-    Source: Duchon 1977 (doi:10.1007/BFb0086566), the spline; Brouet et al. 2012 (doi:10.1145/2185520.2185532), the
-    aim to keep proportion, ease and shape.
+    Source: Duchon 1977 (doi:10.1007/BFb0086566), the spline; Brouet et al. 2012 (doi:10.1145/2185520.2185532),
+    the aim to keep proportion, ease and shape.
     """
     positions, faces = mesh
     joints = Skeleton(made_for.joint_names, made_for.parents, source.joints)
@@ -149,8 +149,8 @@ def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
             if part not in parts:
                 raise MeshError(
                     f"garments are carried between bodies with arms and legs, but no joint of one of them "
-                    f"({', '.join(rig.joint_names[:4])}, ...) is known as its {' '.join(part).replace('_', ' ')}; "
-                    "name the joints as Mixamo does, or give the mesh of a garment that fits"
+                    f"({', '.join(rig.joint_names[:4])}, ...) is known as its {' '.join(part).replace('_', ' ')}"
+                    "; name the joints as Mixamo does, or give the mesh of a garment that fits"
                 )
     ours = {part: joints for part, joints in ours.items() if part in theirs}
     try:
@@ -210,7 +210,7 @@ def _spline(start: np.ndarray, end: np.ndarray, size: float) -> Callable[[np.nda
 
 
 def _keep_ease(positions: np.ndarray, faces: np.ndarray, wanted: np.ndarray, posture: Posture) -> np.ndarray:
-    """Move cloth along the skin's normals to the wanted heights above the skin [m], together with its neighbours."""
+    """Move cloth along the skin's normals to the wanted heights above the skin [m], with its neighbours."""
     edges = unique_edges(faces)
     edge = float(np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1).mean())
     laplacian = scipy.sparse.csgraph.laplacian(
