@@ -21,7 +21,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.joints import find_parts
-from eslr_jax.body.motion import Motion, pose_body, shape_body, still_motion
+from eslr_jax.body.motion import Motion, obstacle_surface, pose_body, shape_body, still_motion
 from eslr_jax.body.rig import body_skeleton, make_body
 from eslr_jax.body.timing import with_settling
 from eslr_jax.body.units import UnitsWarning
@@ -35,7 +35,7 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton
 from eslr_jax.render import render_frame, side_by_side, write_png
-from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import last_frames, simulate
 from eslr_jax.types import Body
@@ -320,7 +320,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     own = [load_garment(name, vertices=vertices, body=body, cache=False) for name in garments]  # type: ignore[arg-type]
     took = (time.perf_counter() - began) / len(own)
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
-    surface = shared_surface(cloths, body)
+    surface = obstacle_surface(body)  # bodies of one topology then share a program
     options = SceneOptions(has_skin=True, integrator="bdf2", ground="off")
     still = pose_body(body, standing_motion(body, SETTLE + frames), arm_abduction=0.0)
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
@@ -355,7 +355,6 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
                 "walk_max_stretch": moving["max_principal_stretch"],
                 "walk_inside_mm": moving["penetration_max_mm"],
             },
-            (np.asarray(still.positions[STILL]), np.asarray(runs[0].trajectory.positions[STILL])),
             (
                 np.asarray(walk.positions),
                 positions,
@@ -373,7 +372,7 @@ def _picture(body: Body, panels: list[tuple[str, np.ndarray, np.ndarray, np.ndar
     """Return a strip of pictures: labels, body vertices, cloth vertices and faces."""
     faces = np.asarray(body.faces)
     pictures = [
-        render_frame(skin, faces, cloth, triangles, camera=25.0, size=(260, 400))
+        render_frame(skin, faces, cloth, triangles, camera=25.0, size=(180, 280))
         for _, skin, cloth, triangles in panels
     ]
     return side_by_side(pictures, tuple(label for label, *_ in panels))
@@ -388,7 +387,9 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     names, garments = (["figure"], GARMENTS[:1]) if arguments.smoke else (arguments.bodies, GARMENTS)
-    table: dict[str, Any] = {
+    path = arguments.out / "other_bodies.json"
+    table: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    table |= {
         "clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, "device": device_name(), **environment(),
     }  # fmt: skip
     for name in names:
@@ -396,7 +397,7 @@ def main() -> None:
             warnings.simplefilter("ignore", UnitsWarning)  # Mixamo's is in centimetres, on purpose
             body = load_body() if name == "bundled" else make_body(BODIES[name]())
         rows, panels = [], []
-        for row, (skin, cloth), (moving, positions, faces) in measure(
+        for row, (moving, positions, faces) in measure(
             body, garments, frames=SMOKE_FRAMES if arguments.smoke else FRAMES
         ):
             print(
@@ -404,14 +405,10 @@ def main() -> None:
                 {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()},
             )
             rows.append(row)
-            last = len(positions) - 1
-            panels += [
-                (row["garment"], skin, cloth, faces),
-                (f"frame {last}", moving[last], positions[last], faces),
-            ]
+            panels.append((row["garment"], moving[-1], positions[-1], faces))
         table[name] = rows
         write_png(arguments.out / f"other_bodies_{name}.png", _picture(body, panels))
-        with atomic_write(arguments.out / "other_bodies.json") as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(json.dumps(table, indent=1) + "\n")
 
 
