@@ -23,7 +23,17 @@ from eslr_jax.io.npz import read_arrays, write_arrays
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
 # A change in these makes every entry stale.
-_CODE = ("geometry", "fit", "io/mesh.py", "io/gltf_document.py", "io/garment.py", "types.py")
+_CODE = (
+    "geometry",
+    "fit",
+    "body/alignment.py",
+    "body/joints.py",
+    "body/lbs.py",
+    "io/mesh.py",
+    "io/gltf_document.py",
+    "io/garment.py",
+    "types.py",
+)
 
 
 def user_cache() -> Path:

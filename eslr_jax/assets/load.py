@@ -21,7 +21,8 @@ from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
-from eslr_jax.fit.options import FitOptions
+from eslr_jax.fit.options import FitOptions, Scale
+from eslr_jax.fit.transfer import transfer_garment
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.refine import refine
 from eslr_jax.geometry.validate import validate_body
@@ -49,6 +50,7 @@ DEFAULT_MOTION = "cmu_016_32"
 DEFAULT_MODEL = "eslr-small"
 START_MODEL = "smooth-small"  # the network that was trained to give the solver an initial guess
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
+_SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
 _REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices, see `geometry.refine`
 
 
@@ -138,7 +140,8 @@ def load_garment(
         name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
             or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
         vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
-        body: Body that a mesh is fitted to; the bundled one by default.
+        body: Body that is to wear it: a mesh is fitted to it, a bundled garment carried to it; by default the
+            bundled one.
         fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
         cache: Keep the result for the next time.
@@ -146,7 +149,7 @@ def load_garment(
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
-        MeshError: The mesh can't be simulated, or does not fit the body.
+        MeshError: The mesh can't be simulated, does not fit the body, or can't be carried to it.
     """
     stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
     return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
@@ -161,20 +164,22 @@ def load_garment_file(
     cache: bool = True,
     on_source: Callable[[GarmentSource], None] | None = None,
 ) -> GarmentFile:
-    """Load a garment as arrays on the host, fitted to the body if it is a mesh.
+    """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
 
     Args:
         name: Garment; see `load_garment`, also for the other arguments.
         vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
-        body: Body that a mesh is fitted to.
+        body: Body that is to wear it.
         fit: Options of the fit.
         cache: Keep the result for the next time.
         on_source: Function that is told of a mesh before it is fitted.
     """
     if not _is_path(str(name)):
-        if vertices in _REFINED:
-            return _refined(read_garment_npz(find_asset("garment", f"{name}_4k")), _REFINED[vertices])
-        return read_garment_npz(find_asset("garment", f"{name}_{vertices}"))
+        stored = read_garment_npz(
+            find_asset("garment", f"{name}_{'4k' if vertices in _REFINED else vertices}")
+        )
+        stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
+        return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
     path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
     if path.is_file() and is_garment_file(path):
         return read_garment_npz(path)
@@ -187,6 +192,26 @@ def load_garment_file(
     key = content_key("fit", path.read_bytes(), str(name), options, *_body_arrays(rig))
     arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
     return garment_from_arrays(arrays, source.name)
+
+
+def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:
+    """Return a bundled garment on a body; the bundled one wears it as it is."""
+    own = load_body()
+    if body is None or (
+        body.joint_names == own.joint_names
+        and body.rest_positions.shape == own.rest_positions.shape
+        and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)
+    ):
+        return stored
+    if not cache:
+        return transfer_garment(stored, own, body, scale=scale)
+    bends = () if body.pose_directions is None else (np.asarray(body.pose_directions),)
+    arrays = [array for _, array in sorted(garment_arrays(stored).items())]
+    key = content_key(
+        "transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends
+    )
+    carried = cached_arrays(key, lambda: garment_arrays(transfer_garment(stored, own, body, scale=scale)))
+    return garment_from_arrays(carried, "garment")
 
 
 def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:

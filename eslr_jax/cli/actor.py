@@ -43,17 +43,12 @@ def load_actor(options: Options) -> tuple[Any, Any, str]:
     return rig, pose_body(rig, clip, num_frames=options.frames, arm_abduction=options.arm_abduction), motion
 
 
-def check_skin(garment: str, cloth, rig, body: str) -> None:
-    """Refuse a garment that hangs on the joints of another body."""
+def check_skin(garment: str, cloth, rig) -> None:
+    """Refuse a fitted garment that hangs on the joints of another body."""
     import numpy as np
 
-    from eslr_jax.assets import asset_names, load_body
-
-    is_bundled = garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment")
-    if is_bundled and rig.joint_names != load_body().joint_names:
-        raise ConfigError(
-            f"garment {garment} hangs on the bundled body; for {body} give a mesh file (obj, ply, stl, glb), "
-            "which is fitted to it"
-        )
     if int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
-        raise ConfigError(f"{garment} was fitted to another body; give the mesh it was fitted from")
+        raise ConfigError(
+            f"{garment} was fitted to another body; give the mesh it was fitted from, or carry that mesh to this "
+            "body with eslr fit --made-for"
+        )

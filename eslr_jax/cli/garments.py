@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -13,26 +14,33 @@ from eslr_jax.cli.console import app, say, stderr, use_compile_cache
 from eslr_jax.errors import AssetError, MissingExtraError
 from eslr_jax.fit.options import FitOptions
 
+if TYPE_CHECKING:
+    from eslr_jax.io.garment import GarmentFile
+    from eslr_jax.types import Body
+
 
 @app.command
 def fit(
     garment: tyro.conf.Positional[str],
     out: Path,
     body: str = "anny",
+    made_for: str | None = None,
     options: Annotated[FitOptions, tyro.conf.arg(name="")] = FitOptions(),  # noqa: B008 - frozen
     fabric: tuple[str, ...] = (),
     picture: bool = True,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Fit a garment of your own to a body once, for `eslr simulate --garment OUT`.
+    """Fit a garment to a body once, for `eslr simulate --garment OUT`.
 
-    Unit, axes, place and the pose of the arms are recognised if they are not given. A picture beside OUT shows
-    the garment before and after.
+    Unit, axes, place and the pose of the arms are recognised if they are not given. A garment that was made for
+    another body is carried from that body to this one. A picture beside OUT shows the garment before and after.
 
     Args:
-        garment: A mesh (obj, ply, stl, glb, npz), or FILE.pkl#NAME of HOOD's garments.
+        garment: A mesh (obj, ply, stl, glb, npz), FILE.pkl#NAME of HOOD's garments, or the name of a bundled
+            garment for another body than the bundled one.
         out: The garment file to write, such as shirt.npz.
         body: Name of a bundled body, or a body file.
+        made_for: The body that the mesh was modelled on, if that is another one: a name or a file.
         options: What is given instead of recognised.
         fabric: Fabric as for `eslr simulate`; it is kept in the file.
         picture: Render the picture (extra `render`).
@@ -40,7 +48,7 @@ def fit(
     """
     from eslr_jax.assets import load_body, load_garment_file, prepare_stored
     from eslr_jax.fabric import garment_material
-    from eslr_jax.fit.report import describe_cost, describe_fit
+    from eslr_jax.fit.report import describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.garment import write_garment_npz
 
     if out.suffix != ".npz":
@@ -54,25 +62,47 @@ def fit(
 
     with stderr.status("fitting"):
         rig = load_body(body)
-        stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
-        if "fit" not in stored.metadata:
+        if made_for is None:
+            stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
+        else:
+            stored = _carry(garment, (rig, load_body(made_for)), options, describe_source)
+        report = stored.metadata.get("fit") or stored.metadata.get("transfer")
+        if report is None:
             raise AssetError(
-                f"{garment} needs no fit: it is bundled or already fitted; give it to eslr simulate, or give "
-                "eslr fit a mesh"
+                f"{garment} needs no fit: it is made for this body or already fitted; give it to eslr simulate, "
+                "or give eslr fit a mesh"
             )
         stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
         garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
     write_garment_npz(out, stored)
     if picture:
         _write_before_and_after(out.with_suffix(".png"), stored, rig)
-    report = stored.metadata["fit"]
     if json_:
         print(json.dumps(report, indent=2))
-        for text in report["warnings"]:
+        for text in report.get("warnings", ()):
             say(f"warning: {text}")
     else:
-        print(describe_fit(report))
+        print(describe_fit(report) if "fit" in stored.metadata else describe_transfer(report))
         print(out)
+
+
+def _carry(garment: str, bodies: tuple[Body, Body], options: FitOptions, on_source: Callable) -> GarmentFile:
+    """Return a mesh that was modelled on the second body, fitted to the first.
+
+    Raises:
+        AssetError: The garment is no mesh of its own.
+    """
+    from eslr_jax.assets import asset_names
+    from eslr_jax.fit.fit import fit_garment
+    from eslr_jax.io.garment import is_garment_file, read_garment_source
+
+    if garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment"):
+        raise AssetError(f"garment {garment} is made for the bundled body; leave out --made-for")
+    if Path(garment).is_file() and is_garment_file(garment):
+        raise AssetError(f"{garment} is fitted already; give the mesh that it was fitted from")
+    source = read_garment_source(garment)
+    on_source(source)
+    return fit_garment(source, bodies[0], options, made_for=bodies[1])
 
 
 def _write_before_and_after(path: Path, stored, rig) -> None:

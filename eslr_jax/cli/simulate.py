@@ -76,8 +76,8 @@ def simulate(
     Ctrl-C keeps the frames that are done, and --resume goes on from them.
 
     Args:
-        garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first;
-            see `eslr fit` where recognition fails.
+        garment: Name of a bundled garment (see `eslr assets`), which is carried to any body, or a mesh file,
+            which is fitted to the body first; see `eslr fit` where recognition fails.
         motion: Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO
             (.pkl), glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
             cmu_016_32.
@@ -172,7 +172,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
-    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit
+    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.run import ClothTrack, write_run
     from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
@@ -191,7 +191,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         method = _choose_method(options, request, num_vertices, choice)
         cloth = prepare_stored(stored, name=Path(options.garment).name, **_embedding(method.config.model))
         material = garment_material(options.fabric, cloth, stored)
-        check_skin(options.garment, cloth, rig, options.body)
+        check_skin(options.garment, cloth, rig)
         settle = (_SETTLE if method.config.iterations else 0) if options.settle is None else options.settle
         settling = with_settling(poses, settle)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
@@ -215,6 +215,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     if "fit" in stored.metadata:
         say(describe_fit(stored.metadata["fit"]))
+    if "transfer" in stored.metadata:
+        say(f"{options.garment} carried to {options.body}: {describe_transfer(stored.metadata['transfer'])}")
     if num_vertices >= LARGE:
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
     whole, timing, scene = _run(method, scene, done)

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.fit.clearance import push_out
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
 from eslr_jax.fit.placement import Placement, find_placement
-from eslr_jax.fit.postures import Posture, arm_postures, rest_posture, unpose
+from eslr_jax.fit.postures import Posture, arm_postures, rest_posture
 from eslr_jax.fit.remesh import remesh
+from eslr_jax.fit.rest import lay_to_rest
+from eslr_jax.fit.transfer import carry_shape
 from eslr_jax.fit.waist import Waist, find_waist
 from eslr_jax.geometry.repair import (
     Cleaned,
@@ -24,19 +25,17 @@ from eslr_jax.geometry.repair import (
     largest_component,
     weld,
 )
-from eslr_jax.geometry.skinning import transfer_skin_weights
 from eslr_jax.geometry.topology import face_areas, face_cross_products, vertex_components
 from eslr_jax.geometry.validate import check_arrays, validate_mesh
 from eslr_jax.io.garment import GarmentFile, GarmentSource
 from eslr_jax.types import Body
 
-_SMOOTHING = 3  # Laplacian steps over transferred skin weights, as for the bundled shirts
-_LOOSE_SMOOTHING = 20  # for skirts, or the two legs tear them, as for the bundled dresses
-_LOOSE = 0.05  # [m] from the body; a garment is loose if a tenth of its vertices are farther away
 _MAX_COORDINATE = 1e6  # beyond it no unit makes a garment
 
 
-def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = None) -> GarmentFile:
+def fit_garment(
+    source: GarmentSource, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
+) -> GarmentFile:
     """Clean a garment's mesh, put it on the body, and give it skin weights and pins.
 
     Lengths, areas and angles stay those of the file, unless it is remeshed. Lowering arms and moving vertices
@@ -46,12 +45,14 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
         source: Garment of `read_garment_source`.
         body: The body in its rest pose.
         options: What is given instead of recognised.
+        made_for: The body that it was modelled on, if that is another one: it is put on that body first and
+            carried from there; see `transfer_garment`.
 
     Returns:
         The garment; `metadata["fit"]` reports what was recognised, done and doubted.
 
     Raises:
-        MeshError: The mesh can't be repaired, or does not fit the body.
+        MeshError: The mesh can't be repaired, does not fit the body, or can't be carried to it.
         ConfigError: An option contradicts the garment.
     """
     options = options or FitOptions()
@@ -65,8 +66,13 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
     for option, value in (("weld", options.weld), ("join_gap", options.join_gap)):
         if not 0 <= value < np.inf:
             raise ConfigError(f"{option} = {value:g} is no distance; give 0 or more")
+    if made_for is None and options.scale != "body":
+        raise ConfigError(
+            f"scale {options.scale} is for a garment of another body; give that body too (eslr fit --made-for)"
+        )
+    worn_by = body if made_for is None else made_for
     clean, report = _clean(mesh.positions, mesh.faces, options)
-    postures = arm_postures(body) if options.arms == "auto" else [rest_posture(body)]
+    postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
     placement = find_placement(
         clean.positions,
         clean.faces,
@@ -89,12 +95,12 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
     validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
     report |= {"vertices": len(sewn), "faces": len(faces)}
 
-    clear, penetration = push_out(sewn, faces, posture) if options.push_out else (sewn, {})
-    weights, indices = _skin_weights(clear, faces, posture, body)
-    rest = clear
-    if posture.arm_angle is not None:
-        rest = unpose(clear, weights, indices, posture.transforms)
-        rest = push_out(rest, faces, postures[0])[0] if options.push_out else rest
+    placed, transfer = sewn, {}
+    if made_for is not None:
+        carried = carry_shape((sewn, faces), posture, made_for, body, scale=options.scale)
+        placed, sewn, transfer = carried.placed, carried.sewn, {"transfer": carried.report}
+    onto = posture if made_for is None else carried.posture
+    rest, weights, indices, penetration = lay_to_rest(placed, faces, onto, body, is_pushed=options.push_out)
     parts = None if mesh.face_parts is None else mesh.face_parts[face_source]
     file_pins = np.zeros(len(rest), bool)
     if source.is_pinned is not None and options.edge_length is None:
@@ -132,6 +138,7 @@ def fit_garment(source: GarmentSource, body: Body, options: FitOptions | None = 
                 "pinned": int(is_pinned.sum()),
                 "pinned_by": pinned_by,
                 "warnings": [*placement.warnings, *falling],
+                **transfer,
             },
         },
     )
@@ -217,22 +224,6 @@ def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     result = rows.copy()
     result[is_turned] = rows[is_turned][:, ::-1]
     return result
-
-
-def _skin_weights(
-    positions: np.ndarray, faces: np.ndarray, posture: Posture, body: Body
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return skin weights and joints of a garment, from the body in the garment's pose."""
-    is_loose = np.quantile(posture.heights(positions), 0.9) > _LOOSE
-    return transfer_skin_weights(
-        positions,
-        posture.positions,
-        posture.faces,
-        np.asarray(body.skin_weights, np.float64),
-        np.asarray(body.skin_indices),
-        smoothing_steps=_LOOSE_SMOOTHING if is_loose else _SMOOTHING,
-        faces=faces,
-    )
 
 
 def _describe(placement: Placement, posture: Posture) -> dict[str, Any]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-Unit = Literal["auto", "m", "cm", "mm", "in"]
+Unit = Literal["auto", "m", "dm", "cm", "mm", "in", "ft"]
 Axis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+Scale = Literal["body", "girth", "none"]
 
 WELD_TOLERANCE = 1e-5  # of the bounding box's diagonal: ten micrometres on a shirt, more than text rounds off
 _JOIN_GAP = 0.01  # [m] across which parts are joined: a seam allowance
@@ -31,6 +32,8 @@ class FitOptions:
             loop:NUMBER or loop:top|bottom|left|right|front|back. If not given, the pins in the file, or else the
             waistband of a garment that does not hang from the shoulders.
         push_out: Move vertices that lie inside the body out of it.
+        scale: Of a garment that was made for another body: cut it anew for this one (body), change all its
+            lengths by the ratio of the girths (girth), or keep them (none).
     """
 
     units: Unit | float = "auto"
@@ -44,3 +47,4 @@ class FitOptions:
     edge_length: float | None = None
     pin: tuple[str, ...] = ()
     push_out: bool = True
+    scale: Scale = "body"

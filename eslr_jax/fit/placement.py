@@ -15,6 +15,12 @@ from eslr_jax.fit.postures import Posture
 from eslr_jax.fit.scoring import DEEP, Sample, count_pierced, fit_cost, sample_garment, wearing_cost
 from eslr_jax.geometry.validate import UNITS
 
+_TRIED_UNITS = (
+    "m",
+    "cm",
+    "mm",
+    "in",
+)  # feet and decimetres have to be given: no garment's file was seen in them
 _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from a scarf to a long coat
 _SLIDE_STEP = 0.04  # [m] between tried heights
 _NEAR, _MIN_NEAR = 0.06, 0.03  # [m]; share of points nearer than that to the body below which nothing fits
@@ -277,11 +283,13 @@ def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: st
         if not factor > 0 or not np.isfinite(factor):
             raise MeshError(f"{name}: {units} metres per unit; give a positive number")
         return {factor: 1.0}
-    factors = [factor for factor in UNITS.values() if _MIN_DIAGONAL <= diagonal * factor <= _MAX_DIAGONAL]
+    factors = [
+        UNITS[unit] for unit in _TRIED_UNITS if _MIN_DIAGONAL <= diagonal * UNITS[unit] <= _MAX_DIAGONAL
+    ]
     if not factors:
         raise MeshError(
-            f"{name}: bounding-box diagonal {diagonal:.4g} is no garment's in {', '.join(UNITS)}; scale it, or "
-            "give the metres per unit"
+            f"{name}: bounding-box diagonal {diagonal:.4g} is no garment's in {', '.join(_TRIED_UNITS)}; scale "
+            "it, or give the metres per unit"
         )
     small = _SMALL_SHARE * float(np.ptp(body.positions[:, 1]))
     return {

@@ -29,7 +29,7 @@ class Posture:
     parents: tuple[int, ...]  # of the joints
     faces: Int[np.ndarray, "body_faces 3"]
     is_obstacle: Bool[np.ndarray, " body_faces"]
-    arm_angle: float | None  # degrees below the horizontal; None in the rest pose
+    arm_angle: float | None  # degrees below the horizontal, if it is one of `ARM_ANGLES`
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "body_vertices 3"]:
@@ -153,21 +153,37 @@ def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> 
 
 
 def _posture(body: Body, transforms: np.ndarray, angle: float | None) -> Posture:
-    """Return the posture of a body under joint maps."""
+    """Return the posture of a body under joint maps; without an angle, the rest pose."""
     transforms = np.asarray(transforms, np.float64)
-    rest = np.asarray(body.rest_positions, np.float64)
-    rest_joints = np.asarray(body.joint_rest_positions, np.float64)
-    weights, indices = np.asarray(body.skin_weights, np.float64), np.asarray(body.skin_indices)
-    posed = rest
+    posed = np.asarray(body.rest_positions, np.float64)
     if angle is not None:
-        blended = _blend(weights, indices, transforms)
-        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], rest) + blended[:, :, 3]
+        blended = _blend(np.asarray(body.skin_weights, np.float64), np.asarray(body.skin_indices), transforms)
+        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], posed) + blended[:, :, 3]
+    return take_posture(body, posed, transforms, angle)
+
+
+def take_posture(
+    body: Body,
+    positions: Float[np.ndarray, "body_vertices 3"],
+    transforms: Float[np.ndarray, "joints 3 4"],
+    arm_angle: float | None = None,
+) -> Posture:
+    """Return a body in a pose.
+
+    Args:
+        body: The body.
+        positions: Its vertices in the pose [m], shape [body_vertices, 3].
+        transforms: Maps of the joints from the rest pose to the pose, shape [joints, 3, 4].
+        arm_angle: Degrees of the arms below the horizontal, if they are at one of `ARM_ANGLES`.
+    """
+    transforms = np.asarray(transforms, np.float64)
+    rest_joints = np.asarray(body.joint_rest_positions, np.float64)
     return Posture(
-        positions=posed,
+        positions=np.asarray(positions, np.float64),
         transforms=transforms,
         joints=np.einsum("jxy,jy->jx", transforms[:, :, :3], rest_joints) + transforms[:, :, 3],
         parents=body.parents,
         faces=np.asarray(body.faces, np.int64),
         is_obstacle=np.asarray(body.is_obstacle),
-        arm_angle=angle,
+        arm_angle=arm_angle,
     )

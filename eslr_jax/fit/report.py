@@ -28,8 +28,20 @@ def describe_fit(report: dict[str, Any]) -> str:
             f"{after['inside']}, {after['depth_max_mm']:.1f} mm, after; moved by at most "
             f"{inside['push_out']['moved_max_mm']:.1f} mm"
         )
+    if "transfer" in report:
+        lines.append(f"carried to the body: {describe_transfer(report['transfer'])}")
     lines.append(f"pinned: {report['pinned']} vertices ({report['pinned_by']})")
     return "\n".join([*lines, *(f"warning: {text}" for text in report["warnings"])])
+
+
+def describe_transfer(report: dict[str, Any]) -> str:
+    """Return what a transfer did as one line, without the names of garment and body."""
+    cut = {
+        "body": "cut anew for it",
+        "girth": "all lengths scaled by its girth",
+        "none": "lengths kept as they were",
+    }[report["scale"]]
+    return f"{cut}; its girth is {report['girth']:.2f} and its length {report['length']:.2f} of what it was"
 
 
 def describe_cost(num_vertices: int) -> str | None:

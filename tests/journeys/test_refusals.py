@@ -244,6 +244,12 @@ OTHERS = {
     "a fit with an edge of nothing": (("fit", "skirt.obj", "--out", "a.npz", "--edge-length", "0"), "edge"),
     "a fit with a weld of nan": (("fit", "skirt.obj", "--out", "a.npz", "--weld", "nan"), "weld"),
     "a fit with a pin of no vertex": (("fit", "skirt.obj", "--out", "a.npz", "--pin", "vertices:99999"), "99999"),
+    "a size of a garment of no other body": (
+        ("fit", "skirt.obj", "--out", "a.npz", "--scale", "girth", "--no-picture"), "--made-for",
+    ),
+    "a bundled garment of another body": (
+        ("fit", "tank", "--out", "a.npz", "--made-for", "anny"), "made for the bundled body",
+    ),
     "a fit into a folder that is a file": (("fit", "skirt.obj", "--out", "key.toml/a.npz"), "key.toml"),
     "a map that is no table": (
         ("simulate", "--joint-map", "list.json", "--motion", "good.bvh", "--out", "t"), "list.json",

@@ -1,0 +1,238 @@
+"""Carry a garment from the body that it was made for to another one, of any rig, shape and rest pose."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.sparse.linalg import splu
+
+from eslr_jax.body.alignment import align_rests
+from eslr_jax.body.joints import Part, find_parts
+from eslr_jax.body.motion import Motion, pose_body
+from eslr_jax.body.retarget import local_rotations
+from eslr_jax.body.rig import body_skeleton
+from eslr_jax.errors import ConfigError, MeshError, MotionError
+from eslr_jax.fit.clearance import body_heights, push_out
+from eslr_jax.fit.options import Scale
+from eslr_jax.fit.postures import Posture, rest_posture, take_posture
+from eslr_jax.fit.rest import lay_to_rest
+from eslr_jax.geometry.topology import unique_edges
+from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.skeleton import Skeleton
+from eslr_jax.types import Body
+
+_JOINTS = ("upper_arm", "forearm", "hand", "upper_leg", "lower_leg", "foot")  # that all rigs have alike
+_NEEDED = ("upper_arm", "upper_leg")  # without them a trunk has no size
+_MIDLINE = 0.01  # of the body's height: vertices nearer to the middle than that can be the crotch
+_CROTCH = (0.15, 0.02)  # of the body's height: how far below and above the hip joints it can be
+_EASE = 0.03  # [m] from the skin, from which on cloth rather follows the cloth around it
+_REACHES = (0.6, 0.3, 0.15, 0.1, 0.06)  # [m] over which the cloth moves together, one after the other
+_ROUNDS = 3  # of each
+_UNSEEN = 1e-6  # weight of the offset where no skin is near
+
+
+class Carried(NamedTuple):
+    """A garment on another body, in the pose in which it was made."""
+
+    placed: Float[np.ndarray, "vertices 3"]  # outside the body [m]
+    sewn: Float[np.ndarray, "vertices 3"]  # with the lengths that it is to have [m]
+    posture: Posture  # the body in that pose
+    report: dict[str, Any]
+
+
+def transfer_garment(
+    garment: GarmentFile, source: Body, target: Body, *, scale: Scale = "body"
+) -> GarmentFile:
+    """Carry a garment from the body that it was made for to another one.
+
+    The bodies may differ in rig, shape, size and rest pose; their joints need names of a common family.
+
+    Args:
+        garment: A garment on the source body, such as a bundled one; see `load_garment_file`.
+        source: The body that it was made for.
+        target: The body that is to wear it.
+        scale: Which lengths the cloth gets. "body": the cut is graded, so that the ease stays that of the source
+            body, in proportion; "girth": all lengths change by one factor, the ratio of the girths; "none": the
+            cloth keeps its lengths.
+
+    Returns:
+        The garment in the target's rest pose, with skin weights of the target; `metadata["transfer"]` reports
+        what was done.
+
+    Raises:
+        ConfigError: The garment has a sewn shape of its own: it was fitted, and may have another pose.
+        MeshError: The target lacks arms or legs of known names, or does not stand at rest.
+    """
+    if garment.sewn_positions is not None:
+        raise ConfigError(
+            "a fitted garment can't be carried to another body; give the mesh it was fitted from, and the body "
+            "that it was made for (eslr fit --made-for)"
+        )
+    mesh = garment.rest_positions, garment.faces
+    carried = carry_shape(mesh, rest_posture(source), source, target, scale=scale)
+    rested = lay_to_rest(carried.placed, garment.faces, carried.posture, target)
+    return dataclasses.replace(
+        garment,
+        rest_positions=rested.positions,
+        skin_weights=rested.skin_weights,
+        skin_indices=rested.skin_indices,
+        sewn_positions=carried.sewn,
+        metadata=garment.metadata | {"transfer": carried.report},
+    )
+
+
+def carry_shape(
+    mesh: tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]],
+    source: Posture,
+    made_for: Body,
+    target: Body,
+    *,
+    scale: Scale,
+) -> Carried:
+    """Carry a garment's shape from a posed body to another body in the same pose.
+
+    A spline through the joints and the crotch leads from one body to the other. Then the cloth moves along the
+    skin's normals until its distance from the skin is what it was, in proportion to the bodies; loose cloth
+    follows the cloth around it.
+
+    Args:
+        mesh: Garment vertices on the source [m], and triangles.
+        source: The body that the garment was made for, in the pose in which it was made.
+        made_for: That body.
+        target: The body that is to wear it, at rest.
+        scale: Which lengths the cloth gets; see `transfer_garment`.
+
+    Raises:
+        MeshError: The target lacks arms or legs of known names, or does not stand at rest.
+
+    Source: Duchon 1977 (doi:10.1007/BFb0086566), the spline; Brouet et al. 2012 (doi:10.1145/2185520.2185532),
+    the aim to keep proportion, ease and shape.
+    """
+    positions, faces = mesh
+    joints = Skeleton(made_for.joint_names, made_for.parents, source.joints)
+    posture = pose_alike(target, joints)
+    here = _landmarks(source, joints)
+    there = _landmarks(posture, Skeleton(target.joint_names, target.parents, posture.joints))
+    # Hip joints are at quite different heights from rig to rig: they only stand in for the crotch.
+    passed = ("upper_leg",) if all(("", "crotch") in marks for marks in (here, there)) else ("crotch",)
+    shared = [part for part in here if part in there and part[1] not in passed]
+    start, end = (np.array([marks[part] for part in shared]) for marks in (here, there))
+    size = _size(start, end)
+    heights, _ = body_heights(positions, source)
+    graded = _keep_ease(_spline(start, end, size)(positions), faces, size * heights, posture)
+    placed, _ = push_out(graded, faces, posture)
+    is_trunk = np.abs(positions[:, 0]) < abs(here["left", "upper_arm"][0])
+    girth, length = _proportions(positions, placed, unique_edges(faces), is_trunk)
+    if scale == "body":
+        sewn = np.where(heights[:, None] > 0, placed, graded)  # what was tight stays tight
+    else:
+        sewn = positions * (girth if scale == "girth" else 1.0)
+    report = {"scale": scale, "girth": round(girth, 3), "length": round(length, 3)}
+    return Carried(placed, sewn, posture, report)
+
+
+def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
+    """Return a body whose limbs point where those of another skeleton point.
+
+    Raises:
+        MeshError: The body lacks arms or legs of known names, or does not stand at rest.
+    """
+    own = body_skeleton(body)
+    ours, theirs = find_parts(own), find_parts(skeleton)
+    for rig, parts in ((own, ours), (skeleton, theirs)):
+        for part in [(side, chain) for chain in _NEEDED for side in ("left", "right")]:
+            if part not in parts:
+                raise MeshError(
+                    f"garments are carried between bodies with arms and legs, but no joint of one of them "
+                    f"({', '.join(rig.joint_names[:4])}, ...) is known as its {' '.join(part).replace('_', ' ')}"
+                    "; name the joints as Mixamo does, or give the mesh of a garment that fits"
+                )
+    ours = {part: joints for part, joints in ours.items() if part in theirs}
+    try:
+        turned = align_rests(own, skeleton, ours, theirs, "of the garment")
+    except MotionError as error:
+        raise MeshError(
+            "no garment can be carried to a body that does not stand at rest; export it in a T-pose or A-pose"
+        ) from error
+    known = {joint for joints in ours.values() for joint in joints}
+    for joint, parent in enumerate(own.parents):
+        if parent >= 0 and joint not in known:
+            turned[joint] = turned[parent]
+    rotations = local_rotations(turned[None], own.parents)
+    pose = Motion("pose", rotations, own.rest_positions[:1], 30.0, body.joint_names, arm_abduction=0.0)
+    poses = pose_body(body, pose)
+    return take_posture(body, np.asarray(poses.positions[0]), np.asarray(poses.joint_transforms[0]))
+
+
+def _landmarks(posture: Posture, skeleton: Skeleton) -> dict[Part, np.ndarray]:
+    """Return places that correspond between bodies [m]: joints, and the crotch if it is clear where it is."""
+    places = {
+        part: skeleton.rest_positions[joints[0]]
+        for part, joints in find_parts(skeleton).items()
+        if part[1] in _JOINTS
+    }
+    crotch = _crotch(posture, 0.5 * (places["left", "upper_leg"] + places["right", "upper_leg"]))
+    return places if crotch is None else places | {("", "crotch"): crotch}
+
+
+def _crotch(posture: Posture, hips: np.ndarray) -> np.ndarray | None:
+    """Return the lowest point of the trunk between the legs [m]; None if the legs meet farther down."""
+    height = float(np.ptp(posture.positions[:, 1]))
+    points = posture.positions[posture.touchable]
+    middle = points[np.abs(points[:, 0] - hips[0]) < _MIDLINE * height, 1]
+    if not len(middle) or not -_CROTCH[0] * height < middle.min() - hips[1] < _CROTCH[1] * height:
+        return None
+    return np.array([hips[0], middle.min(), hips[2]])
+
+
+def _size(start: np.ndarray, end: np.ndarray) -> float:
+    """Return how many times farther apart the second places are than the first."""
+    spread = [np.sum((places - places.mean(axis=0)) ** 2) for places in (start, end)]
+    return float(np.sqrt(spread[1] / spread[0]))
+
+
+def _spline(start: np.ndarray, end: np.ndarray, size: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the smooth map of space that takes the first places to the second and scales by `size`."""
+
+    def kernel(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points[:, None] - start, axis=2)
+
+    system = np.block(
+        [[kernel(start), np.ones((len(start), 1))], [np.ones((1, len(start))), np.zeros((1, 1))]]
+    )
+    weights = np.linalg.solve(system, np.vstack([end - size * start, np.zeros((1, 3))]))
+    return lambda points: size * points + kernel(points) @ weights[:-1] + weights[-1]
+
+
+def _keep_ease(positions: np.ndarray, faces: np.ndarray, wanted: np.ndarray, posture: Posture) -> np.ndarray:
+    """Move cloth along the skin's normals to the wanted heights above the skin [m], with its neighbours."""
+    edges = unique_edges(faces)
+    edge = float(np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1).mean())
+    laplacian = scipy.sparse.csgraph.laplacian(
+        scipy.sparse.coo_array((np.ones(len(edges)), edges.T), (len(positions),) * 2), symmetrized=True
+    )
+    trust = 1.0 / (1.0 + (wanted / _EASE) ** 2)
+    result = positions
+    for reach in np.repeat(_REACHES, _ROUNDS):
+        heights, normals = body_heights(result, posture)
+        weight = np.where(normals.any(axis=1), trust, 0.0) + _UNSEEN
+        system = scipy.sparse.diags_array(weight) + (reach / edge) ** 2 * laplacian
+        result = result + splu(system.tocsc()).solve((weight * (wanted - heights))[:, None] * normals)
+    return result
+
+
+def _proportions(
+    before: np.ndarray, after: np.ndarray, edges: np.ndarray, is_trunk: np.ndarray
+) -> tuple[float, float]:
+    """Return how cloth around trunk and legs has changed: level lengths, and upright ones."""
+    edges = edges[is_trunk[edges].all(axis=1)]
+    spans = [np.abs(points[edges[:, 1]] - points[edges[:, 0]]) for points in (before, after)]
+    level, upright = (
+        [float(np.linalg.norm(span[:, axes], axis=1).sum()) for span in spans] for axes in ([0, 2], [1])
+    )
+    return level[1] / level[0], upright[1] / upright[0]
