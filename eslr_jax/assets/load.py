@@ -22,6 +22,7 @@ from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.refine import refine
 from eslr_jax.geometry.validate import validate_body
@@ -142,7 +143,8 @@ def load_garment(
         fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
         cache: Keep the result for the next time.
-        options: Arguments of `prepare_garment`.
+        options: Arguments of `prepare_stored` and of `prepare_garment`; those that a network asks for are its
+            `ModelConfig.garment_options`.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
@@ -213,7 +215,13 @@ def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:
 
 
 def prepare_stored(
-    stored: GarmentFile, *, pad: bool = False, cache: bool = True, name: str = "garment", **options: Any
+    stored: GarmentFile,
+    *,
+    pad: bool = False,
+    cache: bool = True,
+    name: str = "garment",
+    has_coarse_edges: bool = False,
+    **options: Any,
 ) -> Garment:
     """Prepare a garment file for simulation.
 
@@ -222,6 +230,7 @@ def prepare_stored(
         pad: Pad to a bucket of sizes.
         cache: Keep the result for the next time.
         name: Name of the garment in messages.
+        has_coarse_edges: Add the coarse edges that a hierarchical network reads.
         options: Arguments of `prepare_garment`.
 
     Raises:
@@ -244,12 +253,10 @@ def prepare_stored(
         leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
         return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
-    if not cache:
-        return to_device(Garment(**make()))
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
-    return to_device(
-        Garment(**cached_arrays(content_key("prepare", pad, sorted(options.items()), *own), make))
-    )
+    key = content_key("prepare", pad, sorted(options.items()), *own)
+    garment = Garment(**(cached_arrays(key, make) if cache else make()))
+    return to_device(add_coarse_edges(garment) if has_coarse_edges else garment)
 
 
 def _body_arrays(body: Body) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import warnings
 
-from eslr_jax.cli import assets, bodies, budget, evaluate, garments, play, runs, simulate, train
+from eslr_jax.cli import assets, bodies, budget, convert, evaluate, garments, play, runs, simulate, train
 from eslr_jax.cli.console import app, say
 from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
 from eslr_jax.errors import ConfigError, EslrError
@@ -24,6 +24,7 @@ COMMANDS = (
     train,
     evaluate,
     budget,
+    convert,
 )  # each has registered its own
 
 _REPEATABLE = ("--set",)

@@ -118,15 +118,7 @@ def evaluate(
 def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> list[Garment]:
     """Load garments padded to one bucket: all scenes then share one compiled rollout."""
     return pad_alike(
-        [
-            load_garment(
-                name,
-                vertices=vertices,  # type: ignore[arg-type]
-                embedding_size=model.embedding_size,
-                embedding_mode=model.embedding_mode,
-            )
-            for name in names
-        ]
+        [load_garment(name, vertices=vertices, **model.garment_options) for name in names]  # type: ignore[arg-type]
     )
 
 
