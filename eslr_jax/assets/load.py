@@ -397,15 +397,26 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
         AssetError: There is no such model, it can't take so many refinement steps, or the file is damaged.
         CheckpointError: The file is for another architecture or a newer version.
     """
-    parts = re.fullmatch(r"(.+):(\d+)", str(name))
-    model = parts[1] if parts else str(name)
-    params, config, _ = read_weights(Path(model) if _is_path(model) else find_asset("model", model))
-    if parts:
+    (params, config, _), steps = _read_model(str(name))
+    if steps:
         try:
-            config = dataclasses.replace(config, refinement_steps=int(parts[2]))
+            config = dataclasses.replace(config, refinement_steps=steps)
         except ValueError as error:
             raise AssetError(f"model {name}: {error}") from error
     return params, config
+
+
+def model_record(name: str | Path) -> dict[str, Any]:
+    """Return how a network was trained, as its file tells; the argument is that of `load_model`."""
+    return _read_model(str(name))[0][2]
+
+
+def _read_model(name: str) -> tuple[tuple[dict[str, Any], ModelConfig, dict[str, Any]], int]:
+    """Return weights, architecture and training record of a model, and the refinement steps asked for or 0."""
+    parts = re.fullmatch(r"(.+):(\d+)", name)
+    model = parts[1] if parts else name
+    path = Path(model) if _is_path(model) else find_asset("model", model)
+    return read_weights(path), int(parts[2]) if parts else 0
 
 
 def default_model() -> str:
