@@ -52,6 +52,7 @@ def trajectory_states(trajectory: Trajectory, scene: Scene) -> tuple[ClothState,
         position=trajectory.positions[:-1],
         velocity=trajectory.velocities[:-1],
         friction_load=trajectory.friction_loads[:-1],
+        frame=jnp.arange(count, dtype=jnp.int32),
         past=past_states(trajectory.positions, trajectory.velocities, scene, trajectory.residuals),
     )
     return states, frame_inputs(scene)

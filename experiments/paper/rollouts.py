@@ -6,11 +6,13 @@ import argparse
 import functools
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
+import jax
 import numpy as np
+import posed
 from hood_metrics import hood_metrics
 
 from eslr_jax.assets import load_body, load_garment, load_motion
@@ -27,13 +29,14 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
 from eslr_jax.physics.hood import HoodParameters
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
-OPTIMUM, GUESS = "optimum", "guess"
+OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
 CONTROLS: tuple[Control, ...] = get_args(Control)
 EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which networks were trained
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
@@ -58,7 +61,8 @@ class System(NamedTuple):
     config: SimConfig
     garment_options: dict[str, Any]  # of `load_garment`
     control: Control | None
-    cost: dict[str, float]  # parameters, and core-hours of the training where they are known
+    cost: Mapping[str, float]  # parameters, and core-hours of the training where they are known
+    replay: Callable[[Worn], Any] | None = None  # gives all positions of what does not see the cloth
 
 
 def read_system(name: str) -> System:
@@ -68,7 +72,13 @@ def read_system(name: str) -> System:
         name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
             NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
             CHANGE is a control of `evaluation.controls` or another mode of the geodesic embedding.
+            `SKINNED`, the garment carried by the joints, is the control of SYSTEM@FOLDER: one of `posed.SYSTEMS`
+            with the networks that `posed` trained there.
     """
+    if name == SKINNED:
+        return _replayed(lambda worn: skin_garment(worn.scene.garment, worn.poses.joint_transforms), {})
+    if "@" in name:
+        return _read_posed(*name.split("@", 1))
     if name in (OPTIMUM, GUESS):
         iterations = _OPTIMUM_ITERATIONS if name == OPTIMUM else 0
         return System(*simulator_of(SOLVER, iterations), ModelConfig().garment_options, None, {})
@@ -89,6 +99,29 @@ def read_system(name: str) -> System:
     return System(params, config, options, control, cost if hours is None else {**cost, "core_hours": hours})
 
 
+def _read_posed(kind: str, folder: str) -> System:
+    """Return a system that sees the motion alone; its training cost is that of all its garments' networks."""
+    found = [posed.read_network(path) for path in sorted(Path(folder).glob(f"{kind}_*.npz"))]
+    if not found:
+        raise SystemExit(f"{kind}@{folder}: {folder} holds no {kind}_GARMENT.npz; train it with posed.py")
+    cost = {
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(found[0][0].params)),
+        "core_hours": sum(training["core_hours"] for _, training in found),
+    }
+
+    def positions(worn: Worn) -> Any:
+        network, _ = posed.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")
+        return posed.displace(network, worn.scene.garment, worn.poses.joint_transforms)
+
+    return _replayed(positions, cost)
+
+
+def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
+    """Return the system whose positions are known beforehand."""
+    config = SimConfig(model=posed.Replay(), iterations=0)
+    return System(None, config, ModelConfig().garment_options, None, cost, positions)
+
+
 class Setting(NamedTuple):
     """What the rows of a table share."""
 
@@ -105,18 +138,33 @@ class Reference(NamedTuple):
     gap: OptimalityGap  # from some of its states
 
 
-def scenes_of(system: System, setting: Setting) -> Iterator[tuple[str, Scene, float]]:
-    """Yield garment, scene and height of the root joint in the first frame [m]; all share a compiled rollout."""
-    for name, scene, height in _prepare(tuple(system.garment_options.items()), setting):
+class Worn(NamedTuple):
+    """A garment on a clip."""
+
+    garment: str
+    scene: Scene
+    poses: BodyMotion
+
+    def root_height(self) -> float:
+        """Return the height of the root joint in the first frame [m]."""
+        rest = np.append(np.asarray(load_body().joint_rest_positions[0]), 1.0)
+        return float((self.poses.joint_transforms[0, 0] @ rest)[1])
+
+
+def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Any]]:
+    """Yield every garment on every clip with the system's weights; all share a compiled rollout."""
+    for worn in _prepare(tuple(system.garment_options.items()), setting):
+        params = system.params
         if system.control is not None:
-            scene = scene.replace(garment=control_garment(system.control, scene.garment))
-        yield name, scene, height
+            changed = control_garment(system.control, worn.scene.garment)
+            worn = worn._replace(scene=worn.scene.replace(garment=changed))
+        if system.replay is not None:
+            params = system.replay(worn)
+        yield worn, params
 
 
 @functools.lru_cache(maxsize=1)
-def _prepare(
-    garment_options: tuple[tuple[str, Any], ...], setting: Setting
-) -> list[tuple[str, Scene, float]]:
+def _prepare(garment_options: tuple[tuple[str, Any], ...], setting: Setting) -> list[Worn]:
     """Return what `scenes_of` yields; most systems ask for the same."""
     body = load_body()
     motions = [
@@ -127,19 +175,18 @@ def _prepare(
     worn = [load_garment(name, vertices=setting.vertices, **dict(garment_options)) for name in names]  # type: ignore[arg-type]
     poses = motions * len(setting.garments)
     scenes = prepare_scenes(worn, poses, [COTTON] * len(worn))
-    root = np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
-    heights = [float((moving.joint_transforms[0, 0] @ root)[1]) for moving in poses]
-    return list(zip(names, scenes, heights, strict=True))
+    return [Worn(*row) for row in zip(names, scenes, poses, strict=True)]
 
 
 def find_references(setting: Setting) -> list[Reference]:
     """Return the near-optimal rollout of every scene, and the optima from its states."""
     system = read_system(OPTIMUM)
     found = []
-    for name, scene, _ in scenes_of(system, setting):
-        trajectory = rollout_scene(system.params, scene, system.config)
-        found.append(Reference(trajectory, trajectory_gap(trajectory, scene, every=_gap_every(setting))))
-        print(name, OPTIMUM, flush=True)
+    for worn, params in scenes_of(system, setting):
+        trajectory = rollout_scene(params, worn.scene, system.config)
+        gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
+        found.append(Reference(trajectory, gap))
+        print(worn.garment, OPTIMUM, flush=True)
     return found
 
 
@@ -153,12 +200,12 @@ def measure_system(
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
     gaps: dict[str, list[np.ndarray]] = {}
-    for (garment, scene, height), (reference, gap) in zip(
-        scenes_of(system, setting), references, strict=True
-    ):
-        trajectory = rollout_scene(system.params, scene, system.config)
-        row = measure(trajectory, scene, height) | {"distance_mm": distance_mm(trajectory, reference, scene)}
-        left = stepped_potentials(system.params, reference, scene, system.config, every) - gap.optimum
+    for (worn, params), (reference, gap) in zip(scenes_of(system, setting), references, strict=True):
+        garment, scene, _ = worn
+        trajectory = rollout_scene(params, scene, system.config)
+        row = measure(trajectory, scene, worn.root_height())
+        row["distance_mm"] = distance_mm(trajectory, reference, scene)
+        left = stepped_potentials(params, reference, scene, system.config, every) - gap.optimum
         measured.setdefault(garment, []).append(row)
         gaps.setdefault(garment, []).append(np.stack([left * 1e3, left / gap.initial_gap]))
     measured["all"] = list(itertools.chain.from_iterable(measured.values()))

@@ -106,7 +106,7 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     """Return the rows of a table: with those of the controls, and of other embeddings for unseen garments."""
     changed = dict(rows)
     for label, (name, *_) in rows.items():
-        model = None if name in (GUESS, OPTIMUM) else read_system(name).config.model
+        model = read_system(name).config.model
         if isinstance(model, ModelConfig):
             changes = CONTROLS[: len(CONTROLS) if model.attention_blocks else 2] if has_controls else ()
             if table == "unseen_garments" and model.attention_blocks:
@@ -174,6 +174,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
             return make_stepper(params, config)(frame_problem(scene, state, inputs), state)[0].position
 
         memory = jax.jit(forward).lower(system.params, scene.initial_state).compile().memory_analysis()
+        assert memory is not None
         parts[label] = (forward, (system.params, scene.initial_state))
         found[label] = {
             **system.cost,
