@@ -38,6 +38,7 @@ from eslr_jax.types import BodyMotion, Scene, Trajectory
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
 OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
 CONTROLS: tuple[Control, ...] = get_args(Control)
+CONTROLS_OF_WEIGHTS = CONTROLS[:2]  # the others are of the geodesic embedding
 EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which networks were trained
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
@@ -248,9 +249,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
 
 
 def write(result: dict[str, Any], path: Path) -> None:
-    """Write a result with the versions that made it, and print its mean rows."""
+    """Write a result with the versions that made it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n")
-    for model, row in result.get("mean", {}).items():
-        print(model, " ".join(f"{name} {value:.3g}" for name, value in row.items()))

@@ -10,23 +10,25 @@ parameters, layers, latency and memory of the full-size networks and of ours, on
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
 bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the gap
-from the optimum's states, and the energies of free rollouts. --controls adds each network untrained, with a
-decoder of zeros, and with zero and random geodesic coordinates.
+from the optimum's states, and the energies of free rollouts; a second row says it of the same network untrained.
+--controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from rollouts import (
     CONTROLS,
+    CONTROLS_OF_WEIGHTS,
     GUESS,
     OPTIMUM,
     Setting,
+    System,
     arguments,
     find_references,
     measure_system,
@@ -79,13 +81,13 @@ def main() -> None:
     }
     for name in chosen.tables:
         if name == "model_cost":
-            result = cost_table(rows, chosen.vertices, chosen.smoke)
+            write(cost_table(rows, chosen.vertices, chosen.smoke), chosen.out / f"{name}.json")
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
             file = chosen.out / f"{name}.json"
             known = json.loads(file.read_text()) if chosen.keep and file.exists() else {}
-            result = energy_table(with_changes(rows, name, chosen.controls), setting, known)
-        write(result, chosen.out / f"{name}.json")
+            for result in energy_table(with_changes(rows, name, chosen.controls), setting, known):
+                write(result, file)
 
 
 def table_setting(
@@ -108,15 +110,16 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     for label, (name, *_) in rows.items():
         model = read_system(name).config.model
         if isinstance(model, ModelConfig):
-            changes = CONTROLS[: len(CONTROLS) if model.attention_blocks else 2] if has_controls else ()
+            fitting = CONTROLS if model.attention_blocks else CONTROLS_OF_WEIGHTS
+            changes = fitting if has_controls else fitting[:1]
             if table == "unseen_garments" and model.attention_blocks:
                 changes = (*changes, "raw", "landmarks")
             changed |= {f"{label}, {change}": (f"{name}~{change}",) for change in changes}
     return changed
 
 
-def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> dict[str, Any]:
-    """Return the measures of every row: means over seeds, the seeds' own, and those of every garment.
+def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the table after every row: means over seeds, the seeds' own, and those of every garment.
 
     Args:
         rows: Names by label.
@@ -142,11 +145,11 @@ def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> dict[st
             parts["seeds"][label] = {
                 column: [seed["all"][column] for seed in seeds] for column in seeds[0]["all"]
             }
-    for label, row in parts["mean"].items():
-        untrained = parts["mean"].get(f"{label}, untrained")
-        if untrained is not None:
-            row["learned_share"] = untrained["gap_share"] - row["gap_share"]
-    return {**shared, **parts}
+        with_control, _, _ = label.partition(", untrained")
+        if with_control != label and with_control in parts["mean"]:
+            row = parts["mean"][with_control]
+            row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
+        yield {**shared, **parts}
 
 
 def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
@@ -154,15 +157,13 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
 
     Memory is what XLA allocates for the call, weights included.
     """
-    systems = {label: read_system(name) for label, (name, *_) in rows.items()}
+    read = {label: read_system(name) for label, (name, *_) in rows.items()}
+    systems = {label: system for label, system in read.items() if system.replay is None}
     for name in FULL_SIZE[-1:] if is_smoke else FULL_SIZE:
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
-        systems[name] = systems[next(iter(systems))]._replace(
-            params=params,
-            config=SimConfig(model=config, iterations=0),
-            garment_options=config.garment_options,
-            cost=cost,
+        systems[name] = System(
+            params, SimConfig(model=config, iterations=0), config.garment_options, None, cost
         )
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
