@@ -46,6 +46,15 @@ class ModelConfig:
     remat: Literal["layers", "products", "none"] = "products"  # what a layer keeps for its backward pass
     seed: int = 0  # of the random attention features
 
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """Return the arguments of `assets.load_garment` for a garment that this network reads."""
+        return {
+            "embedding_size": self.embedding_size,
+            "embedding_mode": self.embedding_mode,
+            "has_coarse_edges": self.hierarchical,
+        }
+
     def __post_init__(self) -> None:
         """Reject impossible or contradictory values.
 

@@ -23,6 +23,7 @@ from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions, Scale
 from eslr_jax.fit.transfer import transfer_garment
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.refine import refine
 from eslr_jax.geometry.validate import validate_body
@@ -145,7 +146,8 @@ def load_garment(
         fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
         cache: Keep the result for the next time.
-        options: Arguments of `prepare_garment`.
+        options: Arguments of `prepare_stored` and of `prepare_garment`; those that a network asks for are its
+            `ModelConfig.garment_options`.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
@@ -238,7 +240,13 @@ def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:
 
 
 def prepare_stored(
-    stored: GarmentFile, *, pad: bool = False, cache: bool = True, name: str = "garment", **options: Any
+    stored: GarmentFile,
+    *,
+    pad: bool = False,
+    cache: bool = True,
+    name: str = "garment",
+    has_coarse_edges: bool = False,
+    **options: Any,
 ) -> Garment:
     """Prepare a garment file for simulation.
 
@@ -247,6 +255,7 @@ def prepare_stored(
         pad: Pad to a bucket of sizes.
         cache: Keep the result for the next time.
         name: Name of the garment in messages.
+        has_coarse_edges: Add the coarse edges that a hierarchical network reads.
         options: Arguments of `prepare_garment`.
 
     Raises:
@@ -269,12 +278,10 @@ def prepare_stored(
         leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
         return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
-    if not cache:
-        return to_device(Garment(**make()))
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
-    return to_device(
-        Garment(**cached_arrays(content_key("prepare", pad, sorted(options.items()), *own), make))
-    )
+    key = content_key("prepare", pad, sorted(options.items()), *own)
+    garment = Garment(**(cached_arrays(key, make) if cache else make()))
+    return to_device(add_coarse_edges(garment) if has_coarse_edges else garment)
 
 
 def _body_arrays(body: Body) -> list[np.ndarray]:
@@ -415,15 +422,26 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
         AssetError: There is no such model, it can't take so many refinement steps, or the file is damaged.
         CheckpointError: The file is for another architecture or a newer version.
     """
-    parts = re.fullmatch(r"(.+):(\d+)", str(name))
-    model = parts[1] if parts else str(name)
-    params, config, _ = read_weights(Path(model) if _is_path(model) else find_asset("model", model))
-    if parts:
+    (params, config, _), steps = _read_model(str(name))
+    if steps:
         try:
-            config = dataclasses.replace(config, refinement_steps=int(parts[2]))
+            config = dataclasses.replace(config, refinement_steps=steps)
         except ValueError as error:
             raise AssetError(f"model {name}: {error}") from error
     return params, config
+
+
+def model_record(name: str | Path) -> dict[str, Any]:
+    """Return how a network was trained, as its file tells; the argument is that of `load_model`."""
+    return _read_model(str(name))[0][2]
+
+
+def _read_model(name: str) -> tuple[tuple[dict[str, Any], ModelConfig, dict[str, Any]], int]:
+    """Return weights, architecture and training record of a model, and the refinement steps asked for or 0."""
+    parts = re.fullmatch(r"(.+):(\d+)", name)
+    model = parts[1] if parts else name
+    path = Path(model) if _is_path(model) else find_asset("model", model)
+    return read_weights(path), int(parts[2]) if parts else 0
 
 
 def default_model() -> str:

@@ -9,7 +9,19 @@ from __future__ import annotations
 import sys
 import warnings
 
-from eslr_jax.cli import assets, bodies, budget, evaluate, garments, play, runs, score, simulate, train
+from eslr_jax.cli import (
+    assets,
+    bodies,
+    budget,
+    convert,
+    evaluate,
+    garments,
+    play,
+    runs,
+    score,
+    simulate,
+    train,
+)
 from eslr_jax.cli.console import app, say
 from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
 from eslr_jax.errors import ConfigError, EslrError
@@ -25,6 +37,7 @@ COMMANDS = (
     evaluate,
     score,
     budget,
+    convert,
 )  # each has registered its own
 
 _REPEATABLE = ("--set",)

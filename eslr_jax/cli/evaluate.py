@@ -23,6 +23,7 @@ def evaluate(
     gap_frames: int = 40,
     every: int = 4,
     rollout_frames: int = 300,
+    control: Literal["untrained", "no_decoder", "no_embedding", "random_embedding"] | None = None,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
     """Evaluate a network on a split: optimality gap, and free rollouts.
@@ -37,6 +38,8 @@ def evaluate(
         gap_frames: Frames of each clip from which the gap is measured.
         every: Of those, measure one in so many.
         rollout_frames: Length of the free rollouts; clips are played back and forth.
+        control: Take something away, to see what it does: weights that were never trained, a decoder of zeros,
+            geodesic coordinates that are zero, or random ones.
         json_: Print as JSON.
     """
     from eslr_jax.assets import load_model
@@ -53,6 +56,7 @@ def evaluate(
         gap_frames=gap_frames,
         every=every,
         rollout_frames=rollout_frames,
+        control=control,
     )
     use_compile_cache()
     with progress("evaluating", 1) as advance:
@@ -63,7 +67,7 @@ def evaluate(
             iterations=iterations,
             on_scene=lambda done, total, label: advance(done, total),
         )
-    result = {"model": model, "iterations": iterations, **result, **environment()}
+    result = {"model": model, "iterations": iterations, "control": control, **result, **environment()}
     if json_:
         print(json.dumps(result, indent=2))
         return

@@ -24,7 +24,7 @@ from eslr_jax.cli.options import (
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
 
 if TYPE_CHECKING:
-    from eslr_jax.config import ModelConfig, SimConfig
+    from eslr_jax.config import SimConfig
     from eslr_jax.io.garment import GarmentFile
     from eslr_jax.simulation.budget import Choice
     from eslr_jax.simulation.simulate import Simulation
@@ -149,6 +149,11 @@ class _Method(NamedTuple):
     budget_ms: float | None
     tolerance: float | None
 
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """What the network asks of a garment."""
+        return getattr(self.config.model, "garment_options", {})
+
 
 def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bool) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report."""
@@ -189,7 +194,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         )
         num_vertices = len(stored.rest_positions)
         method = _choose_method(options, request, num_vertices, choice)
-        cloth = prepare_stored(stored, name=Path(options.garment).name, **_embedding(method.config.model))
+        cloth = prepare_stored(stored, name=Path(options.garment).name, **method.garment_options)
         material = garment_material(options.fabric, cloth, stored)
         check_skin(options.garment, cloth, rig)
         settle = (_SETTLE if method.config.iterations else 0) if options.settle is None else options.settle
@@ -308,13 +313,6 @@ def _choose_method(
         tolerance=0.0 if choice is None else choice.tolerance,
     )
     return _Method(simulator, model, params, config, choice, budget_ms, tolerance)
-
-
-def _embedding(architecture: ModelConfig | None) -> dict[str, Any]:
-    """Return how a garment's embedding has to be for a network."""
-    if architecture is None:
-        return {}
-    return {"embedding_size": architecture.embedding_size, "embedding_mode": architecture.embedding_mode}
 
 
 def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:

@@ -14,6 +14,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, s
 from eslr_jax.body.motion import Motion, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import simulated_terms
@@ -39,6 +40,7 @@ class EvaluationOptions:
     gap_frames: int = 40  # frames of each clip for the gap
     every: int = 4  # of those, measure one in so many
     rollout_frames: int = 300  # of the free rollout; clips are played back and forth
+    control: Control | None = None  # what the network is deprived of; see `controls`
 
     def __post_init__(self) -> None:
         """Reject lengths that leave nothing to measure.
@@ -85,6 +87,9 @@ def evaluate(
     drifts: dict[str, float] = {}
     total = len(garments) * len(clips)
     cloths = _load_alike(garments, options.vertices, model)
+    if options.control is not None:
+        params = control_params(options.control, params, model)
+        cloths = [control_garment(options.control, cloth) for cloth in cloths]
     surface = shared_surface(cloths, body)
     for garment, cloth in zip(garments, cloths, strict=True):
         for clip in clips:
@@ -118,15 +123,7 @@ def evaluate(
 def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> list[Garment]:
     """Load garments padded to one bucket: all scenes then share one compiled rollout."""
     return pad_alike(
-        [
-            load_garment(
-                name,
-                vertices=vertices,  # type: ignore[arg-type]
-                embedding_size=model.embedding_size,
-                embedding_mode=model.embedding_mode,
-            )
-            for name in names
-        ]
+        [load_garment(name, vertices=vertices, **model.garment_options) for name in names]  # type: ignore[arg-type]
     )
 
 
@@ -164,10 +161,21 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
 
 def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any]:
     """Return the measures of one free rollout, beside those of the solver's on the same scene."""
-    measured = measure_rollout(simulate(params, scene, config=config, raises=False).trajectory, scene)
+    trajectory = simulate(params, scene, config=config, raises=False).trajectory
+    measured = measure_rollout(trajectory, scene)
     near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
     reference = simulate(None, scene, config=near_optimum, raises=False).trajectory
-    return {**measured, "optimum": measure_rollout(reference, scene)}
+    return {
+        **measured,
+        "distance_mm": distance_mm(trajectory, reference, scene),
+        "optimum": measure_rollout(reference, scene),
+    }
+
+
+def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> float:
+    """Return how far two rollouts of a scene are apart: mean over vertices and simulated frames [mm]."""
+    apart = np.asarray(trajectory.positions)[1:] - np.asarray(reference.positions)[1:]
+    return float(np.linalg.norm(apart[:, np.asarray(scene.garment.vertex_mask)], axis=-1).mean() * 1e3)
 
 
 def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
@@ -226,5 +234,6 @@ def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
     if "optimum" in scenes[0]:
         ratios = [scene["coverage"] / max(scene["optimum"]["coverage"], 1e-9) for scene in scenes]
         pooled["coverage_worst_ratio"] = float(np.min(ratios))
+        pooled["distance_mm"] = float(np.mean([scene["distance_mm"] for scene in scenes]))
         pooled["optimum"] = _pool_rollouts([scene["optimum"] for scene in scenes])
     return pooled

@@ -16,7 +16,7 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
-from eslr_jax.simulation.stepper import find_start, past_state
+from eslr_jax.simulation.stepper import find_start, make_stepper, past_state
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
@@ -159,6 +159,30 @@ def gap_medians(ends: OptimalityGap, energy: Float[Array, " frames"]) -> dict[st
         "gap_mean_j": float(np.mean(gap)),
         "gap_p90_j": float(np.quantile(gap, 0.9)),
     }
+
+
+@partial(jax.jit, static_argnames=("config", "every"))
+def stepped_potentials(
+    params: Any, trajectory: Trajectory, scene: Scene, config: SimConfig, every: int
+) -> Float[Array, " frames"]:
+    """Return the potential [J] that a simulator's single frames end with, from the states of a trajectory.
+
+    Args:
+        params: Weights of its network; None without one.
+        trajectory: Supplies the states.
+        scene: Its scene.
+        config: Network and iterations; static.
+        every: Take every so many frames, as `GapOptions` does; static.
+    """
+    frames = jax.tree.map(lambda leaf: leaf[1::every], trajectory_states(trajectory, scene))
+    stepper = make_stepper(params, config)
+
+    def measure(frame: tuple[ClothState, FrameInput]) -> Float[Array, ""]:
+        state, inputs = frame
+        problem = frame_problem(scene, state, inputs)
+        return potential(stepper(problem, state)[0].position, problem)
+
+    return jax.lax.map(measure, frames)
 
 
 def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> OptimalityGap:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry import topology
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
 from eslr_jax.geometry.groups import compact_groups
 from eslr_jax.geometry.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
@@ -111,13 +112,14 @@ def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list
     """Pad garments to one bucket, so that they share compiled functions and can be stacked.
 
     Args:
-        garments: Unpadded garments.
+        garments: Unpadded garments; those with coarse edges get them anew, padded too.
         bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
     """
     if bucket is None:
         bucket = common_bucket([garment_bucket(garment) for garment in garments])
         bucket = bucket._replace(vertices=bucket.vertices + 1)
-    return [to_device(pad_garment(garment, bucket)) for garment in garments]
+    padded = [pad_garment(garment, bucket) for garment in garments]
+    return [to_device(add_coarse_edges(one) if one.coarse is not None else one) for one in padded]
 
 
 def to_device(garment: Garment) -> Garment:

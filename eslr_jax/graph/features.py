@@ -173,8 +173,11 @@ def hood_edge_features(
 
 
 def hood_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 9"]:
-    """Return vertex minus body point 3 [m], its norm, the same with the body's next frame 4, timestep [s]."""
-    now, later = inputs.position - contacts.points, inputs.position - contacts.next_points
+    """Return body point minus vertex 3 [m], its norm, the same with the body's next frame 4, timestep [s].
+
+    As on mesh edges, that is sender minus receiver.
+    """
+    now, later = contacts.points - inputs.position, contacts.next_points - inputs.position
     return jnp.concatenate(
         [
             now,

@@ -10,7 +10,7 @@ import io
 import math
 import pickle
 import pickletools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,13 @@ class _Stub:
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
+
+
+class _OrderedDict(dict):
+    """collections.OrderedDict; attributes, such as those of PyTorch's weights, are no content and are dropped."""
+
+    def __setstate__(self, state: Any) -> None:
+        pass
 
 
 class _Reconstructor(_Stub):
@@ -143,26 +150,31 @@ def _text(value: Any) -> str:
     return value.decode("latin1") if isinstance(value, bytes) else value
 
 
-def _stub(convert: Callable[[_Stub, _Plain], Any]) -> type:
-    """Return a class of stubs for one global."""
+def make_stub(convert: Callable[[Any, Callable[[Any], Any]], Any]) -> type:
+    """Return a class of stubs for one global.
+
+    Args:
+        convert: Makes plain data of a stub, with its `arguments` and `state`. Its second argument does the same
+            for what the stub holds.
+    """
     return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
 
 
 _ALLOWED: dict[str, type] = {
     "copyreg._reconstructor": _Reconstructor,
     "builtins.object": _Stub,  # the base that _reconstructor names
-    "builtins.bytes": _stub(_bytes),
-    "_codecs.encode": _stub(_bytes),
-    "collections.OrderedDict": dict,
-    "numpy.dtype": _stub(_dtype),
-    "numpy.ndarray": _stub(_array),
-    "numpy._core.multiarray._reconstruct": _stub(_array),  # an array that gets its state later
-    "numpy._core.multiarray.scalar": _stub(_scalar),
-    "numpy._core.numeric._frombuffer": _stub(_buffer),
-    "scipy.sparse.csc.csc_matrix": _stub(_sparse(scipy.sparse.csc_array)),
-    "scipy.sparse.csr.csr_matrix": _stub(_sparse(scipy.sparse.csr_array)),
-    "chumpy.ch.Ch": _stub(_chumpy),
-    "chumpy.reordering.Select": _stub(_chumpy_select),
+    "builtins.bytes": make_stub(_bytes),
+    "_codecs.encode": make_stub(_bytes),
+    "collections.OrderedDict": _OrderedDict,
+    "numpy.dtype": make_stub(_dtype),
+    "numpy.ndarray": make_stub(_array),
+    "numpy._core.multiarray._reconstruct": make_stub(_array),  # an array that gets its state later
+    "numpy._core.multiarray.scalar": make_stub(_scalar),
+    "numpy._core.numeric._frombuffer": make_stub(_buffer),
+    "scipy.sparse.csc.csc_matrix": make_stub(_sparse(scipy.sparse.csc_array)),
+    "scipy.sparse.csr.csr_matrix": make_stub(_sparse(scipy.sparse.csr_array)),
+    "chumpy.ch.Ch": make_stub(_chumpy),
+    "chumpy.reordering.Select": make_stub(_chumpy_select),
 }
 _RENAMED = {  # modules of Python 2, of NumPy before 2 and of SciPy since 1.8
     "copy_reg": "copyreg",
@@ -177,11 +189,20 @@ _RENAMED = {  # modules of Python 2, of NumPy before 2 and of SciPy since 1.8
 class _Unpickler(pickle.Unpickler):
     """Finds the stubs and nothing else."""
 
+    def __init__(self, data: bytes, stubs: Mapping[str, type], find_persistent: Callable[[Any], Any] | None):
+        super().__init__(io.BytesIO(data), encoding="latin1")
+        self._stubs, self._find_persistent = stubs, find_persistent
+
     def find_class(self, module_name: str, global_name: str) -> Any:
         name = f"{_RENAMED.get(module_name, module_name)}.{global_name.replace('_array', '_matrix')}"
-        if name not in _ALLOWED:
+        if name not in self._stubs:
             raise pickle.UnpicklingError(f"it names {module_name[:60]}.{global_name[:60]}, which is not data")
-        return _ALLOWED[name]
+        return self._stubs[name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        if self._find_persistent is None:
+            raise pickle.UnpicklingError("it names data outside of the file")
+        return self._find_persistent(pid)
 
 
 def read_pickle(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> Any:
@@ -201,9 +222,27 @@ def read_pickle(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> 
         AssetError: The file is missing, damaged or too large, or it holds anything else.
     """
     with parsing(path, content, max_bytes=max_bytes, form=" as a pickle", remedy="write it again") as file:
-        data = file.read_bytes()
-        _check_memo(data)
-        return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), {})
+        return unpickle(file.read_bytes())
+
+
+def unpickle(
+    data: bytes,
+    *,
+    stubs: Mapping[str, type] | None = None,
+    find_persistent: Callable[[Any], Any] | None = None,
+) -> Any:
+    """Return the content of a pickle as plain data; see `read_pickle`.
+
+    Args:
+        data: The pickle.
+        stubs: Further globals that it may name, as `module.name`, each with its class of `make_stub`.
+        find_persistent: Returns the stub for a persistent id, where the pickle may refer to data outside of it.
+
+    Raises:
+        Exception: The pickle is damaged or holds anything but data; of any class, so call it within `parsing`.
+    """
+    _check_memo(data)
+    return _plain(_Unpickler(data, {**_ALLOWED, **(stubs or {})}, find_persistent).load(), {})
 
 
 def _check_memo(data: bytes) -> None:
@@ -231,7 +270,7 @@ def _plain(value: Any, done: dict[int, Any]) -> Any:
         def plain(item: Any) -> Any:
             return _plain(item, done)
 
-        if type(value) is dict:
+        if type(value) in (dict, _OrderedDict):
             done[id(value)] = {plain(key): plain(item) for key, item in value.items()}
         elif type(value) in (list, tuple):
             done[id(value)] = type(value)(map(plain, value))

@@ -14,7 +14,6 @@ from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene.plan import shared_surface
@@ -68,13 +67,10 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         ConfigError: The split is unknown or empty, or no clip has two frames.
         AssetError: A garment does not exist.
     """
-    options = {"embedding_size": config.model.embedding_size, "embedding_mode": config.model.embedding_mode}
+    options = config.model.garment_options
     unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    garments = pad_alike(unpadded)
-    if config.model.hierarchical:
-        garments = [add_coarse_edges(garment) for garment in garments]
     return build_training_data(
-        garments, load_body(), [load_motion(clip) for clip in split_clips(config.split)]
+        pad_alike(unpadded), load_body(), [load_motion(clip) for clip in split_clips(config.split)]
     )
 
 

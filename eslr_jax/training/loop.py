@@ -74,6 +74,7 @@ def train(
     step_functions = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.step)
+    spent = core_seconds(out) - time.process_time()
     metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
     with metrics_file.open("a") as log, contextlib.ExitStack() as stack:
         is_stopping: Callable[[int], bool] | None = None
@@ -89,7 +90,11 @@ def train(
                 means = _means(window)
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
-                record = {"step": done, "seconds": time.perf_counter() - began, "its": speed, **means}
+                seconds = {
+                    "seconds": time.perf_counter() - began,
+                    "core_seconds": spent + time.process_time(),
+                }
+                record = {"step": done, **seconds, "its": speed, **means}
                 log.write(json.dumps(record) + "\n")
                 log.flush()
                 on_progress(done, config.steps, record)
@@ -114,9 +119,21 @@ def train(
 def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
     """Write the network of a run as npz and JSON, and return the npz file."""
     path = out / "model.npz"
-    training = {"steps": int(state.step), "garments": config.garments, "vertices": config.vertices}
+    training = {
+        "steps": int(state.step),
+        "garments": config.garments,
+        "vertices": config.vertices,
+        "core_hours": core_seconds(out) / 3600,
+    }
     write_weights(path, jax.device_get(state.params), config.model, training)
     return path
+
+
+def core_seconds(out: Path) -> float:
+    """Return the processor time that a run has taken so far, summed over cores and resumptions [s]."""
+    metrics = out / "metrics.jsonl"
+    lines = metrics.read_text().splitlines() if metrics.exists() else []
+    return json.loads(lines[-1]).get("core_seconds", 0.0) if lines else 0.0
 
 
 def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:

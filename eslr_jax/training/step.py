@@ -210,7 +210,7 @@ def _sample_gradient(
         lambda: start_trajectory(entry.key, data, garment, config),
         lambda: entry.slot,
     )
-    problem = _problem(slot, data, garment, config)
+    problem = slot_problem(slot, data, garment, config)
     terms_of = potential_terms
     if config.energy_set == "hood":
         terms_of = _hood_terms(slot, data, step // config.horizon)
@@ -233,7 +233,7 @@ def _sample_gradient(
     return gradient, _Sample(slot, metrics, statistics)
 
 
-def _problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig) -> FrameProblem:
+def slot_problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig) -> FrameProblem:
     """Pose the body at both ends of the frame and state the frame's problem."""
     transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
     body = BodyStep(data.body(transforms, slot.girth), data.body(later, slot.girth))

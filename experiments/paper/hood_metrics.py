@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -32,6 +33,7 @@ class HoodMetrics(NamedTuple):
     gradient_norm: Float[Array, " steps"]  # mean over vertices of the total's gradient [N]
 
 
+@partial(jax.jit, static_argnames="criterion")
 def hood_metrics(
     positions: Float[Array, "frames vertices 3"],
     scene: Scene,

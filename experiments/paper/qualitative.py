@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from native_garments import ABLATION, BUNDLED
-from rollouts import OPTIMUM, arguments, simulator, write
+from rollouts import OPTIMUM, arguments, read_system, write
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
@@ -30,6 +29,7 @@ from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
+MODELS = ("mgn-5-correction", "eslr-5-correction", "eslr-small", "smooth-small+20", OPTIMUM)
 _SIZE = (240, 340)  # of a picture, width and height [pixels]
 _CAMERA = 25.0  # [degrees] from the front towards the side
 _FULL_SCALE = 0.98  # quantile of the optimum's energy per area at which the colours end
@@ -85,19 +85,23 @@ def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
 
 def main() -> None:
     """Simulate, render and write."""
-    chosen = arguments(__doc__, frames=90)
+    parser = arguments(__doc__)
+    parser.add_argument("--frames", type=int, default=90, help="of every rollout")
+    chosen = parser.parse_args()
     clip = load_splits()["motions"]["test"][0]
-    models, garments = (*ABLATION[::-1], *BUNDLED, OPTIMUM), GARMENTS
+    models, garments = MODELS, GARMENTS
     if chosen.smoke:
-        models, garments = models[-1:], garments[:1]
+        models, garments, chosen.frames = models[-1:], garments[:1], 5
     body = load_body()
     poses = pose_body(body, back_and_forth(load_motion(clip), chosen.frames), num_frames=chosen.frames)
     results: dict[tuple[str, str], tuple[Any, Scene, np.ndarray]] = {}
     for name in models:
-        params, config, options = simulator(name)
+        system = read_system(name)
         for garment in garments:
-            scene = prepare_scene(load_garment(garment, vertices=chosen.vertices, **options), poses)
-            positions = rollout_scene(params, scene, config).positions
+            scene = prepare_scene(
+                load_garment(garment, vertices=chosen.vertices, **system.garment_options), poses
+            )
+            positions = rollout_scene(system.params, scene, system.config).positions
             results[name, garment] = np.asarray(positions), scene, np.asarray(face_energies(positions, scene))
             print(name, garment, flush=True)
 

@@ -1,111 +1,228 @@
-"""Free rollouts, measured by HOOD's six terms and their Total, as in its tables and the paper's."""
+"""Systems by name, and free rollouts measured by HOOD's six terms and their Total, as in the paper's tables."""
 
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
+import jax
 import numpy as np
+import posed
 from hood_metrics import hood_metrics
 
 from eslr_jax.assets import load_body, load_garment, load_motion
+from eslr_jax.assets.load import model_record
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
-from eslr_jax.evaluation.evaluate import back_and_forth
+from eslr_jax.evaluation.controls import Control, control_garment, control_params
+from eslr_jax.evaluation.evaluate import back_and_forth, distance_mm
+from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
+from eslr_jax.models.registry import count_parameters
 from eslr_jax.physics.hood import HoodParameters
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
-OPTIMUM = "optimum"
+OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
+CONTROLS: tuple[Control, ...] = get_args(Control)
+CONTROLS_OF_WEIGHTS = CONTROLS[:2]  # the others are of the geodesic embedding
+EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which networks were trained
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
 _OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.05 % of the initial gap
+_GAP_FRAMES = 10  # of every rollout, from whose states the gap is measured
 
 
-def arguments(description: str | None, *, frames: int = 150) -> argparse.Namespace:
-    """Read the options that every script of this folder has."""
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of the options that every script of this folder has."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=frames, help="of every rollout")
     parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="few frames of one garment on one clip")
-    chosen = parser.parse_args()
-    if chosen.smoke:
-        chosen.frames = 5
-    return chosen
+    return parser
 
 
-def simulator(model: str) -> tuple[Any, SimConfig, dict[str, Any]]:
-    """Return weights, configuration and garment options of a network, or of the optimum.
+class System(NamedTuple):
+    """A simulator of the tables."""
 
-    Args:
-        model: Name of a bundled network, NAME+20 for twenty solver iterations behind it, or `OPTIMUM`.
-    """
-    if model == OPTIMUM:
-        return *simulator_of(SOLVER, _OPTIMUM_ITERATIONS), {}
-    name, _, iterations = model.partition("+")
-    params, config = simulator_of(name, int(iterations or 0))
-    return params, config, embedding_options(config.model)
+    params: Any  # weights; None without a network
+    config: SimConfig
+    garment_options: dict[str, Any]  # of `load_garment`
+    control: Control | None
+    cost: Mapping[str, float]  # parameters, and core-hours of the training where they are known
+    replay: Callable[[Worn], Any] | None = None  # gives all positions of what does not see the cloth
 
 
-def embedding_options(config: ModelConfig | None) -> dict[str, Any]:
-    """Return the options of `load_garment` that a network asks for."""
-    names = ("embedding_size", "embedding_mode")
-    return {} if config is None else {name: getattr(config, name) for name in names}
-
-
-def table(
-    models: Sequence[str],
-    garments: Sequence[str],
-    clips: Sequence[str],
-    *,
-    vertices: str = "1k",
-    frames: int = 150,
-    **garment_options: Any,
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the measures of every model on every garment, as means over clips.
+def read_system(name: str) -> System:
+    """Return the system of a name.
 
     Args:
-        models: Names as `simulator` takes them.
-        garments: Names of bundled garments.
-        clips: Names of bundled clips, played back and forth.
-        vertices: Resolution of the garments.
-        frames: Length of every rollout.
-        garment_options: Options of `load_garment` in place of the model's own.
+        name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
+            NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
+            CHANGE is a control of `evaluation.controls` or another mode of the geodesic embedding.
+            `SKINNED`, the garment carried by the joints, is the control of SYSTEM@FOLDER: one of `posed.SYSTEMS`
+            with the networks that `posed` trained there.
     """
+    if name == SKINNED:
+        return _replayed(lambda worn: skin_garment(worn.scene.garment, worn.poses.joint_transforms), {})
+    if "@" in name:
+        return _read_posed(*name.split("@", 1))
+    if name in (OPTIMUM, GUESS):
+        iterations = _OPTIMUM_ITERATIONS if name == OPTIMUM else 0
+        return System(*simulator_of(SOLVER, iterations), ModelConfig().garment_options, None, {})
+    network, _, change = name.partition("~")
+    network, _, iterations = network.partition("+")
+    params, config = simulator_of(network, int(iterations or 0))
+    assert isinstance(config.model, ModelConfig)
+    options, control = config.model.garment_options, None
+    if change in EMBEDDINGS:
+        options = {**options, "embedding_mode": change}
+    elif change in CONTROLS:
+        control = change
+        params = control_params(control, params, config.model)
+    elif change:
+        raise SystemExit(f"{name}: no change {change!r}; there are {', '.join((*CONTROLS, *EMBEDDINGS))}")
+    cost = {"parameters": count_parameters(params)}
+    hours = model_record(network).get("core_hours")
+    return System(params, config, options, control, cost if hours is None else {**cost, "core_hours": hours})
+
+
+def _read_posed(kind: str, folder: str) -> System:
+    """Return a system that sees the motion alone; its training cost is that of all its garments' networks."""
+    found = [posed.read_network(path) for path in sorted(Path(folder).glob(f"{kind}_*.npz"))]
+    if not found:
+        raise SystemExit(f"{kind}@{folder}: {folder} holds no {kind}_GARMENT.npz; train it with posed.py")
+    cost = {
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(found[0][0].params)),
+        "core_hours": sum(training["core_hours"] for _, training in found),
+    }
+
+    def positions(worn: Worn) -> Any:
+        network, _ = posed.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")
+        return posed.displace(network, worn.scene.garment, worn.poses.joint_transforms)
+
+    return _replayed(positions, cost)
+
+
+def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
+    """Return the system whose positions are known beforehand."""
+    config = SimConfig(model=posed.Replay(), iterations=0)
+    return System(None, config, ModelConfig().garment_options, None, cost, positions)
+
+
+class Setting(NamedTuple):
+    """What the rows of a table share."""
+
+    garments: tuple[str, ...]  # names of bundled garments
+    clips: tuple[str, ...]  # names of bundled clips, played back and forth
+    frames: int  # of every rollout
+    vertices: str
+
+
+class Reference(NamedTuple):
+    """The near-optimal rollout of a scene."""
+
+    trajectory: Trajectory
+    gap: OptimalityGap  # from some of its states
+
+
+class Worn(NamedTuple):
+    """A garment on a clip."""
+
+    garment: str
+    scene: Scene
+    poses: BodyMotion
+
+    def root_height(self) -> float:
+        """Return the height of the root joint in the first frame [m]."""
+        rest = np.append(np.asarray(load_body().joint_rest_positions[0]), 1.0)
+        return float((self.poses.joint_transforms[0, 0] @ rest)[1])
+
+
+def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Any]]:
+    """Yield every garment on every clip with the system's weights; all share a compiled rollout."""
+    for worn in _prepare(tuple(system.garment_options.items()), setting):
+        params = system.params
+        if system.control is not None:
+            changed = control_garment(system.control, worn.scene.garment)
+            worn = worn._replace(scene=worn.scene.replace(garment=changed))
+        if system.replay is not None:
+            params = system.replay(worn)
+        yield worn, params
+
+
+@functools.lru_cache(maxsize=1)
+def _prepare(garment_options: tuple[tuple[str, Any], ...], setting: Setting) -> list[Worn]:
+    """Return what `scenes_of` yields; most systems ask for the same."""
     body = load_body()
     motions = [
-        pose_body(body, back_and_forth(load_motion(clip), frames), num_frames=frames) for clip in clips
+        pose_body(body, back_and_forth(load_motion(clip), setting.frames), num_frames=setting.frames)
+        for clip in setting.clips
     ]
-    measured: dict[str, dict[str, dict[str, float]]] = {}
-    for model in models:
-        params, config, options = simulator(model)
-        cloths = [load_garment(name, vertices=vertices, **(options | garment_options)) for name in garments]  # type: ignore[arg-type]
-        # One size and one body surface for all: one compilation per model.
-        worn = [cloth for cloth in cloths for _ in motions]
-        scenes = iter(prepare_scenes(worn, motions * len(cloths), [COTTON] * len(worn)))
-        measured[model] = {}
-        for garment in garments:
-            rows = []
-            for poses in motions:
-                scene = next(scenes)
-                trajectory = rollout_scene(params, scene, config)
-                root = poses.joint_transforms[0, 0] @ np.append(np.asarray(body.joint_rest_positions[0]), 1.0)
-                rows.append(measure(trajectory, scene, float(root[1])))
-            measured[model][garment] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-            print(garment, model, {name: round(value, 4) for name, value in measured[model][garment].items()})
-    return measured
+    names = [name for name in setting.garments for _ in motions]
+    worn = [load_garment(name, vertices=setting.vertices, **dict(garment_options)) for name in names]  # type: ignore[arg-type]
+    poses = motions * len(setting.garments)
+    scenes = prepare_scenes(worn, poses, [COTTON] * len(worn))
+    return [Worn(*row) for row in zip(names, scenes, poses, strict=True)]
+
+
+def find_references(setting: Setting) -> list[Reference]:
+    """Return the near-optimal rollout of every scene, and the optima from its states."""
+    system = read_system(OPTIMUM)
+    found = []
+    for worn, params in scenes_of(system, setting):
+        trajectory = rollout_scene(params, worn.scene, system.config)
+        gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
+        found.append(Reference(trajectory, gap))
+        print(worn.garment, OPTIMUM, flush=True)
+    return found
+
+
+def measure_system(
+    name: str, setting: Setting, references: Sequence[Reference]
+) -> dict[str, dict[str, float]]:
+    """Return the measures of a system on every garment, and on "all" of them.
+
+    Energies and distances are means over frames, clips and garments; gaps are medians over frames.
+    """
+    system, every = read_system(name), _gap_every(setting)
+    measured: dict[str, list[dict[str, float]]] = {}
+    gaps: dict[str, list[np.ndarray]] = {}
+    for (worn, params), (reference, gap) in zip(scenes_of(system, setting), references, strict=True):
+        garment, scene, _ = worn
+        trajectory = rollout_scene(params, scene, system.config)
+        row = measure(trajectory, scene, worn.root_height())
+        row["distance_mm"] = distance_mm(trajectory, reference, scene)
+        left = stepped_potentials(params, reference, scene, system.config, every) - gap.optimum
+        measured.setdefault(garment, []).append(row)
+        gaps.setdefault(garment, []).append(np.stack([left * 1e3, left / gap.initial_gap]))
+    measured["all"] = list(itertools.chain.from_iterable(measured.values()))
+    gaps["all"] = list(itertools.chain.from_iterable(gaps.values()))
+    rows = {}
+    for garment, found in measured.items():
+        energy, share = np.median(np.concatenate(gaps[garment], axis=1), axis=1)
+        means = {column: float(np.mean([row[column] for row in found])) for column in found[0]}
+        rows[garment] = {**means, "gap_mj": float(energy), "gap_share": float(share)}
+    print(name, {column: round(value, 4) for column, value in rows["all"].items()}, flush=True)
+    return rows
+
+
+def _gap_every(setting: Setting) -> int:
+    """Return at every which frame the gap is measured."""
+    return max((setting.frames - 1) // _GAP_FRAMES, 1)
 
 
 def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[str, float]:
@@ -131,20 +248,8 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     }
 
 
-def mean_over_garments(measured: dict[str, dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return the mean row of every model."""
-    return {
-        model: {
-            name: float(np.mean([row[name] for row in rows.values()])) for name in next(iter(rows.values()))
-        }
-        for model, rows in measured.items()
-    }
-
-
 def write(result: dict[str, Any], path: Path) -> None:
-    """Write a result with the versions that made it, and print its mean rows."""
+    """Write a result with the versions that made it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n")
-    for model, row in result.get("mean", {}).items():
-        print(model, " ".join(f"{name} {value:.3g}" for name, value in row.items()))

@@ -88,7 +88,7 @@ def test_hood_world_features_and_the_rows_beyond_the_radius(scene, hood_graph):
     contacts = inputs.contacts
     is_close = np.abs(contacts.distances) <= 0.03
     assert 0 < is_close.sum() < len(is_close)
-    now, later = inputs.position - contacts.points, inputs.position - contacts.next_points
+    now, later = contacts.points - inputs.position, contacts.next_points - inputs.position
     step = np.full((len(now), 1), 1 / 30)
     expected = np.concatenate([with_norm(now), with_norm(later), step], axis=1)
     expected[~is_close] = 0

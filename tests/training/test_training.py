@@ -230,7 +230,7 @@ def test_hoods_recipe_takes_finite_steps(small_data, tmp_path):
         "model.message_passing_steps": 2,
         "model.latent_size": 16,
     }
-    config = load_recipe(RECIPES / "hood.toml", overrides)
+    config = load_recipe(RECIPES / "paper" / "full-size.toml", overrides)
     assert config.energy_set == "hood"
     state = train(config, tmp_path, datasets=(small_data,))
     assert int(state.skipped) == 0

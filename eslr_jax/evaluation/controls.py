@@ -1,0 +1,50 @@
+"""Controls: the same network without something, which tells what that something does."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from eslr_jax.config import ModelConfig
+from eslr_jax.models.registry import init_model
+from eslr_jax.types import Garment
+
+Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
+
+
+def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
+    """Return weights without what a control takes away.
+
+    Args:
+        control: "untrained" has weights of a new network, on the trained one's statistics of features.
+            "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
+        params: Weights of the trained network.
+        config: Architecture.
+    """
+    if control == "untrained":
+        return {**params, "params": init_model(config)["params"]}
+    if control == "no_decoder":
+        decoder, last = params["params"]["decoder"], config.hidden_layers
+        names = (f"kernel_{last}", f"bias_{last}")
+        zeros = {name: jnp.zeros_like(decoder[name]) for name in names}
+        return {**params, "params": {**params["params"], "decoder": {**decoder, **zeros}}}
+    return params
+
+
+def control_garment(control: Control, garment: Garment) -> Garment:
+    """Return a garment without what a control takes away.
+
+    Args:
+        control: "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same
+            spread, equal for equal garments.
+        garment: The garment.
+    """
+    embedding = garment.geodesic_embedding
+    if control == "no_embedding":
+        return garment.replace(geodesic_embedding=jnp.zeros_like(embedding))
+    if control == "random_embedding":
+        noise = jax.random.normal(jax.random.key(0), embedding.shape)
+        return garment.replace(geodesic_embedding=noise * jnp.std(embedding, axis=0, keepdims=True))
+    return garment

@@ -1,0 +1,289 @@
+"""Baselines that see the body's motion and not the cloth: one network a garment, trained on energies alone.
+
+    python experiments/paper/posed.py pbns|snug|snug-m GARMENT --out FOLDER [--steps 2000] [--smoke]
+
+They predict displacements of the rest mesh, which the skin weights then carry along. What each keeps and lacks:
+
+- pbns: four layers of 32 and a basis of displacements, one pose at a time. Its own springs and hinges are
+  replaced by our energies, without inertia and friction: the floor that static poses leave.
+- snug: four GRUs of 256 and a linear layer. Its energies are ours. Windows of three frames, hidden states that
+  begin at random, and inertia on the last frame alone follow GAPS, as SNUG's own training was not published.
+- snug-m: snug that also reads the fabric, which changes from window to window. It stands in for MSN (Liu et al.
+  2023), of which neither code nor text was found.
+
+All read rotations relative to the root instead of SMPL's axis-angles, and no body shape.
+
+Source: Bertiche et al. 2021 (PBNS); Santesteban et al. 2022 (SNUG); Chen et al. 2024 (GAPS).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
+from eslr_jax.body import lbs
+from eslr_jax.config import ModelConfig, TrainConfig
+from eslr_jax.graph.features import DENSITY_SCALE, material_inputs
+from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.potential import potential_terms
+from eslr_jax.scene.build import initial_state
+from eslr_jax.training.data import TrainingData, build_training_data
+from eslr_jax.training.pool import FPS, Slot, sample_material
+from eslr_jax.training.step import slot_problem
+from eslr_jax.types import Garment, Material
+
+SYSTEMS = ("pbns", "snug", "snug-m")
+WINDOW = 3  # frames
+_BATCH = 16  # windows
+_RATE = 1e-3  # GAPS and PBNS
+_UNIT = 0.1  # [J], of the loss
+_OFFSET = 0.01  # [m], of a displacement per unit of output
+_FEWEST = 0.05  # a joint counts that carries a vertex by at least this weight
+
+
+class Displacements(nn.Module):
+    """From features of consecutive poses to displacements of the rest mesh."""
+
+    system: str
+    num_vertices: int
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "windows frames features"], hidden: Float[Array, "layers windows 256"]
+    ) -> Float[Array, "windows frames vertices 3"]:
+        """Return displacements [m]; `hidden` is what the GRUs remember of the frames before."""
+        x = features
+        for layer in range(4):
+            if self.system == "pbns":
+                x = nn.relu(nn.Dense(32)(x))
+            else:
+                x = nn.RNN(nn.GRUCell(256))(x, initial_carry=hidden[layer])
+        small = nn.initializers.variance_scaling(0.01, "fan_in", "normal")
+        out = nn.Dense(3 * self.num_vertices, use_bias=self.system != "pbns", kernel_init=small)(x)
+        return _OFFSET * out.reshape((*out.shape[:-1], self.num_vertices, 3))
+
+
+@struct.dataclass
+class PosedNetwork:
+    """A trained network and what its input needs."""
+
+    params: Any
+    mean: Float[Array, " features"]
+    deviation: Float[Array, " features"]
+    joints: Int[Array, " joints"]  # whose rotations are read
+    system: str = struct.field(pytree_node=False)
+
+
+def pose_features(
+    transforms: Float[Array, "frames joints 3 4"], joints: Int[Array, " read"], *, is_static: bool
+) -> Float[Array, "frames features"]:
+    """Return what is seen of a body's motion; turning and shifting the whole scene does not change it.
+
+    Two columns of every joint's rotation relative to the root, and the vertical as the root sees it. Unless
+    `is_static`, also the root's turn since the last frame and the velocity [m/s] of the point that it carries.
+    """
+    turned, moved = transforms[..., :3], transforms[:, 0, :, 3]
+    root = turned[:, 0]
+    relative = jnp.einsum("fba,fjbc->fjac", root, turned[:, joints])[..., :2]
+    parts = [relative.reshape((len(root), -1)), root[:, 1]]
+    if not is_static:
+        before = jnp.maximum(jnp.arange(len(root)) - 1, 0)
+        turn = jnp.einsum("fba,fbc->fac", root[before], root)[..., :2].reshape((len(root), 6))
+        velocity = jnp.einsum("fba,fb->fa", root, moved - moved[before]) * FPS
+        parts += [turn, velocity]
+    return jnp.concatenate(parts, axis=1)
+
+
+def fabric_features(garment: Garment, material: Material) -> Float[Array, " 4"]:
+    """Return bending stiffness, mu and lambda over HOOD's ranges, and the logarithm of the density."""
+    return jnp.append(material_inputs(garment, material)[0], jnp.log(material.density / DENSITY_SCALE))
+
+
+def displace(
+    network: PosedNetwork, garment: Garment, transforms: Float[Array, "frames joints 3 4"]
+) -> Float[Array, "frames vertices 3"]:
+    """Return the garment's positions on a moving body [m], shape [frames, vertices, 3]; cotton."""
+    features = _inputs(network, garment, transforms, COTTON)
+    count = (
+        network.params["params"]["Dense_0" if network.system != "pbns" else "Dense_4"]["kernel"].shape[1] // 3
+    )
+    module = Displacements(network.system, count)
+    offsets = module.apply(network.params, features[None], jnp.zeros((4, 1, 256)))[0]
+    missing = garment.rest_positions.shape[0] - count
+    return carry(garment, jnp.pad(offsets, ((0, 0), (0, missing), (0, 0))), transforms)
+
+
+def carry(
+    garment: Garment,
+    offsets: Float[Array, "frames vertices 3"],
+    transforms: Float[Array, "frames joints 3 4"],
+) -> Float[Array, "frames vertices 3"]:
+    """Return the displaced rest mesh skinned to every frame [m], shape [frames, vertices, 3]."""
+
+    def one(frame: tuple[Array, Array]) -> Array:
+        offset, posed = frame
+        return lbs.skin(garment.rest_positions + offset, garment.skin_weights, garment.skin_indices, posed)
+
+    return jax.lax.map(one, (offsets, transforms))
+
+
+def _inputs(
+    network: PosedNetwork, garment: Garment, transforms: Float[Array, "frames joints 3 4"], material: Material
+) -> Float[Array, "frames features"]:
+    """Return standardised features of a motion, with the fabric's for snug-m."""
+    features = pose_features(transforms, network.joints, is_static=network.system == "pbns")
+    features = (features - network.mean[None]) / network.deviation[None]
+    if network.system != "snug-m":
+        return features
+    fabric = fabric_features(garment, material)
+    return jnp.concatenate([features, jnp.broadcast_to(fabric, (len(features), 4))], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """A predictor whose weights are the positions of all frames: what sees no cloth is known beforehand."""
+
+    def apply(self, params: Any, problem: Any, state: Any, /) -> Any:
+        """Return the positions of the next frame."""
+        return params[state.frame + 1]
+
+
+def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwork, list[float]]:
+    """Train a network for a garment on the bundled training clips; return it and its losses [0.1 J]."""
+    garment = load_garment(name)
+    data = build_training_data([garment], load_body(), [load_motion(clip) for clip in split_clips("train")])
+    carried = np.zeros(data.joint_transforms.shape[1])
+    np.maximum.at(carried, np.asarray(garment.skin_indices).ravel(), np.asarray(garment.skin_weights).ravel())
+    joints = jnp.asarray(np.flatnonzero(carried >= _FEWEST))
+    seen = pose_features(data.joint_transforms, joints, is_static=system == "pbns")
+    is_inside = data.frames_left[:-1] > 0  # the joined clips jump where one ends
+    seen = seen[1:][np.asarray(is_inside)]
+    network = PosedNetwork(None, seen.mean(axis=0), jnp.maximum(seen.std(axis=0), 1e-3), joints, system)
+    module = Displacements(system, garment.rest_positions.shape[0])
+    width = seen.shape[1] + (4 if system == "snug-m" else 0)
+    params = module.init(jax.random.key(seed), jnp.zeros((1, WINDOW, width)), jnp.zeros((4, 1, 256)))
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(_RATE, steps))
+    )
+    moments, losses = optimizer.init(params), []
+    # Last frames of windows that lie within a clip.
+    ends = np.flatnonzero(np.asarray(data.frames_left)[:-2] > 1) + 2
+    frames = jax.random.choice(jax.random.key(seed + 1), jnp.asarray(ends), (steps, _BATCH))
+    step = jax.jit(partial(_train_step, module=module, optimizer=optimizer))
+    began = time.process_time()
+    for k in range(steps):
+        params, moments, loss = step(params, moments, network, data, frames[k], jax.random.key(seed + 2 + k))
+        losses.append(float(loss))
+        if k % 50 == 0:
+            print(
+                f"{system} {name} step {k} loss {np.mean(losses[-50:]):.3f} {time.process_time() - began:.0f} s",
+                flush=True,
+            )
+    return network.replace(params=params), losses
+
+
+def _train_step(params, moments, network, data: TrainingData, frames, key, *, module, optimizer):
+    """Return weights, moments and loss after one step on a batch of windows."""
+    garment = data.garment(jnp.int32(0))
+    keys = jax.random.split(key, _BATCH + 1)
+    hidden = 0.1 * jax.random.normal(keys[0], (4, _BATCH, 256))  # GAPS
+    probability = 1.0 if network.system == "snug-m" else 0.0
+    materials = jax.vmap(partial(sample_material, probability=probability))(keys[1:])
+    windows = frames[:, None] + jnp.arange(1 - WINDOW, 1)[None]
+    transforms = data.joint_transforms[windows]
+
+    def positions_of(params):
+        features = jax.vmap(lambda motion, fabric: _inputs(network, garment, motion, fabric))(
+            transforms, materials
+        )
+        offsets = module.apply(params, features, hidden)
+        return jax.lax.map(lambda window: carry(garment, *window), (offsets, transforms))
+
+    positions, pull_back = jax.vjp(positions_of, params)
+
+    def slope_of(sample):
+        (first, second, last), frame, material = sample
+        velocity = (second - first) * FPS
+        zero = jnp.zeros(())
+        slot = Slot(
+            initial_state(second, velocity),
+            frame - 1,
+            zero,
+            zero,
+            jnp.int32(0),
+            material,
+            jnp.zeros((), bool),
+        )
+        problem = slot_problem(slot, data, garment, TrainConfig(model=ModelConfig()))
+
+        def loss(position):
+            terms = potential_terms(position, problem)
+            moving = 0.0 if network.system == "pbns" else terms.inertia
+            return (terms.stretch + terms.bending + terms.gravity + terms.collision + moving) / _UNIT
+
+        return jax.value_and_grad(loss)(last)
+
+    losses, slopes = jax.lax.map(slope_of, (positions, frames.astype(jnp.int32), materials))
+    cotangent = jnp.zeros_like(positions).at[:, -1].set(slopes / _BATCH)
+    updates, moments = optimizer.update(pull_back(cotangent)[0], moments, params)
+    return optax.apply_updates(params, updates), moments, jnp.mean(losses)
+
+
+def write_network(network: PosedNetwork, path: Path, training: dict[str, Any]) -> None:
+    """Write a network as an npz archive, and how it was trained beside it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(network.params).items()}
+    inputs = {name: np.asarray(getattr(network, name)) for name in ("mean", "deviation", "joints")}
+    write_arrays(path, {**leaves, **inputs}, is_compressed=True)
+    path.with_suffix(".json").write_text(
+        json.dumps({"system": network.system, "training": training}, indent=1)
+    )
+
+
+def read_network(path: Path) -> tuple[PosedNetwork, dict[str, Any]]:
+    """Return a network that `write_network` wrote, and its training record."""
+    record = json.loads(path.with_suffix(".json").read_text())
+    arrays = {name: jnp.asarray(value) for name, value in read_arrays(path, content="network").items()}
+    inputs = {name: arrays.pop(name) for name in ("mean", "deviation", "joints")}
+    params = unflatten_dict({tuple(name.split("/")): value for name, value in arrays.items()})
+    return PosedNetwork(params, **inputs, system=record["system"]), record["training"]
+
+
+def main() -> None:
+    """Train and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("system", choices=SYSTEMS)
+    parser.add_argument("garment")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    began = time.process_time()
+    network, losses = train(chosen.system, chosen.garment, chosen.steps, chosen.seed)
+    training = {
+        "steps": chosen.steps,
+        "core_hours": (time.process_time() - began) / 3600,
+        "final_loss_j": float(np.mean(losses[-100:])) * _UNIT,
+    }
+    write_network(network, chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)
+    print(chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)
+
+
+if __name__ == "__main__":
+    main()

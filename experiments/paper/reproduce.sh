@@ -1,0 +1,41 @@
+#!/usr/bin/env bash
+# Train the paper's networks and make its tables from them.
+#
+#   experiments/paper/reproduce.sh [full|small] [OUT]
+#
+# full: the paper's sizes at 4k vertices, by HOOD's recipe; needs a GPU with the extra `cuda`, and days.
+# small: five layers at 1k vertices, two seeds; some four hours of one CPU core.
+# Run it again to go on where it stopped. STEPS=2 shortens every training, to see that all works.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+size=${1:-full} out=${2:-out/paper}
+
+train() { # name, recipe, changes
+  local folder="$out/$1" recipe="experiments/configs/paper/$2.toml"
+  shift 2
+  [[ -f $folder/model.npz ]] && return
+  if [[ -d $folder/checkpoints ]]; then
+    eslr train --out "$folder" --resume
+  else
+    eslr train --config "$recipe" --out "$folder" "${@/#/--set=}" ${STEPS:+--set=steps=$STEPS}
+  fi
+}
+
+rows=()
+if [[ $size == full ]]; then
+  for model in mgn-15 mgn-48 hood lsdmp-15 gsa-15 eslr-10 eslr-15; do
+    train "$model" full-size "model=$model"
+    rows+=("$model=$out/$model/model.npz")
+  done
+  vertices=4k
+else
+  for model in mgn-5 lsdmp-5 gsa-5 eslr-5; do
+    for seed in 0 1; do
+      train "$model-s$seed" 1k "model.base=$model" "seed=$seed"
+    done
+    rows+=("$model=$out/$model-s0/model.npz,$out/$model-s1/model.npz")
+  done
+  vertices=1k
+fi
+python experiments/paper/tables.py --models guess=guess "${rows[@]}" optimum=optimum --controls \
+  --vertices "$vertices" --out "$out/tables" ${STEPS:+--smoke}

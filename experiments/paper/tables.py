@@ -1,0 +1,195 @@
+"""The paper's tables: every system beside its controls, the solver and the optimum.
+
+    python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
+        [--models LABEL=NAME,NAME ...] [--controls] [--keep] [--clips N] [--frames 100] [--smoke]
+
+native_garments (I, II): six garments on unseen clips. unseen_garments (III): garments that no network has seen,
+with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a Mixamo
+character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them. model_cost (V):
+parameters, layers, latency and memory of the full-size networks and of ours, on the T-shirt.
+
+A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
+bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the gap
+from the optimum's states, and the energies of free rollouts; a second row says it of the same network untrained.
+--controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from rollouts import (
+    CONTROLS,
+    CONTROLS_OF_WEIGHTS,
+    GUESS,
+    OPTIMUM,
+    Setting,
+    System,
+    arguments,
+    find_references,
+    measure_system,
+    read_system,
+    write,
+)
+
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.assets.load import START_MODEL, default_model
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.evaluation.scene_parts import take_turns
+from eslr_jax.models.registry import MODELS, count_parameters, init_model
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import make_stepper
+
+# Trained alike, applied once a frame (configs/paper/1k.toml); the rest have recipes of their own.
+DEEP = ("mgn-5=mgn-5-correction", "eslr-5=eslr-5-correction")
+BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20")
+SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
+FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
+TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")
+_NEW_MOTION_FRAMES = 60  # the clips are short
+_TURNS = 7  # in which latencies are measured
+
+Rows = dict[str, tuple[str, ...]]
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = arguments(__doc__)
+    parser.add_argument("--tables", nargs="+", default=TABLES, choices=TABLES)
+    parser.add_argument("--models", nargs="+", metavar="LABEL=NAME,NAME", help="rows")
+    parser.add_argument("--controls", action="store_true", help="rows for each network's controls")
+    parser.add_argument(
+        "--keep", action="store_true", help="keep the rows that a table of the same setting has"
+    )
+    parser.add_argument("--clips", type=int, help="number of clips; 3, and 7 of another source, if not given")
+    parser.add_argument("--garments", nargs="+", help="only these")
+    parser.add_argument("--frames", type=int, default=100, help="of every rollout")
+    chosen = parser.parse_args()
+    if chosen.smoke:
+        chosen.models = chosen.models or (DEEP[-1], f"optimum={OPTIMUM}")
+        chosen.clips, chosen.frames, chosen.garments, chosen.controls = 1, 5, ["tshirt"], True
+    rows = {
+        label: tuple(names.split(","))
+        for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
+    }
+    for name in chosen.tables:
+        if name == "model_cost":
+            write(cost_table(rows, chosen.vertices, chosen.smoke), chosen.out / f"{name}.json")
+        else:
+            setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
+            file = chosen.out / f"{name}.json"
+            known = json.loads(file.read_text()) if chosen.keep and file.exists() else {}
+            for result in energy_table(with_changes(rows, name, chosen.controls), setting, known):
+                write(result, file)
+
+
+def table_setting(
+    table: str, clips: int | None, garments: Sequence[str] | None, frames: int, vertices: str
+) -> Setting:
+    """Return the garments and clips of a table."""
+    splits = load_splits()
+    test, unseen = splits["motions"]["test"], splits["motions"]["unseen_motion"][::3]
+    if table == "new_motion":
+        length = min(frames, _NEW_MOTION_FRAMES)
+        return Setting(tuple(garments or ("tshirt", "dress")), tuple(unseen[:clips]), length, vertices)
+    known = tuple(splits["garments"]["unseen" if table == "unseen_garments" else "train"])
+    chosen = tuple(name for name in garments or known if name in known)
+    return Setting(chosen or known[:1], tuple(test[: clips or 3]), frames, vertices)
+
+
+def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
+    """Return the rows of a table: with those of the controls, and of other embeddings for unseen garments."""
+    changed = dict(rows)
+    for label, (name, *_) in rows.items():
+        model = read_system(name).config.model
+        if isinstance(model, ModelConfig):
+            fitting = CONTROLS if model.attention_blocks else CONTROLS_OF_WEIGHTS
+            changes = fitting if has_controls else fitting[:1]
+            if table == "unseen_garments" and model.attention_blocks:
+                changes = (*changes, "raw", "landmarks")
+            changed |= {f"{label}, {change}": (f"{name}~{change}",) for change in changes}
+    return changed
+
+
+def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the table after every row: means over seeds, the seeds' own, and those of every garment.
+
+    Args:
+        rows: Names by label.
+        setting: Garments and clips.
+        known: Result of before, whose rows are kept if it has the same setting.
+    """
+    shared = json.loads(json.dumps(setting._asdict()))
+    if any(known.get(name) != value for name, value in shared.items()):
+        known = {}
+    parts = {name: dict(known.get(name, {})) for name in ("mean", "seeds", "garments")}
+    references = find_references(setting)
+    for label, names in rows.items():
+        if label in parts["mean"]:
+            continue
+        seeds = [measure_system(name, setting, references) for name in names]
+        means = {
+            garment: {column: float(np.mean([seed[garment][column] for seed in seeds])) for column in row}
+            for garment, row in seeds[0].items()
+        }
+        parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **read_system(names[0]).cost}
+        parts["garments"][label] = means
+        if len(seeds) > 1:
+            parts["seeds"][label] = {
+                column: [seed["all"][column] for seed in seeds] for column in seeds[0]["all"]
+            }
+        with_control, _, _ = label.partition(", untrained")
+        if with_control != label and with_control in parts["mean"]:
+            row = parts["mean"][with_control]
+            row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
+        yield {**shared, **parts}
+
+
+def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
+    """Return what systems and the full-size networks cost: a frame of the T-shirt, contact search included.
+
+    Memory is what XLA allocates for the call, weights included.
+    """
+    read = {label: read_system(name) for label, (name, *_) in rows.items()}
+    systems = {label: system for label, system in read.items() if system.replay is None}
+    for name in FULL_SIZE[-1:] if is_smoke else FULL_SIZE:
+        params, config = init_model(MODELS[name]), MODELS[name]
+        cost = {"parameters": count_parameters(params)}
+        systems[name] = System(
+            params, SimConfig(model=config, iterations=0), config.garment_options, None, cost
+        )
+    poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
+    parts, found = {}, {}
+    for label, system in systems.items():
+        scene = prepare_scene(load_garment("tshirt", vertices=vertices, **system.garment_options), poses)  # type: ignore[arg-type]
+        inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+
+        def forward(params, state, config=system.config, scene=scene, inputs=inputs):
+            return make_stepper(params, config)(frame_problem(scene, state, inputs), state)[0].position
+
+        memory = jax.jit(forward).lower(system.params, scene.initial_state).compile().memory_analysis()
+        assert memory is not None
+        parts[label] = (forward, (system.params, scene.initial_state))
+        found[label] = {
+            **system.cost,
+            "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
+        }
+        if isinstance(system.config.model, ModelConfig):
+            found[label] |= {
+                "layers": system.config.model.message_passing_steps,
+                "refinement_steps": system.config.model.refinement_steps,
+            }
+    for label, milliseconds in take_turns(parts, 1 if is_smoke else _TURNS).items():
+        found[label]["latency_ms"] = milliseconds
+    return {"vertices": vertices, "device": device_name(), "mean": found}
+
+
+if __name__ == "__main__":
+    main()
