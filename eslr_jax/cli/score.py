@@ -110,6 +110,7 @@ def _own_task(run: Run) -> _Task:
 
 def _run_task(sequence: MeshSequence, run: Run) -> _Task:
     """Return a trajectory in the scene of a run, cut to its length."""
+    from eslr_jax.body.motion import first_poses
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import first_frames
 
@@ -124,12 +125,9 @@ def _run_task(sequence: MeshSequence, run: Run) -> _Task:
         raise MotionError(
             f"{sequence.name} has {count} frames, {run.name} only {task.scene.num_frames}; cut it"
         )
-    scene, poses = first_frames(task.scene, count), task.poses
-    if poses is not None:
-        poses = poses.replace(
-            positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
-        )
+    scene = first_frames(task.scene, count)
     _check_sequence(sequence, positions, scene)
+    poses = None if task.poses is None else first_poses(task.poses, count)
     return task._replace(trajectory=positions, scene=scene, poses=poses)
 
 
