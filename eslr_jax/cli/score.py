@@ -148,7 +148,7 @@ def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
     stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
     positions = in_vertex_order(sequence, stored)
     cloth = prepare_stored(stored, name=Path(options.garment).name)
-    check_skin(options.garment, cloth, rig, options.body)
+    check_skin(options.garment, cloth, rig)
     scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
     _check_sequence(sequence, positions, scene)
     label = {"garment": options.garment, "motion": motion, "body": options.body}
