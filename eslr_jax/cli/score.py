@@ -141,9 +141,10 @@ def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import prepare_scene
 
-    usual = {name: entry.default for name, entry in inspect.signature(simulate).parameters.items()}
-    usual = {field.name: usual[field.name] for field in dataclasses.fields(Options)}
-    options = Options(**usual | given | {"frames": len(sequence.positions)})
+    usual = inspect.signature(simulate).parameters
+    values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
+    values.update(given, frames=len(sequence.positions))
+    options = Options(**values)
     rig, poses, motion = load_actor(options)
     stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
     positions = in_vertex_order(sequence, stored)
