@@ -123,6 +123,13 @@ def pose_body(
     return body_motion(body, _skin_body(body, rotations, transforms), transforms, fps=fps)
 
 
+def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
+    """Return the first frames of a body in motion, at most all of them."""
+    return poses.replace(
+        positions=poses.positions[:num_frames], joint_transforms=poses.joint_transforms[:num_frames]
+    )
+
+
 def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *, fps: float) -> BodyMotion:
     """Return a body in motion; every `BodyMotion` is made here.
 

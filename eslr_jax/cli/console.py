@@ -52,16 +52,17 @@ def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
     """Print what a person wants to know of a trajectory first: words, then figures.
 
     Args:
-        report: Of `trajectory_report` with `wear_report`, see `describe_report`.
+        report: Of `trajectory_report`, and of `wear_report` where the body is known, see `describe_report`.
         more: Other figures by name; they come last.
     """
     from eslr_jax.evaluation.words import describe_report
 
-    words = describe_report(report)
-    for text in words.good:
-        print(f"good: {text}")
-    for text in words.warnings:
-        print(f"warning: {text}")
+    if "slide_m" in report:  # else the body is not known whole
+        words = describe_report(report)
+        for text in words.good:
+            print(f"good: {text}")
+        for text in words.warnings:
+            print(f"warning: {text}")
     terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
     rows = {
         "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",

@@ -110,6 +110,7 @@ def _own_task(run: Run) -> _Task:
 
 def _run_task(sequence: MeshSequence, run: Run) -> _Task:
     """Return a trajectory in the scene of a run, cut to its length."""
+    from eslr_jax.body.motion import first_poses
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import first_frames
 
@@ -124,12 +125,9 @@ def _run_task(sequence: MeshSequence, run: Run) -> _Task:
         raise MotionError(
             f"{sequence.name} has {count} frames, {run.name} only {task.scene.num_frames}; cut it"
         )
-    scene, poses = first_frames(task.scene, count), task.poses
-    if poses is not None:
-        poses = poses.replace(
-            positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
-        )
+    scene = first_frames(task.scene, count)
     _check_sequence(sequence, positions, scene)
+    poses = None if task.poses is None else first_poses(task.poses, count)
     return task._replace(trajectory=positions, scene=scene, poses=poses)
 
 
@@ -143,14 +141,15 @@ def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import prepare_scene
 
-    usual = {name: entry.default for name, entry in inspect.signature(simulate).parameters.items()}
-    usual = {field.name: usual[field.name] for field in dataclasses.fields(Options)}
-    options = Options(**usual | given | {"frames": len(sequence.positions)})
+    usual = inspect.signature(simulate).parameters
+    values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
+    values.update(given, frames=len(sequence.positions))
+    options = Options(**values)
     rig, poses, motion = load_actor(options)
     stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
     positions = in_vertex_order(sequence, stored)
     cloth = prepare_stored(stored, name=Path(options.garment).name)
-    check_skin(options.garment, cloth, rig, options.body)
+    check_skin(options.garment, cloth, rig)
     scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
     _check_sequence(sequence, positions, scene)
     label = {"garment": options.garment, "motion": motion, "body": options.body}

@@ -174,6 +174,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     import numpy as np
 
     from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.body.motion import first_poses
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
@@ -238,9 +239,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         if count < 2:
             raise KeyboardInterrupt
         write_unfinished(out, kept, interrupted_record(options, method.choice, scene.self_contact))
-        poses = poses.replace(
-            positions=poses.positions[:count], joint_transforms=poses.joint_transforms[:count]
-        )
+        poses = first_poses(poses, count)
         scene = first_frames(scene, kept.num_frames)
     trajectory, scene = last_frames(kept, scene, count)
     if method.budget_ms is not None and timing.frame_ms > _KEPT * method.budget_ms:

@@ -153,7 +153,10 @@ def _read_gltf(path: Path, name: str, fps: float | None) -> MeshSequence:
         _, _, kind, times, values = shapes[chosen[0]]
         at, rate = document.sample_times([times], fps)
         moves = [key for entry in animations for key in document.key_frames(entry)]
-        moved = {(node, path): sample_keys(path, *keys, at) for node, path, *keys in moves}
+        moved = {
+            (node, path): sample_keys(path, how, keys, at_keys, at)
+            for node, path, how, keys, at_keys in moves
+        }
         world = document.world_matrices(moved, len(at))[:, chosen[0]]
         shapes_at, faces = _read_shapes(document, nodes[chosen[0]]["mesh"])
         weights = sample_keys("weights", kind, times, values, at)

@@ -13,13 +13,16 @@ from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.models.registry import init_model
+from eslr_jax.physics.air import blowing
 
 FRAMES = 7
+GUSTY = SceneOptions(air=blowing((3.0, 0.0, 0.0), 1.0))  # blows otherwise in every frame
 
 
-@pytest.fixture(scope="module", params=["euler", "bdf2"])
+@pytest.fixture(scope="module", params=["euler", "bdf2", "gusts"])
 def task(request):
-    scene = prepare_scene(square(), drifting_ball(FRAMES), options=SceneOptions(integrator=request.param))
+    options = SceneOptions(integrator=request.param) if request.param != "gusts" else GUSTY
+    scene = prepare_scene(square(), drifting_ball(FRAMES), options=options)
     return scene, simulate(None, scene, config=SimConfig(iterations=60)).trajectory
 
 
