@@ -62,7 +62,8 @@ def test_assets_lists_every_kind():
         (("--tolerance", "1%", "--iterations", "5"), ("leave out", "--iterations")),
         (("--budget", "20ms", "--tolerance", "1%"), ("either",)),
         (("--simulator", "physics", "--model", "eslr-small"), ("leave out --model",)),
-        (("--garment", "tshirt", "--garment", "dress"), ("--garment is given twice",)),
+        (("--garment", "tshirt", "--garment", "tshirt"), ("worn once only",)),
+        (("--motion", "turn", "--motion", "jump"), ("--motion is given twice",)),
         (("--frames", "100000", "--simulator", "physics"), ("fewer than",)),
     ],
 )

@@ -261,7 +261,7 @@ def prepare_stored(
     Raises:
         MeshError: The mesh can't be simulated.
     """
-    options.setdefault("allow_components", "fit" in stored.metadata)
+    options.setdefault("allow_components", not stored.metadata.keys().isdisjoint(("fit", "outfit")))
 
     def make() -> dict[str, np.ndarray]:
         garment = prepare_garment(

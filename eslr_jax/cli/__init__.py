@@ -40,7 +40,7 @@ COMMANDS = (
     convert,
 )  # each has registered its own
 
-_REPEATABLE = ("--set",)
+_REPEATABLE = {"--set": "train", "--garment": "simulate"}  # and the command that collects its values
 
 __all__ = ["app", "main"]
 
@@ -75,5 +75,5 @@ def _refuse_repetition(arguments: list[str]) -> None:
     """
     options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
     for option in options:
-        if options.count(option) > 1 and option not in _REPEATABLE:
+        if options.count(option) > 1 and _REPEATABLE.get(option) != arguments[0]:
             raise ConfigError(f"{option} is given twice; give it once")

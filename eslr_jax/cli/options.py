@@ -19,7 +19,7 @@ _SAME = 1e-4  # [m] by which the beginning of the same scene may differ between 
 class Options:
     """The options that decide what is simulated; see `eslr simulate --help`."""
 
-    garment: str
+    garment: tuple[str, ...]  # of an outfit the innermost first; empty for the default
     motion: str | None
     body: str
     simulator: Literal["network", "physics"] | None
@@ -111,7 +111,7 @@ def read_interrupted(
                 f"{out} was simulated with {name.replace('_', '-')} = {_text(own)}, not {_text(_plain(value))}; "
                 "leave out all options but --out to go on, or start in another folder without --resume"
             )
-    values = values | {"fabric": tuple(values["fabric"]), "betas": tuple(values["betas"])}
+    values = values | {name: tuple(values[name]) for name in ("garment", "fabric", "betas")}
     if values["joint_map"] is not None:
         values["joint_map"] = Path(values["joint_map"])
     choice, capacity = record["choice"], record["capacity"]

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from eslr_jax.simulation.simulate import Simulation
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
+_GARMENT = "tshirt"
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
 _SETTLE = 15  # frames: a T-shirt's start is stretched by 1.87 at an armpit, and by 1.2 after these
@@ -38,7 +39,7 @@ _KEPT = 1.2  # times a budget, from which on it counts as missed
 
 @app.command
 def simulate(
-    garment: str = "tshirt",
+    garment: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     motion: str | None = None,
     body: str = "anny",
     simulator: Literal["network", "physics"] | None = None,
@@ -77,7 +78,8 @@ def simulate(
 
     Args:
         garment: Name of a bundled garment (see `eslr assets`), which is carried to any body, or a mesh file,
-            which is fitted to the body first; see `eslr fit` where recognition fails.
+            which is fitted to the body first; see `eslr fit` where recognition fails. Give it again for
+            what is worn over it, as in --garment pants --garment tshirt. A T-shirt if not given.
         motion: Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO
             (.pkl), glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
             cmu_016_32.
@@ -178,6 +180,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
+    from eslr_jax.fit.outfit import combine_garments
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.run import ClothTrack, write_run
     from eslr_jax.physics.air import blowing
@@ -185,19 +188,25 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
 
     request = _read_request(options)
+    names = options.garment or (_GARMENT,)
+    label = "+".join(names)
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)
-        stored = load_garment_file(
-            options.garment,
-            vertices=options.vertices,
-            body=rig,
-            on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
-        )
+        garments = [
+            load_garment_file(
+                name,
+                vertices=options.vertices,
+                body=rig,
+                on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
+            )
+            for name in names
+        ]
+        stored = combine_garments(garments, _part_names(names)) if len(garments) > 1 else garments[0]
         num_vertices = len(stored.rest_positions)
         method = _choose_method(options, request, num_vertices, choice)
-        cloth = prepare_stored(stored, name=Path(options.garment).name, **method.garment_options)
+        cloth = prepare_stored(stored, name=label, **method.garment_options)
         material = garment_material(options.fabric, cloth, stored)
-        check_skin(options.garment, cloth, rig)
+        check_skin(label, cloth, rig)
         settle = (_SETTLE if method.config.iterations else 0) if options.settle is None else options.settle
         settling = with_settling(poses, settle)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
@@ -219,10 +228,11 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
     if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
-    if "fit" in stored.metadata:
-        say(describe_fit(stored.metadata["fit"]))
-    if "transfer" in stored.metadata:
-        say(f"{options.garment} carried to {options.body}: {describe_transfer(stored.metadata['transfer'])}")
+    for name, worn in zip(names, garments, strict=True):
+        if "fit" in worn.metadata:
+            say(describe_fit(worn.metadata["fit"]))
+        if "transfer" in worn.metadata:
+            say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
     if num_vertices >= LARGE:
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
     whole, timing, scene = _run(method, scene, done)
@@ -250,7 +260,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     with stderr.status("measuring"):
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
-            "garment": options.garment,
+            "garment": label,
             "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
             "self_contact": scene.self_contact is not None,
@@ -271,7 +281,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
     if has_pictures and not is_unfinished:
-        _write_sheet(out, np.asarray(trajectory.positions), cloth, poses)
+        _write_sheet(out, np.asarray(trajectory.positions), stored, poses)
     return report
 
 
@@ -381,17 +391,26 @@ def _expected_ms(method: _Method, num_vertices: int) -> float:
     return expected_ms(read_calibration(), num_vertices, method.model or SOLVER, method.config.iterations)
 
 
+def _part_names(garments: tuple[str, ...]) -> list[str]:
+    """Return what the parts of an outfit are called: bundled garments by their names, others by their files'."""
+    return [name.partition("#")[2] or Path(name).stem for name in garments]
+
+
 def _say_if_any(text: str | None) -> None:
     """Print a line on stderr, if there is one."""
     if text:
         say(text)
 
 
-def _write_sheet(out: Path, positions, cloth, poses) -> None:
-    """Render the contact sheet; without the extra `render` say so and go on."""
+def _write_sheet(out: Path, positions, stored: GarmentFile, poses) -> None:
+    """Render the contact sheet, garments of an outfit in their colours; without the extra `render` say so."""
     import numpy as np
 
     from eslr_jax.render import contact_sheet, write_png
+    from eslr_jax.render.pictures import OUTFIT_COLORS
+
+    counts = list(stored.metadata.get("outfit", {"all": len(stored.rest_positions)}).values())
+    colors = np.resize(OUTFIT_COLORS, (len(counts), 3)).repeat(counts, axis=0)
 
     try:
         with progress("rendering", 8) as advance:
@@ -399,7 +418,8 @@ def _write_sheet(out: Path, positions, cloth, poses) -> None:
                 np.asarray(poses.positions),
                 np.asarray(poses.faces),
                 positions,
-                np.asarray(cloth.faces),
+                stored.faces,
+                vertex_colors=colors,
                 rest_positions=np.asarray(poses.rest_positions),
                 timestep=float(poses.timestep),
                 on_picture=advance,

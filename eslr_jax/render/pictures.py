@@ -15,6 +15,7 @@ from eslr_jax.render.camera import Camera, facing_angles, follow, parse_angle
 from eslr_jax.render.scene import Surface, trace_picture
 
 GARMENT_COLOR = (0.30, 0.50, 0.70)  # sRGB
+OUTFIT_COLORS = (GARMENT_COLOR, (0.80, 0.47, 0.32), (0.45, 0.62, 0.38), (0.62, 0.45, 0.66))  # sRGB, in turns
 BODY_COLOR = (0.88, 0.73, 0.64)  # sRGB
 _PICTURE_SIZE = (480, 640)  # width, height [pixels]
 _SHEET_PICTURE_SIZE = (252, 360)  # width, height [pixels]

@@ -1,0 +1,159 @@
+"""Garments that are worn together: one mesh of several pieces, each outside those beneath it (host)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from eslr_jax.errors import MeshError
+from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.skinning import smooth
+from eslr_jax.geometry.topology import boundary_loops, vertex_normals
+from eslr_jax.io.garment import GarmentFile
+
+LAYER_GAP = 5e-3  # [m] left between two layers at rest: two millimetres over the thickness of repulsion
+_REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
+_ROUNDS = 20
+_SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
+
+
+def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> GarmentFile:
+    """Return garments that are worn together as one garment of several pieces.
+
+    Where a garment lies beneath an earlier one in the rest pose, it is moved over it. It keeps its own lengths.
+
+    Args:
+        garments: Garments of one body, the innermost first.
+        names: A name for each. They name the parts; a garment's own parts follow behind a slash.
+
+    Returns:
+        The outfit. `metadata["outfit"]` has the names and the numbers of vertices.
+
+    Raises:
+        MeshError: Two garments have the same name, or vertices of one stay beneath another.
+    """
+    if len(set(names)) < len(names):
+        raise MeshError(f"an outfit of {', '.join(names)}: a garment can be worn once only")
+    placed: list[np.ndarray] = []
+    for number, garment in enumerate(garments):
+        positions = garment.rest_positions
+        for inner, other in zip(placed, garments[:number], strict=True):
+            positions = _move_over(positions, garment.faces, inner, other.faces)
+        for inner, other, name in zip(placed, garments[:number], names[:number], strict=True):
+            heights, _ = _heights(positions, inner, other.faces)
+            if (beneath := int(np.sum(heights < 0))) > 0:
+                raise MeshError(
+                    f"{beneath} vertices of {names[number]} stay beneath {name}; change their order"
+                )
+        placed.append(positions)
+    counts = [len(positions) for positions in placed]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    influences = max(garment.skin_weights.shape[1] for garment in garments)
+    part_names, face_parts = _parts(garments, names)
+    sewn = [g.rest_positions if g.sewn_positions is None else g.sewn_positions for g in garments]
+    has_uvs = all(garment.corner_uvs is not None for garment in garments)
+    return GarmentFile(
+        rest_positions=np.concatenate(placed),
+        faces=np.concatenate([g.faces + start for g, start in zip(garments, starts, strict=True)]),
+        skin_weights=_stack([garment.skin_weights for garment in garments], influences),
+        skin_indices=_stack([garment.skin_indices for garment in garments], influences),
+        is_pinned=np.concatenate([garment.is_pinned for garment in garments]),
+        sewn_positions=np.concatenate(sewn),
+        corner_uvs=np.concatenate([g.corner_uvs for g in garments]) if has_uvs else None,  # type: ignore[misc]
+        face_parts=face_parts,
+        part_names=part_names,
+        metadata={"outfit": dict(zip(names, counts, strict=True)), "fabrics": _fabrics(garments, names)},
+    )
+
+
+def _move_over(
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    inner: Float[np.ndarray, "inner_vertices 3"],
+    inner_faces: Int[np.ndarray, "inner_faces 3"],
+) -> Float[np.ndarray, "vertices 3"]:
+    """Return a layer with its vertices moved out over another one, and its faces off that one's vertices."""
+    result = positions.copy()
+    for _ in range(_ROUNDS):
+        heights, normals = _heights(result, inner, inner_faces)
+        move = np.maximum(LAYER_GAP - heights, 0.0)[:, None] * normals
+        # Vertices of the layer beneath may still look out between those of this one.
+        under, outward = _heights(inner, result, faces)
+        sunk = np.flatnonzero(np.isfinite(under) & (under > -0.5 * LAYER_GAP))
+        nearest, _ = closest_points(inner[sunk], result, faces)
+        lift = (under[sunk] + 0.5 * LAYER_GAP)[:, None] * outward[sunk]
+        for corner in range(3):
+            vertices = faces[nearest, corner]
+            longer = np.linalg.norm(lift, axis=1) > np.linalg.norm(move[vertices], axis=1)
+            move[vertices[longer]] = lift[longer]
+        if np.abs(move).max(initial=0.0) < 1e-5:
+            break
+        is_moved = np.abs(move).max(axis=1, keepdims=True) > 0
+        result += np.where(is_moved, move, smooth(move, faces, _SPREAD))
+    return result
+
+
+def _heights(
+    points: Float[np.ndarray, "points 3"],
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
+    """Return how high points are over a layer [m], infinite where they are beside it, and its normals.
+
+    Beside it are points whose nearest place on it is on a hem, or more than 5 cm away.
+    """
+    nearest, weights = closest_points(points, positions, faces)
+    corners = faces[nearest]
+    offset = points - np.einsum("pk,pkx->px", weights, positions[corners])
+    normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    is_beside = _on_hem(weights, corners, faces, len(positions))
+    is_beside |= np.linalg.norm(offset, axis=1) > _REACH
+    return np.where(is_beside, np.inf, np.einsum("px,px->p", offset, normals)), normals
+
+
+def _on_hem(
+    weights: np.ndarray, corners: np.ndarray, faces: np.ndarray, num_vertices: int
+) -> Bool[np.ndarray, " points"]:
+    """Tell which places of a mesh lie on its boundary: all corners that count are on it."""
+    hem = np.zeros(num_vertices, bool)
+    for loop in boundary_loops(faces):
+        hem[loop] = True
+    return np.all(hem[corners] | (weights < 1e-6), axis=1)
+
+
+def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:
+    """Return tables below each other, with columns of zeros up to a width."""
+    return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
+
+
+def _parts(
+    garments: Sequence[GarmentFile], names: Sequence[str]
+) -> tuple[tuple[str, ...], Int[np.ndarray, " faces"]]:
+    """Return the names of an outfit's parts, and the part of every face."""
+    part_names: list[str] = []
+    face_parts = []
+    for garment, name in zip(garments, names, strict=True):
+        own = np.zeros(len(garment.faces), np.int64) if garment.face_parts is None else garment.face_parts
+        face_parts.append(own + len(part_names))
+        part_names += [name] if garment.face_parts is None else [f"{name}/{p}" for p in garment.part_names]
+    return tuple(part_names), np.concatenate(face_parts)
+
+
+def _fabrics(garments: Sequence[GarmentFile], names: Sequence[str]) -> list[str]:
+    """Return the fabrics that the garments' files give, each for its part."""
+    fabrics = []
+    for garment, name in zip(garments, names, strict=True):
+        whole = ["cotton"]
+        for text in garment.metadata.get("fabrics", ()):
+            part, separator, rest = str(text).rpartition(":")
+            if separator:
+                fabrics.append(f"{name}/{part}:{rest}")
+            else:
+                whole = [rest]
+        parts = [name] if garment.face_parts is None else [f"{name}/{part}" for part in garment.part_names]
+        given = {text.rpartition(":")[0] for text in fabrics}
+        fabrics += [f"{part}:{whole[0]}" for part in parts if part not in given]
+    return fabrics

@@ -1,0 +1,89 @@
+"""Garments that are worn together."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from garment_shapes import rings
+
+from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.body.motion import pose_body
+from eslr_jax.body.timing import with_settling
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import MeshError
+from eslr_jax.evaluation.referee import intersecting_pairs
+from eslr_jax.fabric import garment_material
+from eslr_jax.fit.outfit import LAYER_GAP, combine_garments
+from eslr_jax.io.garment import GarmentFile
+from eslr_jax.physics.materials import fabric_material
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.simulate import simulate
+
+SETTLE = 15  # frames
+
+
+def tube(radius: float, bottom: float, top: float) -> GarmentFile:
+    """Return a tube of cloth around the vertical, its normals outwards."""
+    positions, faces = rings([(top, radius, radius, 0.0), (bottom, radius, radius, 0.0)], around=24, rows=7)
+    count = len(positions)
+    return GarmentFile(
+        positions, faces, np.ones((count, 1)), np.zeros((count, 1), int), np.zeros(count, bool)
+    )
+
+
+def test_a_garment_beneath_another_is_moved_over_it_and_keeps_its_lengths():
+    inner, outer = tube(0.10, 0.0, 0.4), tube(0.098, 0.2, 0.6)
+    outfit = combine_garments([inner, outer], ["skirt", "top"])
+    first, second = np.split(outfit.rest_positions, [len(inner.rest_positions)])
+    np.testing.assert_array_equal(first, inner.rest_positions)
+    covering = second[second[:, 1] < 0.38]
+    assert np.linalg.norm(covering[:, [0, 2]], axis=1).min() > 0.10 + 0.9 * LAYER_GAP * np.cos(np.pi / 24)
+    assert not len(intersecting_pairs(outfit.rest_positions, outfit.faces))
+    sewn = np.concatenate([inner.rest_positions, outer.rest_positions])
+    np.testing.assert_array_equal(outfit.sewn_positions, sewn)
+
+
+def test_garments_far_from_each_other_stay_as_they_are():
+    garments = [tube(0.10, 0.0, 0.4), tube(0.10, 0.5, 0.9)]
+    outfit = combine_garments(garments, ["skirt", "top"])
+    np.testing.assert_array_equal(
+        outfit.rest_positions, np.concatenate([garment.rest_positions for garment in garments])
+    )
+
+
+def test_parts_and_fabrics_are_named_after_their_garments():
+    inner, outer = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
+    half = np.arange(len(outer.faces)) // (len(outer.faces) // 2)
+    outer = dataclasses.replace(
+        outer, face_parts=half, part_names=("low", "high"), metadata={"fabrics": ["denim", "high:silk"]}
+    )
+    outfit = combine_garments([inner, outer], ["skirt", "top"])
+    assert outfit.part_names == ("skirt", "top/low", "top/high")
+    garment = prepare_stored(outfit, cache=False)
+    material = garment_material((), garment, outfit)
+    for part, fabric in enumerate(("cotton", "denim", "silk")):
+        expected = fabric_material(fabric).lame_mu
+        assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
+
+
+def test_a_garment_is_worn_once():
+    with pytest.raises(MeshError, match="worn once only"):
+        combine_garments([tube(0.10, 0.0, 0.4)] * 2, ["skirt", "skirt"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("pants", "tshirt"), ("shorts", "dress"), ("tank", "longsleeve")])
+def test_an_outfit_on_a_walk_does_not_cross_itself(names):
+    outfit = combine_garments([load_garment_file(name) for name in names], names)
+    garment = prepare_stored(outfit)
+    assert not len(intersecting_pairs(garment.rest_positions, outfit.faces))
+    poses = with_settling(pose_body(load_body(), load_motion("cmu_016_32"), num_frames=100), SETTLE)
+    options = SceneOptions(has_skin=True, integrator="bdf2")
+    run = simulate(
+        None, prepare_scene(garment, poses, options=options), config=SimConfig(iterations=300, tolerance=0.01)
+    )
+    piece = np.repeat([0, 1], list(outfit.metadata["outfit"].values()))[outfit.faces[:, 0]]
+    positions = np.asarray(run.trajectory.positions)[SETTLE:]
+    for frame in (20, 40, 60, 80, 99):
+        pairs = intersecting_pairs(positions[frame], outfit.faces)
+        assert not np.any(piece[pairs[:, 0]] != piece[pairs[:, 1]]), frame
