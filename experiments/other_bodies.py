@@ -338,7 +338,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
         at_rest = jax.device_get(measure_frames(runs[0].trajectory, runs[0].scene))
         trajectory, scene = last_frames(runs[1].trajectory, runs[1].scene, frames)
         moving = trajectory_report(trajectory, scene, poses=walk)
-        positions = np.asarray(trajectory.positions)
+        positions = np.asarray(trajectory.positions)[:, is_real]
         heights, _ = body_heights(np.asarray(cloth.rest_positions, np.float64)[is_real], rest_posture(body))
         yield (
             {

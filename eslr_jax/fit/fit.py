@@ -95,12 +95,14 @@ def fit_garment(
     validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
     report |= {"vertices": len(sewn), "faces": len(faces)}
 
-    placed, transfer = sewn, {}
+    placed, worn_in, transfer = sewn, posture, {}
     if made_for is not None:
         carried = carry_shape((sewn, faces), posture, made_for, body, scale=options.scale)
-        placed, sewn, transfer = carried.placed, carried.sewn, {"transfer": carried.report}
-    onto = posture if made_for is None else carried.posture
-    rest, weights, indices, penetration = lay_to_rest(placed, faces, onto, body, is_pushed=options.push_out)
+        placed, sewn, worn_in = carried.placed, carried.sewn, carried.posture
+        transfer = {"transfer": carried.report}
+    rest, weights, indices, penetration = lay_to_rest(
+        placed, faces, worn_in, body, is_pushed=options.push_out
+    )
     parts = None if mesh.face_parts is None else mesh.face_parts[face_source]
     file_pins = np.zeros(len(rest), bool)
     if source.is_pinned is not None and options.edge_length is None:
