@@ -49,7 +49,7 @@ from eslr_jax.training.step import slot_problem
 from eslr_jax.types import Garment, Material
 
 SYSTEMS = ("pbns", "snug", "snug-m")
-WINDOW = 3  # frames
+WINDOW = 4  # frames; the first only tells where the others' contacts are searched
 _BATCH = 16  # windows
 _RATE = 1e-3  # GAPS and PBNS
 _UNIT = 0.1  # [J], of the loss
@@ -183,7 +183,7 @@ def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwo
     )
     moments, losses = optimizer.init(params), []
     # Last frames of windows that lie within a clip.
-    ends = np.flatnonzero(np.asarray(data.frames_left)[:-2] > 1) + 2
+    ends = np.flatnonzero(np.asarray(data.frames_left)[: 1 - WINDOW] >= WINDOW - 1) + WINDOW - 1
     frames = jax.random.choice(jax.random.key(seed + 1), jnp.asarray(ends), (steps, _BATCH))
     step = jax.jit(partial(_train_step, module=module, optimizer=optimizer))
     began = time.process_time()
@@ -218,29 +218,32 @@ def _train_step(params, moments, network, data: TrainingData, frames, key, *, mo
     positions, pull_back = jax.vjp(positions_of, params)
 
     def slope_of(sample):
-        (first, second, last), frame, material = sample
-        velocity = (second - first) * FPS
+        """Return an energy and its slope: that of a still cloth, and of inertia too for a window's last frame."""
+        (before, position, velocity), frame, material, is_last = sample
         zero = jnp.zeros(())
-        slot = Slot(
-            initial_state(second, velocity),
-            frame - 1,
-            zero,
-            zero,
-            jnp.int32(0),
-            material,
-            jnp.zeros((), bool),
-        )
+        state = initial_state(before, jnp.where(is_last, velocity, 0.0))
+        slot = Slot(state, frame - 1, zero, zero, jnp.int32(0), material, jnp.zeros((), bool))
         problem = slot_problem(slot, data, garment, TrainConfig(model=ModelConfig()))
 
         def loss(position):
             terms = potential_terms(position, problem)
-            moving = 0.0 if network.system == "pbns" else terms.inertia
-            return (terms.stretch + terms.bending + terms.gravity + terms.collision + moving) / _UNIT
+            inertia = 0.0 if network.system == "pbns" else jnp.where(is_last, terms.inertia, 0.0)
+            return (terms.stretch + terms.bending + terms.gravity + terms.collision + inertia) / _UNIT
 
-        return jax.value_and_grad(loss)(last)
+        return jax.value_and_grad(loss)(position)
 
-    losses, slopes = jax.lax.map(slope_of, (positions, frames.astype(jnp.int32), materials))
-    cotangent = jnp.zeros_like(positions).at[:, -1].set(slopes / _BATCH)
+    before, after = positions[:, :-1], positions[:, 1:]
+    velocities = jnp.broadcast_to((positions[:, -2:-1] - positions[:, -3:-2]) * FPS, after.shape)
+    counted = windows[:, 1:]
+    samples = (
+        (before, after, velocities),
+        counted.astype(jnp.int32),
+        jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], WINDOW - 1, axis=1), materials),
+        jnp.broadcast_to(counted == windows[:, -1:], counted.shape),
+    )
+    flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[2:])), samples)
+    losses, slopes = jax.lax.map(slope_of, flat)
+    cotangent = jnp.zeros_like(positions).at[:, 1:].set(slopes.reshape(after.shape) / len(losses))
     updates, moments = optimizer.update(pull_back(cotangent)[0], moments, params)
     return optax.apply_updates(params, updates), moments, jnp.mean(losses)
 

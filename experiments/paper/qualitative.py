@@ -29,7 +29,8 @@ from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
-MODELS = ("mgn-5-correction", "eslr-5-correction", "eslr-small", "smooth-small+20", OPTIMUM)
+ABLATION = ("mgn-small-6k", "gsa-small-6k", "lsdmp-small-6k", "eslr-small-6k")
+MODELS = (*ABLATION, "eslr-small", "smooth-small+20", OPTIMUM)
 _SIZE = (240, 340)  # of a picture, width and height [pixels]
 _CAMERA = 25.0  # [degrees] from the front towards the side
 _FULL_SCALE = 0.98  # quantile of the optimum's energy per area at which the colours end

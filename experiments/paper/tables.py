@@ -1,12 +1,12 @@
 """The paper's tables: every system beside its controls, the solver and the optimum.
 
     python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
-        [--models LABEL=NAME,NAME ...] [--controls] [--keep] [--clips N] [--frames 100] [--smoke]
+        [--models LABEL=NAME,NAME ...] [--controls] [--keep] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on unseen clips. unseen_garments (III): garments that no network has seen,
 with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a Mixamo
 character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them. model_cost (V):
-parameters, layers, latency and memory of the full-size networks and of ours, on the T-shirt.
+parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
 bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the gap
@@ -53,6 +53,7 @@ BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20"
 SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
 TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")
+_CLIPS = 3  # of the test split, if none are given
 _NEW_MOTION_FRAMES = 60  # the clips are short
 _TURNS = 7  # in which latencies are measured
 
@@ -68,22 +69,25 @@ def main() -> None:
     parser.add_argument(
         "--keep", action="store_true", help="keep the rows that a table of the same setting has"
     )
-    parser.add_argument("--clips", type=int, help="number of clips; 3, and 7 of another source, if not given")
+    parser.add_argument("--clips", nargs="+", help="only these")
     parser.add_argument("--garments", nargs="+", help="only these")
     parser.add_argument("--frames", type=int, default=100, help="of every rollout")
     chosen = parser.parse_args()
     if chosen.smoke:
         chosen.models = chosen.models or (DEEP[-1], f"optimum={OPTIMUM}")
-        chosen.clips, chosen.frames, chosen.garments, chosen.controls = 1, 5, ["tshirt"], True
+        chosen.clips, chosen.frames, chosen.garments, chosen.controls = ["cmu_016_32"], 5, ["tshirt"], True
     rows = {
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
     }
     for name in chosen.tables:
         if name == "model_cost":
-            write(cost_table(rows, chosen.vertices, chosen.smoke), chosen.out / f"{name}.json")
+            result = cost_table(rows, chosen.vertices, chosen.smoke)
+            write(result, chosen.out / f"{name}_{chosen.vertices}.json")
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
+            if chosen.smoke:
+                setting = setting._replace(garments=setting.garments[:1])
             file = chosen.out / f"{name}.json"
             known = json.loads(file.read_text()) if chosen.keep and file.exists() else {}
             for result in energy_table(with_changes(rows, name, chosen.controls), setting, known):
@@ -91,17 +95,18 @@ def main() -> None:
 
 
 def table_setting(
-    table: str, clips: int | None, garments: Sequence[str] | None, frames: int, vertices: str
+    table: str, clips: Sequence[str] | None, garments: Sequence[str] | None, frames: int, vertices: str
 ) -> Setting:
-    """Return the garments and clips of a table."""
+    """Return the garments and clips of a table; those that are given are taken where they belong to it."""
     splits = load_splits()
-    test, unseen = splits["motions"]["test"], splits["motions"]["unseen_motion"][::3]
     if table == "new_motion":
-        length = min(frames, _NEW_MOTION_FRAMES)
-        return Setting(tuple(garments or ("tshirt", "dress")), tuple(unseen[:clips]), length, vertices)
-    known = tuple(splits["garments"]["unseen" if table == "unseen_garments" else "train"])
-    chosen = tuple(name for name in garments or known if name in known)
-    return Setting(chosen or known[:1], tuple(test[: clips or 3]), frames, vertices)
+        own_clips, own_garments = splits["motions"]["unseen_motion"][::3], ("tshirt", "dress")
+        frames = min(frames, _NEW_MOTION_FRAMES)
+    else:
+        kind = "unseen" if table == "unseen_garments" else "train"
+        own_clips, own_garments = splits["motions"]["test"][:_CLIPS], splits["garments"][kind]
+    worn = tuple(name for name in garments or () if table == "new_motion" or name in own_garments)
+    return Setting(worn or tuple(own_garments), tuple(clips or own_clips), frames, vertices)
 
 
 def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
@@ -159,7 +164,8 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     """
     read = {label: read_system(name) for label, (name, *_) in rows.items()}
     systems = {label: system for label, system in read.items() if system.replay is None}
-    for name in FULL_SIZE[-1:] if is_smoke else FULL_SIZE:
+    full_size = FULL_SIZE if vertices != "1k" else ()
+    for name in FULL_SIZE[-1:] if is_smoke else full_size:
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
         systems[name] = System(
