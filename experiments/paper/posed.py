@@ -276,7 +276,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--smoke", action="store_true", help="two steps")
     chosen = parser.parse_args()
+    if chosen.smoke:
+        chosen.steps = 2
     began = time.process_time()
     network, losses = train(chosen.system, chosen.garment, chosen.steps, chosen.seed)
     training = {
