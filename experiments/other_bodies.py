@@ -292,6 +292,7 @@ BODIES = {
 
 
 RESULTS = Path(__file__).parent / "results"
+BOTTOMS = ("shorts", "kneepants", "pants")  # a body that wears one alone is bare above: not in the pictures
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip
@@ -405,7 +406,8 @@ def main() -> None:
                 {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()},
             )
             rows.append(row)
-            panels.append((row["garment"], moving[-1], positions[-1], faces))
+            if row["garment"] not in BOTTOMS:
+                panels.append((row["garment"], moving[-1], positions[-1], faces))
         table[name] = rows
         write_png(arguments.out / f"other_bodies_{name}.png", _picture(body, panels))
         with atomic_write(path) as temporary:
