@@ -50,7 +50,7 @@ def score(
             their order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a
             folder of OBJ or PLY files. Or a run of `eslr simulate`, which tells its own scene.
         run: Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
-        garment: Garment as for `eslr simulate`; tshirt if not given.
+        garment: Name of a bundled garment, or a mesh file; tshirt if not given. An outfit is told by its run.
         motion: Motion as for `eslr simulate`; cmu_016_32 if not given, from its first frame on.
         body: Body as for `eslr simulate`; anny if not given.
         vertices: Resolution of a bundled garment; 1k if not given.
@@ -141,18 +141,19 @@ def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import prepare_scene
 
+    garment = given.get("garment", _GARMENT)
     usual = inspect.signature(simulate).parameters
     values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
-    values.update(given, frames=len(sequence.positions))
+    values.update(given, garment=(garment,), frames=len(sequence.positions))
     options = Options(**values)
     rig, poses, motion = load_actor(options)
-    stored = load_garment_file(options.garment, vertices=options.vertices, body=rig)
+    stored = load_garment_file(garment, vertices=options.vertices, body=rig)
     positions = in_vertex_order(sequence, stored)
-    cloth = prepare_stored(stored, name=Path(options.garment).name)
-    check_skin(options.garment, cloth, rig)
+    cloth = prepare_stored(stored, name=Path(garment).name)
+    check_skin(garment, cloth, rig)
     scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
     _check_sequence(sequence, positions, scene)
-    label = {"garment": options.garment, "motion": motion, "body": options.body}
+    label = {"garment": garment, "motion": motion, "body": options.body}
     return _Task(positions, scene, poses, stored, label)
 
 
