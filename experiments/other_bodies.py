@@ -301,7 +301,7 @@ FRAMES = 100  # of it
 SETTLE = 15  # frames on the walk's first pose, as `eslr simulate` has them
 STILL, RAISE = 50, 25  # frames that the body stands, and in which it lifts its arms to its own rest pose
 STANDING = 45.0  # [degrees] of the arms below the horizontal, as garments are cut
-SMOKE_FRAMES = 2 * STILL
+SMOKE_FRAMES = STILL  # of the walk
 ITERATIONS = 30  # of the solver
 
 
