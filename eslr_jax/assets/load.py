@@ -423,7 +423,7 @@ def load_model(name: str | Path) -> tuple[dict[str, Any], ModelConfig]:
         CheckpointError: The file is for another architecture or a newer version.
     """
     (params, config, _), steps = _read_model(str(name))
-    if steps:
+    if steps is not None:
         try:
             config = dataclasses.replace(config, refinement_steps=steps)
         except ValueError as error:
@@ -436,12 +436,12 @@ def model_record(name: str | Path) -> dict[str, Any]:
     return _read_model(str(name))[0][2]
 
 
-def _read_model(name: str) -> tuple[tuple[dict[str, Any], ModelConfig, dict[str, Any]], int]:
-    """Return weights, architecture and training record of a model, and the refinement steps asked for or 0."""
+def _read_model(name: str) -> tuple[tuple[dict[str, Any], ModelConfig, dict[str, Any]], int | None]:
+    """Return weights, architecture and training record of a model, and the refinement steps asked for."""
     parts = re.fullmatch(r"(.+):(\d+)", name)
     model = parts[1] if parts else name
     path = Path(model) if _is_path(model) else find_asset("model", model)
-    return read_weights(path), int(parts[2]) if parts else 0
+    return read_weights(path), int(parts[2]) if parts else None
 
 
 def default_model() -> str:

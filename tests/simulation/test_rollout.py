@@ -127,7 +127,8 @@ def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
 
 
 def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved):
-    from eslr_jax.evaluation.gap import find_friction_loads, reached_potentials, trajectory_states
+    from eslr_jax.evaluation.foreign import find_friction_loads
+    from eslr_jax.evaluation.gap import reached_potentials, trajectory_states
 
     scene = prepare_scene(cloth, poses).replace(pin_targets=None)
     trajectory = rollout_scene(None, scene, SOLVER)
