@@ -218,6 +218,9 @@ class Scene:
     pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
     num_frames: int = struct.field(pytree_node=False)
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
+    pieces: Int[Array, " vertices"] | None = (
+        None  # self-contact between different pieces only; None: all cloth
+    )
     ground: Float[Array, ""] | None = None  # height of a level ground [m]
     air: Air | None = None
     damping: Float[Array, ""] | None = None  # of the fabric [s], see `physics.damping`

@@ -263,7 +263,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "garment": label,
             "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
-            "self_contact": scene.self_contact is not None,
+            "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
             "integrator": integrator,
             "settle": settle,
             "skin_contacts": modelled.has_skin,

@@ -86,6 +86,7 @@ def find_self_contacts(
     garment: Garment,
     capacity: PairCapacity,
     *,
+    pieces: Int[Array, " vertices"] | None = None,
     radius: float = SEARCH_RADIUS,
 ) -> FacePairs:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
@@ -100,11 +101,13 @@ def find_self_contacts(
         predicted: A guess of the vertices at t + 1 [m], such as the inertial one, shape [vertices, 3].
         garment: Rest mesh.
         capacity: Sizes of the buffers; static.
+        pieces: Piece of every vertex: only cloth of different pieces is paired; None: all cloth is.
         radius: Radius of the search [m].
     """
     blocks = garment.vertex_blocks
     points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, blocks)
-    pairs = _find_pairs(points, _Cloth(position, predicted, garment, has_points=True), radius, capacity)
+    cloth = _Cloth(position, predicted, garment, has_points=True, pieces=pieces)
+    pairs = _find_pairs(points, cloth, radius, capacity)
     rows = (pairs.vertices, pairs.corners, pairs.weights)
     return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment, radius))
 
@@ -154,6 +157,7 @@ class _Cloth(NamedTuple):
     predicted: Float[Array, "vertices 3"]  # at t + 1 [m]
     garment: Garment
     has_points: bool  # the points are the vertices of the faces
+    pieces: Int[Array, " vertices"] | None = None  # only cloth of different pieces is paired
 
 
 class _FaceTable(NamedTuple):
@@ -168,7 +172,7 @@ class _FaceTable(NamedTuple):
 def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
     # What is found has no derivative, where it is found has one.
-    still = _Cloth(*jax.lax.stop_gradient(cloth[:3]), has_points=cloth.has_points)
+    still = _Cloth(*jax.lax.stop_gradient(cloth[:3]), *cloth[3:])
     point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
     pairs = _exactly(point, face, points, cloth, radius)
     is_used = jnp.arange(capacity.pairs) < count
@@ -348,6 +352,8 @@ def _exactly(
     is_pair = (squared < jnp.square(radius)) & is_over & is_reached & (size > 0)
     if cloth.has_points:
         is_pair = is_pair & ~_is_around(point, corner, garment)
+    if cloth.pieces is not None:
+        is_pair = is_pair & (cloth.pieces[point] != cloth.pieces[corner[:, 0]])
     return FacePairs(
         vertices=point,
         corners=corner,

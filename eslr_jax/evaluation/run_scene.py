@@ -15,6 +15,7 @@ from eslr_jax.io.run import Run
 from eslr_jax.physics.air import blowing
 from eslr_jax.physics.materials import constants_for
 from eslr_jax.scene.build import initial_state, start_integrator
+from eslr_jax.scene.plan import piece_of_vertices
 from eslr_jax.types import (
     BodyMotion,
     Garment,
@@ -57,6 +58,7 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         has_skin = bool(run.report.get("skin_contacts"))
         body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids], has_skin=has_skin)
     has_layers = has_contact and bool(run.report.get("self_contact"))
+    has_pieces = run.report.get("self_contact") == "pieces"
     start = initial_state(positions[0], velocities[0]).replace(frame=jnp.int32(run.report.get("settle", 0)))
     return Scene(
         garment=garment,
@@ -68,6 +70,7 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
         num_frames=trajectory.num_frames,
         self_contact=default_capacity(positions.shape[1]) if has_layers else None,
+        pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and has_pieces else None,
         ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
         air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
         damping=run.report.get("damping_s"),

@@ -7,7 +7,7 @@ from typing import Literal
 import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
@@ -42,6 +42,7 @@ class ScenePlan:
         pytree_node=False, default=False
     )  # else frame 0 moves as the body does
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
+    pieces: Int[Array, " vertices"] | None = None  # of self-contact between different pieces only
     has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
     ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
@@ -83,6 +84,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         pin_targets=skinned if plan.has_pins else None,
         num_frames=skinned.shape[0],
         self_contact=plan.self_contact,
+        pieces=plan.pieces,
         ground=plan.ground,
         air=plan.air,
         damping=plan.damping,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from eslr_jax.body.timing import check_length
@@ -62,7 +62,8 @@ def plan_scene(
 ) -> ScenePlan:
     """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
-    Self-contact is modelled where two pieces come close to each other; within one piece it has to be asked for.
+    Self-contact is modelled between two pieces that come close to each other; within one piece it has to be asked
+    for: limbs of the body press cloth into itself, such as trousers at the crotch.
     Its buffer starts small, since `simulate` enlarges it. A pure `rollout` needs `default_capacity` in its place,
     or a look at the trajectory's status.
 
@@ -102,6 +103,7 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=starting_capacity(garment.vertex_mask.shape[0], pieces) if has_layers else None,
+        pieces=piece_of_vertices(garment) if has_layers and is_undecided else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
@@ -179,8 +181,14 @@ def prepare_scenes(
         ]
     capacities = [plan.self_contact for plan in plans if plan.self_contact is not None]
     layers = max(capacities, key=lambda capacity: capacity.pairs, default=None)
+    plans = [plan.replace(has_pins=has_pins, self_contact=layers) for plan in plans]
+    if layers is not None and options.self_contact is None:
+        plans = [
+            plan.replace(pieces=piece_of_vertices(garment))
+            for garment, plan in zip(padded, plans, strict=True)
+        ]
     return [
-        _build(garment, motion, material, plan.replace(has_pins=has_pins, self_contact=layers))
+        _build(garment, motion, material, plan)
         for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
     ]
 
@@ -202,7 +210,7 @@ def _could_fall(garment: Garment, poses: BodyMotion) -> bool:
     height = np.asarray(garment.rest_positions)[is_real, 1]
     body = np.asarray(poses.rest_positions)[:, 1]
     shoulders = body.min() + SHOULDERS * np.ptp(body)
-    piece = _piece_of_vertices(garment)
+    piece = piece_of_vertices(garment)[is_real]
     is_held = np.asarray(garment.is_pinned)[is_real] | (height > shoulders)
     return bool(np.setdiff1d(piece, piece[is_held]).size)
 
@@ -222,13 +230,16 @@ def _sampled(num_frames: int) -> np.ndarray:
 
 def count_pieces(garment: Garment) -> int:
     """Return how many pieces of cloth a garment consists of, which no edge joins."""
-    return int(_piece_of_vertices(garment).max()) + 1
+    return int(piece_of_vertices(garment).max()) + 1
 
 
-def _piece_of_vertices(garment: Garment) -> np.ndarray:
-    """Return the piece of every real vertex."""
+def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
+    """Return the piece of cloth that every vertex belongs to, which no edge joins to others; -1 where padded."""
     faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
-    return vertex_components(faces, int(np.sum(garment.vertex_mask)))[1]
+    is_real = np.asarray(garment.vertex_mask)
+    pieces = np.full(len(is_real), -1, np.int32)
+    pieces[is_real] = vertex_components(faces, int(is_real.sum()))[1]
+    return pieces
 
 
 def pieces_meet(garment: Garment, skinned: np.ndarray) -> bool:
@@ -238,7 +249,8 @@ def pieces_meet(garment: Garment, skinned: np.ndarray) -> bool:
         garment: A garment of several pieces.
         skinned: Positions [m], shape [frames, vertices, 3].
     """
-    piece, is_real = _piece_of_vertices(garment), np.asarray(garment.vertex_mask)
+    is_real = np.asarray(garment.vertex_mask)
+    piece = piece_of_vertices(garment)[is_real]
     for frame in _sampled(len(skinned)):
         points = np.asarray(skinned[frame])[is_real]
         for number in range(1, piece.max() + 1):

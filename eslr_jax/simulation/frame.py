@@ -90,7 +90,10 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         strain = past_strain(scene.damping, scene.timestep, state.position, scene.garment)
         problem = problem.replace(strain=strain)
     if scene.self_contact is not None:
-        pairs = find_self_contacts(state.position, problem.inertial_guess, scene.garment, scene.self_contact)
+        guess = problem.inertial_guess
+        pairs = find_self_contacts(
+            state.position, guess, scene.garment, scene.self_contact, pieces=scene.pieces
+        )
         thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)
         problem = problem.replace(layers=SelfContact(pairs, thickness))
     return problem

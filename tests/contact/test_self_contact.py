@@ -143,6 +143,19 @@ def test_pairs_equal_brute_force(cloth):
     assert all(found[pair] == expected[pair] for pair in set(found) & set(expected))
 
 
+def test_with_pieces_only_pairs_between_them_are_found(cloth):
+    position = jnp.asarray(roll_up(cloth), jnp.float32)
+    piece = (np.asarray(cloth.rest_positions)[:, 0] > 0.1).astype(np.int32)
+    every = found_pairs(cloth, find_self_contacts(position, position, cloth, AMPLE))
+    found = found_pairs(
+        cloth, find_self_contacts(position, position, cloth, AMPLE, pieces=jnp.asarray(piece))
+    )
+    between = {pair for pair in every if piece[pair[0]] != piece[np.asarray(cloth.faces)[pair[1], 0]]}
+    assert 20 < len(found) < len(every) - 20
+    # A face across the border belongs to the piece of its first corner.
+    assert {v for v, _ in found} == {v for v, _ in between}
+
+
 def test_flat_cloth_has_no_pairs(cloth):
     contacts = find_self_contacts(cloth.rest_positions, cloth.rest_positions, cloth, AMPLE)
     assert int(contacts.count) == 0
