@@ -145,7 +145,7 @@ def test_pairs_equal_brute_force(cloth):
 
 def test_with_pieces_only_pairs_between_them_are_found(cloth):
     position = jnp.asarray(roll_up(cloth), jnp.float32)
-    piece = (np.asarray(cloth.rest_positions)[:, 0] > 0.1).astype(np.int32)
+    piece = (np.asarray(cloth.rest_positions)[:, 0] > 0.2).astype(np.int32)
     every = found_pairs(cloth, find_self_contacts(position, position, cloth, AMPLE))
     found = found_pairs(
         cloth, find_self_contacts(position, position, cloth, AMPLE, pieces=jnp.asarray(piece))
