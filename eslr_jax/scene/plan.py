@@ -103,7 +103,7 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=starting_capacity(garment.vertex_mask.shape[0], pieces) if has_layers else None,
-        pieces=piece_of_vertices(garment) if has_layers and is_undecided else None,
+        pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and is_undecided else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
@@ -184,7 +184,7 @@ def prepare_scenes(
     plans = [plan.replace(has_pins=has_pins, self_contact=layers) for plan in plans]
     if layers is not None and options.self_contact is None:
         plans = [
-            plan.replace(pieces=piece_of_vertices(garment))
+            plan.replace(pieces=jnp.asarray(piece_of_vertices(garment)))
             for garment, plan in zip(padded, plans, strict=True)
         ]
     return [
