@@ -1,6 +1,6 @@
 """The bundled garments on five other bodies: what carrying them there costs in stretch, and pictures.
 
-    python experiments/other_bodies.py [--smoke] [--out DIR]
+    python experiments/other_bodies.py [--smoke] [--out DIR]    (the figure needs the extra `remesh`)
 
 The bodies are synthetic, since no SMPL model and no bought character may ship: the bundled body in other
 proportions and on other rigs, in T-poses, and a figure of capsules with a surface of its own.
@@ -28,6 +28,7 @@ from eslr_jax.body.units import UnitsWarning
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment, trajectory_report
+from eslr_jax.extras import require
 from eslr_jax.fit.clearance import body_heights
 from eslr_jax.fit.postures import find_arms, rest_posture
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
@@ -247,8 +248,7 @@ _BLEND = 0.02  # [m] of the smooth union of two capsules
 
 def figure() -> RiggedMesh:
     """Return a figure of 1.27 m with a large head, of capsules that flow into each other, in an A-pose."""
-    import pyvista
-
+    pyvista = require("pyvista", extra="remesh", purpose="the figure's surface")
     low, high = np.array([-0.55, -0.05, -0.25]), np.array([0.55, 1.35, 0.25])
     counts = np.ceil((high - low) / _CELL).astype(int)
     grid = pyvista.ImageData(dimensions=tuple(counts), spacing=(_CELL,) * 3, origin=tuple(low))
@@ -387,7 +387,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the table and the pictures")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    names, garments = (["figure"], GARMENTS[:1]) if arguments.smoke else (arguments.bodies, GARMENTS)
+    names, garments = (["mixamo"], GARMENTS[:1]) if arguments.smoke else (arguments.bodies, GARMENTS)
     path = arguments.out / "other_bodies.json"
     table: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     table |= {
