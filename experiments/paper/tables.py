@@ -75,7 +75,7 @@ def main() -> None:
     chosen = parser.parse_args()
     if chosen.smoke:
         chosen.models = chosen.models or (DEEP[-1], f"optimum={OPTIMUM}")
-        chosen.clips, chosen.frames, chosen.garments, chosen.controls = ["cmu_016_32"], 5, ["tshirt"], True
+        chosen.clips, chosen.frames, chosen.garments = ["cmu_016_32"], 5, ["tshirt"]
     rows = {
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
@@ -90,7 +90,8 @@ def main() -> None:
                 setting = setting._replace(garments=setting.garments[:1])
             file = chosen.out / f"{name}.json"
             known = json.loads(file.read_text()) if chosen.keep and file.exists() else {}
-            for result in energy_table(with_changes(rows, name, chosen.controls), setting, known):
+            has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
+            for result in energy_table(with_changes(rows, name, has_controls), setting, known):
                 write(result, file)
 
 
