@@ -9,7 +9,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.geometry.validate import UNITS
 
 _HUMAN = 1.7  # [m]
-_IN_UNITS = (0.3, 3.0)  # [m] extents of bodies that are taken to be in metres
+_IN_METRES = (0.3, 3.0)  # [m] extents of bodies that are taken to be in metres
 _IN_UNITS = (0.5, 2.6)  # [m] extents that make another unit believable
 _EXTENTS = (1e-4, 1e6)  # of a body in any unit; beyond, the file is damaged
 
@@ -34,7 +34,7 @@ def metres_per_unit(name: str, extent: float, units: str | None = None) -> float
     """
     if units is not None:
         return _known_unit(name, units)
-    if _IN_UNITS[0] <= extent <= _IN_UNITS[1]:
+    if _IN_METRES[0] <= extent <= _IN_METRES[1]:
         return 1.0
     if not _EXTENTS[0] <= extent <= _EXTENTS[1]:
         raise AssetError(f"{name} is {extent:.4g} units large; export it again in metres")

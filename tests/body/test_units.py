@@ -26,7 +26,8 @@ def test_a_body_in_odd_units_is_made_a_person_with_a_line_that_says_so(extent, s
 def test_metres_and_named_units_are_not_guessed():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert metres_per_unit("body", 1.7) == 1.0
+        for extent in (0.35, 0.4, 1.7, 2.9):  # a doll, a baby, a person, a giant
+            assert metres_per_unit("body", extent) == 1.0
         assert metres_per_unit("body", 1.7, "cm") == 0.01
         assert metres_per_unit("body", 71.0, "0.02") == 0.02
 
