@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 from numpy.typing import NDArray
 
-from eslr_jax.geometry.closest import closest_points
-from eslr_jax.geometry.topology import boundary_loops, vertex_normals
+from eslr_jax.geometry.closest import nearest_places
+from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
 from eslr_jax.types import BodyMotion, Garment
 
 _EVERY = 10  # frames
@@ -66,9 +66,7 @@ def wear_report(
         "worst_skin_through": None,
     }
     skin = np.unique(skin_faces[np.asarray(poses.is_obstacle)])
-    hem = np.zeros(cloth.shape[1], bool)
-    for loop in boundary_loops(faces):
-        hem[loop] = True
+    hem = is_on_boundary(faces, cloth.shape[1])
     rest = np.asarray(garment.rest_positions)[is_real]
     unposed = np.asarray(poses.rest_positions)
     side, distance, _ = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
@@ -107,13 +105,9 @@ def _sides(
     The first is measured along the normals of both, and the smaller one counts: skin beside a fold is far off
     it, but not in front of it. It is zero where they disagree, at a hem, and where the two face different ways.
     """
-    nearest, weights = closest_points(points, positions, faces)
-    corners = faces[nearest]
-    offset = points - np.einsum("pk,pkx->px", weights, positions[corners])
-    normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
+    nearest, _, offset, normals = nearest_places(points, positions, faces, vertex_normals(positions, faces))
     distance = np.linalg.norm(offset, axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    is_other = hem[corners].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= _ALIKE)
+    is_other = hem[faces[nearest]].any(axis=1) | (np.einsum("px,px->p", outward, normals) <= _ALIKE)
     along = np.stack([np.einsum("px,px->p", offset, axis) for axis in (outward, normals)])
     is_other |= along.prod(axis=0) <= 0
     return np.where(is_other, 0.0, np.sign(along[0]) * np.abs(along).min(axis=0)), distance, nearest

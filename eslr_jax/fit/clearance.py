@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.fit.postures import Posture
-from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.skinning import smooth
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
@@ -39,11 +39,7 @@ def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np
     centers = posture.positions[faces].mean(axis=1)
     near = ((centers > low) & (centers < high)).all(axis=1)
     faces = faces[near] if near.any() else faces
-    nearest, barycentric = closest_points(points, posture.positions, faces)
-    corners = faces[nearest]
-    offset = points - np.einsum("pc,pcx->px", barycentric, posture.positions[corners])
-    normals = np.einsum("pc,pcx->px", barycentric, posture.normals[corners])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    _, _, offset, normals = nearest_places(points, posture.positions, faces, posture.normals)
     distance = np.linalg.norm(offset, axis=1)
     return np.where(np.einsum("px,px->p", offset, normals) < 0, -distance, distance), normals
 

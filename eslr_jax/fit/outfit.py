@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from eslr_jax.errors import MeshError
-from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.skinning import smooth
-from eslr_jax.geometry.topology import boundary_loops, vertex_normals
+from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
 from eslr_jax.io.garment import GarmentFile
 
 LAYER_GAP = 5e-3  # [m] left between two layers at rest: two millimetres over the thickness of repulsion
@@ -42,7 +42,7 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         for inner, other in zip(placed, garments[:number], strict=True):
             positions = _move_over(positions, garment.faces, inner, other.faces)
         for inner, other, name in zip(placed, garments[:number], names[:number], strict=True):
-            heights, _ = _heights(positions, inner, other.faces)
+            heights, _, _ = _heights(positions, inner, other.faces)
             if (beneath := int(np.sum(heights < 0))) > 0:
                 raise MeshError(
                     f"{beneath} vertices of {names[number]} stay beneath {name}; change their order"
@@ -77,15 +77,14 @@ def _move_over(
     """Return a layer with its vertices moved out over another one, and its faces off that one's vertices."""
     result = positions.copy()
     for _ in range(_ROUNDS):
-        heights, normals = _heights(result, inner, inner_faces)
+        heights, normals, _ = _heights(result, inner, inner_faces)
         move = np.maximum(LAYER_GAP - heights, 0.0)[:, None] * normals
         # Vertices of the layer beneath may still look out between those of this one.
-        under, outward = _heights(inner, result, faces)
+        under, outward, nearest = _heights(inner, result, faces)
         sunk = np.flatnonzero(np.isfinite(under) & (under > -0.5 * LAYER_GAP))
-        nearest, _ = closest_points(inner[sunk], result, faces)
         lift = (under[sunk] + 0.5 * LAYER_GAP)[:, None] * outward[sunk]
         for corner in range(3):
-            vertices = faces[nearest, corner]
+            vertices = faces[nearest[sunk], corner]
             longer = np.linalg.norm(lift, axis=1) > np.linalg.norm(move[vertices], axis=1)
             move[vertices[longer]] = lift[longer]
         if np.abs(move).max(initial=0.0) < 1e-5:
@@ -99,34 +98,27 @@ def _heights(
     points: Float[np.ndarray, "points 3"],
     positions: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
-) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
-    """Return how high points are over a layer [m], infinite where they are beside it, and its normals.
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
+    """Return how high points are over a layer [m], infinite where they are beside it, its normals and faces.
 
     Beside it are points whose nearest place on it is on a hem, or more than 5 cm away.
     """
-    nearest, weights = closest_points(points, positions, faces)
-    corners = faces[nearest]
-    offset = points - np.einsum("pk,pkx->px", weights, positions[corners])
-    normals = np.einsum("pk,pkx->px", weights, vertex_normals(positions, faces)[corners])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    is_beside = _on_hem(weights, corners, faces, len(positions))
-    is_beside |= np.linalg.norm(offset, axis=1) > _REACH
-    return np.where(is_beside, np.inf, np.einsum("px,px->p", offset, normals)), normals
-
-
-def _on_hem(
-    weights: np.ndarray, corners: np.ndarray, faces: np.ndarray, num_vertices: int
-) -> Bool[np.ndarray, " points"]:
-    """Tell which places of a mesh lie on its boundary: all corners that count are on it."""
-    hem = np.zeros(num_vertices, bool)
-    for loop in boundary_loops(faces):
-        hem[loop] = True
-    return np.all(hem[corners] | (weights < 1e-6), axis=1)
+    place = nearest_places(points, positions, faces, vertex_normals(positions, faces))
+    hem = is_on_boundary(faces, len(positions))
+    is_beside = np.all(hem[faces[place.faces]] | (place.weights < 1e-6), axis=1)
+    is_beside |= np.linalg.norm(place.offsets, axis=1) > _REACH
+    heights = np.einsum("px,px->p", place.offsets, place.normals)
+    return np.where(is_beside, np.inf, heights), place.normals, place.faces
 
 
 def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:
     """Return tables below each other, with columns of zeros up to a width."""
     return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
+
+
+def _own_parts(garment: GarmentFile, name: str) -> list[str]:
+    """Return what the parts of a garment are called in an outfit."""
+    return [name] if garment.face_parts is None else [f"{name}/{part}" for part in garment.part_names]
 
 
 def _parts(
@@ -138,22 +130,17 @@ def _parts(
     for garment, name in zip(garments, names, strict=True):
         own = np.zeros(len(garment.faces), np.int64) if garment.face_parts is None else garment.face_parts
         face_parts.append(own + len(part_names))
-        part_names += [name] if garment.face_parts is None else [f"{name}/{p}" for p in garment.part_names]
+        part_names += _own_parts(garment, name)
     return tuple(part_names), np.concatenate(face_parts)
 
 
 def _fabrics(garments: Sequence[GarmentFile], names: Sequence[str]) -> list[str]:
     """Return the fabrics that the garments' files give, each for its part."""
-    fabrics = []
+    fabrics: list[str] = []
     for garment, name in zip(garments, names, strict=True):
-        whole = ["cotton"]
+        given = dict.fromkeys(_own_parts(garment, name), "cotton")
         for text in garment.metadata.get("fabrics", ()):
-            part, separator, rest = str(text).rpartition(":")
-            if separator:
-                fabrics.append(f"{name}/{part}:{rest}")
-            else:
-                whole = [rest]
-        parts = [name] if garment.face_parts is None else [f"{name}/{part}" for part in garment.part_names]
-        given = {text.rpartition(":")[0] for text in fabrics}
-        fabrics += [f"{part}:{whole[0]}" for part in parts if part not in given]
+            part, separator, fabric = str(text).rpartition(":")
+            given |= {f"{name}/{part}": fabric} if separator else dict.fromkeys(given, fabric)
+        fabrics += [f"{part}:{fabric}" for part, fabric in given.items()]
     return fabrics

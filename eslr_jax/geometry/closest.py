@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -53,6 +55,37 @@ def closest_points(
         open_points = np.concatenate(still_open) if still_open else open_points[:0]
         num_candidates *= 4
     return nearest, barycentric
+
+
+class NearestPlaces(NamedTuple):
+    """Where a mesh is nearest to points."""
+
+    faces: Int[np.ndarray, " points"]
+    weights: Float[np.ndarray, "points 3"]  # barycentric, of the place on the face
+    offsets: Float[np.ndarray, "points 3"]  # from the place to the point [m]
+    normals: Float[np.ndarray, "points 3"]  # of length one, between those of the face's vertices
+
+
+def nearest_places(
+    points: Float[np.ndarray, "points 3"],
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+) -> NearestPlaces:
+    """Return the place of a mesh that is nearest to every point, and the mesh's normal there.
+
+    Args:
+        points: Query points [m], shape [points, 3].
+        positions: Mesh vertices [m], shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        normals: Of the mesh's vertices, shape [vertices, 3].
+    """
+    nearest, weights = closest_points(points, positions, faces)
+    corners = faces[nearest]
+    offsets = points - np.einsum("pk,pkx->px", weights, positions[corners])
+    along = np.einsum("pk,pkx->px", weights, normals[corners])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
+    return NearestPlaces(nearest, weights, offsets, along)
 
 
 def barycentric_of_closest(

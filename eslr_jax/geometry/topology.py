@@ -233,6 +233,14 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
     return sorted(loops, key=lambda loop: (-len(loop), loop[0]))
 
 
+def is_on_boundary(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> Bool[np.ndarray, " vertices"]:
+    """Return which vertices lie on the boundary of a manifold mesh."""
+    starts, _, _ = half_edges(faces)
+    result = np.zeros(num_vertices, bool)
+    result[starts[twin_half_edges(faces) < 0]] = True
+    return result
+
+
 def _normalize(vectors: np.ndarray) -> np.ndarray:
     """Return unit vectors; a zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
