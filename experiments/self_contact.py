@@ -18,6 +18,7 @@ import numpy as np
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.referee import judge
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
@@ -33,8 +34,6 @@ TURNS = 2  # of every rollout; the faster one counts
 
 def measure(garment: str, clip: str, vertices: str, frames: int) -> dict[str, Any]:
     """Return intersecting pairs of cloth faces over a rollout and milliseconds a frame, with and without."""
-    from eslr_jax.evaluation.referee import judge
-
     cloth = load_garment(garment, vertices=vertices)
     poses = pose_body(load_body(), load_motion(clip), num_frames=frames)
     surface = shared_surface([cloth], poses)  # all clips then share a program

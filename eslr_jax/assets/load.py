@@ -198,8 +198,10 @@ def load_garment_file(
 
 def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:
     """Return a bundled garment on a body; the bundled one wears it as it is."""
+    if body is None:
+        return stored
     own = load_body()
-    if body is None or (
+    if (
         body.joint_names == own.joint_names
         and body.rest_positions.shape == own.rest_positions.shape
         and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from eslr_jax.simulation.budget import Choice
     from eslr_jax.types import PairCapacity, Scene, Trajectory
 
+DEFAULT_GARMENT = "tshirt"
 _SAME = 1e-4  # [m] by which the beginning of the same scene may differ between machines
 
 

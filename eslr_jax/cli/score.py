@@ -12,7 +12,7 @@ import tyro
 
 from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.console import app, print_report, say, stderr, use_compile_cache
-from eslr_jax.cli.options import Options
+from eslr_jax.cli.options import DEFAULT_GARMENT, Options
 from eslr_jax.errors import ConfigError, MeshError, MotionError
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from eslr_jax.io.run import Run
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
-_GARMENT = "tshirt"
 _FAR = (
     0.5  # [m] on average from where the garment is worn, from which a first frame is in other units or axes
 )
@@ -141,7 +140,7 @@ def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
     from eslr_jax.io.garment import in_vertex_order
     from eslr_jax.scene.plan import prepare_scene
 
-    garment = given.get("garment", _GARMENT)
+    garment = given.get("garment", DEFAULT_GARMENT)
     usual = inspect.signature(simulate).parameters
     values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
     values.update(given, garment=(garment,), frames=len(sequence.positions))

@@ -15,6 +15,7 @@ from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, print_report, progress, say, stderr, use_compile_cache
 from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
 from eslr_jax.cli.options import (
+    DEFAULT_GARMENT,
     Options,
     check_same_scene,
     interrupted_record,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from eslr_jax.simulation.simulate import Simulation
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
-_GARMENT = "tshirt"
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
 _SETTLE = 15  # frames: a T-shirt's start is stretched by 1.87 at an armpit, and by 1.2 after these
@@ -188,7 +188,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
 
     request = _read_request(options)
-    names = options.garment or (_GARMENT,)
+    names = options.garment or (DEFAULT_GARMENT,)
     label = "+".join(names)
     with stderr.status("loading garment, body and motion"):
         rig, poses, motion = load_actor(options)

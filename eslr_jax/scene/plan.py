@@ -81,15 +81,17 @@ def plan_scene(
     options = options or SceneOptions()
     check_length(poses)
     skinned, radii = np.empty(0), np.empty(0)
-    pieces, has_layers = count_pieces(garment), options.self_contact
-    is_undecided = has_layers is None and pieces > 1
+    piece, has_layers = piece_of_vertices(garment), options.self_contact
+    num_pieces = int(piece.max()) + 1
+    is_undecided = has_layers is None and num_pieces > 1
     needs_surface = options.has_body and surface is None
     needs_ground = options.has_body and options.ground == "auto"
     if is_undecided or needs_surface or needs_ground:
         skinned = np.asarray(_skin(garment, poses.joint_transforms))
         radii = options.reach + _looseness(garment, poses)
     if is_undecided:
-        has_layers = pieces_meet(garment, skinned)
+        is_real = np.asarray(garment.vertex_mask)
+        has_layers = _pieces_meet(piece[is_real], skinned[:, is_real])
     if not options.has_body:
         surface = None
     elif surface is None:
@@ -102,8 +104,8 @@ def plan_scene(
         constants=constants or PhysicsConstants(),
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
-        self_contact=starting_capacity(garment.vertex_mask.shape[0], pieces) if has_layers else None,
-        pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and is_undecided else None,
+        self_contact=starting_capacity(len(piece), num_pieces) if has_layers else None,
+        pieces=jnp.asarray(piece) if has_layers and is_undecided else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
         ground=ground_height(poses) if has_ground else None,
@@ -228,11 +230,6 @@ def _sampled(num_frames: int) -> np.ndarray:
     return np.unique(np.linspace(0, num_frames - 1, _SAMPLED_FRAMES).astype(int))
 
 
-def count_pieces(garment: Garment) -> int:
-    """Return how many pieces of cloth a garment consists of, which no edge joins."""
-    return int(piece_of_vertices(garment).max()) + 1
-
-
 def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
     """Return the piece of cloth that every vertex belongs to, which no edge joins to others; -1 where padded."""
     faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
@@ -242,19 +239,16 @@ def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
     return pieces
 
 
-def pieces_meet(garment: Garment, skinned: np.ndarray) -> bool:
-    """Return whether two pieces of a garment come close enough to touch, in a sample of skinned frames.
+def _pieces_meet(piece: np.ndarray, skinned: np.ndarray) -> bool:
+    """Return whether two pieces come close enough to touch, in a sample of skinned frames.
 
     Args:
-        garment: A garment of several pieces.
+        piece: Number of the piece of every vertex, shape [vertices].
         skinned: Positions [m], shape [frames, vertices, 3].
     """
-    is_real = np.asarray(garment.vertex_mask)
-    piece = piece_of_vertices(garment)[is_real]
     for frame in _sampled(len(skinned)):
-        points = np.asarray(skinned[frame])[is_real]
         for number in range(1, piece.max() + 1):
-            one, others = points[piece == number], points[piece < number]
+            one, others = skinned[frame][piece == number], skinned[frame][piece < number]
             if np.isfinite(cKDTree(others).query(one, distance_upper_bound=SEARCH_RADIUS)[0]).any():
                 return True
     return False
