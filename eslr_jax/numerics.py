@@ -232,8 +232,7 @@ def scatter_corners(
         values: One value per corner of every item.
         incidence: Flat corner positions per row, see `gather_corners`.
     """
-    padded = jnp.concatenate([values.T.ravel(), jnp.zeros(1, values.dtype)])
-    return sum(padded[incidence[:, k]] for k in range(incidence.shape[1]))  # type: ignore[return-value]
+    return _sum_flat_impl(values.T.ravel(), None, incidence)
 
 
 def sum_incident(
@@ -246,10 +245,16 @@ def sum_incident(
         incidence: Flat corner positions per row, see `gather_corners`.
         corners: Corners of an item.
     """
-    num_items = values.shape[0]
-    items = jnp.where(incidence < corners * num_items, incidence % max(num_items, 1), num_items)
+    items = _incident_items(incidence, values.shape[0], corners=corners)
     padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
     return sum(padded[items[:, k]] for k in range(items.shape[1]))  # type: ignore[return-value]
+
+
+def _incident_items(
+    incidence: Int[Array, "rows degree"], num_items: int, *, corners: int
+) -> Int[Array, "rows degree"]:
+    """Return the items around every row, padded with their number."""
+    return jnp.where(incidence < corners * num_items, incidence % max(num_items, 1), num_items)
 
 
 def vertex_normals(
@@ -265,8 +270,10 @@ def vertex_normals(
         incidence: Of the faces, see `gather_corners`.
     """
     a, b, c = gather_corners(positions, faces, incidence)
-    normals = jnp.stack(cross3(sub3(b, a), sub3(c, a)), axis=-1)
-    return safe_normalize(sum_incident(normals, incidence, corners=3))
+    normals = jnp.stack(cross3(sub3(b, a), sub3(c, a)))
+    padded = jnp.pad(normals, ((0, 0), (0, 1)))
+    around = _incident_items(incidence, faces.shape[0], corners=3)
+    return safe_normalize(jnp.sum(padded[:, around.T], axis=1).T)
 
 
 @jax.custom_jvp

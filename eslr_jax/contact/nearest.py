@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.contact.search import PosedSurface, nearest_faces, opposing_faces
+from eslr_jax.contact.search import PosedSurface, face_corners, nearest_faces, opposing_faces
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, components, safe_norm, safe_normalize, take3, vertex_normals
+from eslr_jax.numerics import Vector3, components, safe_norm, safe_normalize, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
@@ -66,19 +66,17 @@ def _point_on(
     surface: BodySurface,
 ) -> SurfacePoint:
     """Return the nearest point of one face per query point."""
-    body = components(positions)
-    corners = [take3(body, surface.faces[face, k]) for k in range(3)]
-    squared, u, v = point_triangle(components(query), corners[0], corners[1], corners[2])
+    corners = face_corners(positions, surface.faces)[face].T.reshape(3, 3, -1)
+    squared, u, v = point_triangle(components(query), *(tuple(corner) for corner in corners))
     return SurfacePoint(face, (1.0 - u - v, u, v), squared)
 
 
 def interpolate(
-    values: Float[Array, "surface_vertices 3"], location: SurfacePoint, surface: BodySurface
-) -> Float[Array, "vertices 3"]:
+    values: Float[Array, "surface_vertices features"], location: SurfacePoint, surface: BodySurface
+) -> Float[Array, "vertices features"]:
     """Return per-vertex values of the surface at located points."""
-    corners = surface.faces[location.face]
-    weights = location.barycentric
-    return sum(weights[k][:, None] * values[corners[:, k]] for k in range(3))  # type: ignore[return-value]
+    corners = values[surface.faces[location.face].T]
+    return sum(weight[:, None] * corners[k] for k, weight in enumerate(location.barycentric))  # type: ignore[return-value]
 
 
 def find_contacts(
@@ -165,7 +163,8 @@ def _contacts_at(
     Where the surface ends, cloth beyond its boundary is not in contact: the tangent plane there says nothing, and
     the nearest point of the whole body, which the surface is a part of, is another one.
     """
-    points, next_points, normal, next_normal = (interpolate(values, location, surface) for values in step)
+    found = interpolate(jnp.concatenate(step, axis=1), location, surface)
+    points, next_points, normal, next_normal = jnp.split(found, 4, axis=1)
     here = safe_normalize(normal)
     side = jnp.sum((position - points) * here, axis=-1)
     is_apart = location.squared_distance > 0  # on the surface the root has no slope

@@ -13,7 +13,6 @@ from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import (
     TrueEntries,
     Vector3,
-    components,
     dot3,
     sub3,
     take3,
@@ -23,6 +22,7 @@ from eslr_jax.numerics import (
 from eslr_jax.types import BodySurface
 
 _INFINITY = 0x7F800000  # bits of the float32 infinity
+_COLUMNS = 32  # patches are padded to a multiple: XLA packs bits four times as fast without a rest
 _FIRST = 2  # patches that every block looks into; what they hold bounds the distance to the others
 _PAIRS = 4  # pairs of a block and a patch that are looked at together, times the number of blocks
 _SHARE_FACING = 4  # one block in so many is searched for its opposing faces at a time
@@ -37,10 +37,10 @@ class PosedSurface(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """Points in compact groups; component arrays have shape [groups, members]."""
+    """Points in compact groups, the component first: what is done to all three is one kernel."""
 
-    points: Vector3  # [m]
-    normals: Vector3
+    points: Float[Array, "3 groups members"]  # [m]
+    normals: Float[Array, "3 groups members"]
 
 
 class _Patches(NamedTuple):
@@ -79,22 +79,21 @@ def nearest_faces(
         surface: Search tables.
         blocks: Compact groups of query points.
     """
-    body = components(positions)
-    members = take3(body, surface.patch_vertices)
+    members = positions.T[:, surface.patch_vertices]
     patches = _Patches(surface.patch_vertices, _Groups(members, members))
-    points = take3(components(query), blocks)
+    points = query.T[:, blocks]
     groups = _Groups(points, points)
-    num_patches = members[0].shape[0]
-    keys = _with_index(_gaps(points, members), jnp.arange(num_patches, dtype=jnp.int32)[None], num_patches)
+    gaps = _gaps(_bounds(points), _bounds(members, _COLUMNS))
+    keys = _with_index(gaps, jnp.arange(gaps.shape[1], dtype=jnp.int32)[None], gaps.shape[1])
     mask, key = _index_mask(keys.shape[1]), jnp.full(blocks.shape[0], -1)
     nearest = _nothing(blocks.shape)
-    for _ in range(min(_FIRST, keys.shape[1])):
+    for _ in range(min(_FIRST, members.shape[1])):
         key = jnp.min(jnp.where(keys > key[:, None], keys, _INFINITY), axis=1)
         nearest = _merge(nearest, _look(groups, key & mask, patches))
     farthest = jnp.max(nearest.first, axis=1, keepdims=True)
     is_open = (keys > key[:, None]) & ((keys & ~mask) < farthest)
     nearest = _search(groups, patches, true_entries(is_open), nearest)
-    face = _nearest_around(points, _vertices(nearest, patches), body, surface)
+    face = _nearest_around(points, _vertices(nearest, patches), positions, surface)
     return jnp.zeros(query.shape[0], jnp.int32).at[blocks].set(face)
 
 
@@ -117,14 +116,14 @@ def opposing_faces(
         least_cosine: Between normals, below which two places face each other.
     """
     ids, count = surface.patch_vertices, blocks.shape[0]
-    positions = components(body.positions)
-    patches = _Patches(ids, _Groups(take3(positions, ids), take3(components(body.normals), ids)))
-    groups = _Groups(take3(components(query), blocks), take3(components(facing), blocks))
+    patches = _Patches(ids, _Groups(body.positions.T[:, ids], body.normals.T[:, ids]))
+    groups = _Groups(query.T[:, blocks], facing.T[:, blocks])
     may_oppose = _may_oppose(groups, patches.groups, jnp.max(body.reach[ids], axis=1), least_cosine)
 
     def is_excluded(points: _Groups, candidate: Vector3, normal: Vector3) -> Bool[Array, "pairs rows"]:
-        is_ahead = dot3(sub3(candidate, points.points), points.normals) >= 0
-        return ~(is_ahead & (dot3(normal, points.normals) <= least_cosine))
+        here, facing = tuple(points.points), tuple(points.normals)
+        is_ahead = dot3(sub3(candidate, here), facing) >= 0  # type: ignore[arg-type]
+        return ~(is_ahead & (dot3(normal, facing) <= least_cosine))  # type: ignore[arg-type]
 
     nearest = _search(groups, patches, true_entries(may_oppose), _nothing(blocks.shape), is_excluded)
     # Faces are looked for where there is a vertex: in a few blocks, some at a time.
@@ -136,9 +135,9 @@ def opposing_faces(
     def locate(carry):
         first, face = carry
         rows = jax.lax.dynamic_slice(order, (first,), (size,))
-        some, found = jax.tree.map(lambda leaf: leaf[rows], (groups.points, nearest))
-        vertices = _vertices(found, patches)
-        return first + size, face.at[rows].set(_nearest_around(some, vertices, positions, surface))
+        vertices = _vertices(jax.tree.map(lambda leaf: leaf[rows], nearest), patches)
+        around = _nearest_around(groups.points[:, rows], vertices, body.positions, surface)
+        return first + size, face.at[rows].set(around)
 
     start = (jnp.int32(0), jnp.zeros(blocks.shape, jnp.int32))
     _, face = jax.lax.while_loop(lambda carry: carry[0] < num_found, locate, start)
@@ -146,11 +145,18 @@ def opposing_faces(
     return nothing.at[blocks].set(face), nothing.astype(bool).at[blocks].set(is_found)
 
 
-def _bounds(values: Vector3) -> tuple[Vector3, Vector3]:
-    """Return the lowest and the highest of every component within the groups."""
-    x, y, z = values
-    low = (jnp.min(x, axis=1), jnp.min(y, axis=1), jnp.min(z, axis=1))
-    return low, (jnp.max(x, axis=1), jnp.max(y, axis=1), jnp.max(z, axis=1))
+class _Boxes(NamedTuple):
+    """The lowest and the highest of every component within groups."""
+
+    low: Float[Array, "3 groups"]
+    high: Float[Array, "3 groups"]
+
+
+def _bounds(values: Float[Array, "3 groups members"], multiple: int = 1) -> _Boxes:
+    """Return the boxes of groups, and empty ones up to a multiple of their number, infinitely far from any."""
+    more = ((0, 0), (0, -values.shape[1] % multiple))
+    low = jnp.pad(jnp.min(values, axis=2), more, constant_values=jnp.inf)
+    return _Boxes(low, jnp.pad(jnp.max(values, axis=2), more, constant_values=-jnp.inf))
 
 
 Range = tuple[Array, Array]
@@ -166,26 +172,31 @@ def box_gaps(own: list[Range], others: list[Range]) -> Float[Array, "own others"
     return squared  # type: ignore[return-value]
 
 
-def _gaps(points: Vector3, members: Vector3) -> Float[Array, "blocks patches"]:
+def _gaps(blocks: _Boxes, patches: _Boxes) -> Float[Array, "blocks patches"]:
     """Return the squared distances between the boxes around blocks and around patches [m^2]."""
-    own, others = (list(zip(*_bounds(values), strict=True)) for values in (points, members))
+    own, others = (list(zip(boxes.low, boxes.high, strict=True)) for boxes in (blocks, patches))
     return box_gaps(own, others)
 
 
 def _may_oppose(
     blocks: _Groups, patches: _Groups, reach: Float[Array, " patches"], least_cosine: float
-) -> Bool[Array, "blocks patches"]:
-    """Return which patches may hold a vertex that opposes a point of a block: bounds by intervals."""
-    (low, high), (patch_low, patch_high) = _bounds(blocks.points), _bounds(patches.points)
-    normal, patch_normal = _bounds(blocks.normals), _bounds(patches.normals)
+) -> Bool[Array, "blocks columns"]:
+    """Return which patches may hold a vertex that opposes a point of a block: bounds by intervals.
+
+    The columns beyond the patches are false.
+    """
+    box, patch_box = _bounds(blocks.points), _bounds(patches.points, _COLUMNS)
+    normal, patch_normal = _bounds(blocks.normals), _bounds(patches.normals, _COLUMNS)
     cosine, ahead = 0.0, 0.0
     for axis in range(3):
         a, b = (end[axis][:, None] for end in normal)
         c, d = (end[axis][None] for end in patch_normal)
         cosine = cosine + jnp.minimum(jnp.minimum(a * c, a * d), jnp.minimum(b * c, b * d))
-        c, d = patch_low[axis][None] - high[axis][:, None], patch_high[axis][None] - low[axis][:, None]
+        c = patch_box.low[axis][None] - box.high[axis][:, None]
+        d = patch_box.high[axis][None] - box.low[axis][:, None]
         ahead = ahead + jnp.maximum(jnp.maximum(a * c, a * d), jnp.maximum(b * c, b * d))
-    is_near = _gaps(blocks.points, patches.points) < (reach * reach)[None]
+    reach = jnp.pad(reach, (0, patch_box.low.shape[1] - reach.shape[0]))
+    is_near = _gaps(box, patch_box) < (reach * reach)[None]
     return is_near & (cosine <= least_cosine) & (ahead >= 0.0)  # type: ignore[return-value]
 
 
@@ -222,12 +233,12 @@ def _look(
 ) -> _Nearest:
     """Return the two nearest vertices of one patch for each group of points."""
     vertices = patches.vertices[patch]
-    members, normals = (take3(values, patch) for values in patches.groups)
+    members, normals = (values[:, patch] for values in patches.groups)
     count = patches.vertices.size
-    nearest = _nothing(points.points[0].shape)
+    nearest = _nothing(points.points.shape[1:])
     for k in range(vertices.shape[1]):
         here, normal = (tuple(c[:, k, None] for c in values) for values in (members, normals))
-        offset = sub3(points.points, here)  # type: ignore[arg-type]
+        offset = sub3(tuple(points.points), here)  # type: ignore[arg-type]
         distance = _with_index(dot3(offset, offset), vertices[:, k, None], count)
         if is_excluded is not None:
             distance = jnp.where(is_excluded(points, here, normal), _INFINITY, distance)  # type: ignore[arg-type]
@@ -257,7 +268,7 @@ def _search(
         first, nearest = carry
         number = first + jnp.arange(size, dtype=jnp.int32)
         block, patch = pairs.find(number)
-        found = _look(jax.tree.map(lambda leaf: leaf[block], blocks), patch, patches, is_excluded)
+        found = _look(jax.tree.map(lambda leaf: leaf[:, block], blocks), patch, patches, is_excluded)
         is_pair = (number < pairs.count)[:, None]
         found = jax.tree.map(lambda leaf: jnp.where(is_pair, leaf, _INFINITY), found)
         best = nearest.first.at[block].min(found.first)
@@ -276,19 +287,43 @@ def _vertices(nearest: _Nearest, patches: _Patches) -> tuple[Int[Array, "blocks 
 
 
 def _nearest_around(
-    points: Vector3,
+    points: Float[Array, "3 blocks rows"],
     vertices: tuple[Int[Array, "blocks rows"], ...],
-    body: Vector3,
+    positions: Float[Array, "surface_vertices 3"],
     surface: BodySurface,
 ) -> Int[Array, "blocks rows"]:
     """Return the nearest of the faces around some surface vertices per point."""
+    corners = face_corners(positions, surface.faces)
+    return nearest_face_around(tuple(points), vertices, corners, surface.face_incidence)  # type: ignore[arg-type]
+
+
+def face_corners(
+    positions: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"]
+) -> Float[Array, "faces 9"]:
+    """Return the corners of every face, one after another: a row of nine is one read."""
+    return positions[faces].reshape(-1, 9)
+
+
+def nearest_face_around(
+    points: Vector3,
+    vertices: tuple[Int[Array, "*shape"], ...],
+    corners: Float[Array, "faces 9"],
+    face_incidence: Int[Array, "vertices degree"],
+) -> Int[Array, "*shape"]:
+    """Return the nearest of the faces around some vertices of a mesh per point, or face zero.
+
+    Args:
+        points: By components, each of any shape.
+        vertices: One or more for every point.
+        corners: Of `face_corners` [m].
+        face_incidence: Of the mesh, see `numerics.gather_corners`.
+    """
     # What pads the table becomes face zero: one more candidate.
-    around = (surface.face_incidence % surface.faces.shape[0]).astype(jnp.int32).T
-    faces = jnp.concatenate([around[:, vertex] for vertex in vertices])  # [candidates, blocks, rows]
-    corners = jnp.stack([c for k in range(3) for c in take3(body, surface.faces[:, k])], axis=1)
+    around = (face_incidence % corners.shape[0]).astype(jnp.int32).T
+    faces = jnp.concatenate([around[:, vertex] for vertex in vertices])  # [candidates, *shape]
     count = faces.shape[0]
 
-    def try_face(slot: Array, best: Int[Array, "blocks rows"]) -> Int[Array, "blocks rows"]:
+    def try_face(slot: Array, best: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
         a, b, c = jnp.moveaxis(corners[faces[slot]], -1, 0).reshape(3, 3, *best.shape)
         squared, _, _ = point_triangle(points, tuple(a), tuple(b), tuple(c))
         return jnp.minimum(best, _with_index(squared, slot, count))
@@ -297,3 +332,23 @@ def _nearest_around(
     best = jax.lax.fori_loop(0, count, try_face, jnp.full(points[0].shape, _INFINITY, jnp.int32))
     slot = jnp.minimum(best & _index_mask(count), count - 1)
     return jnp.take_along_axis(faces, slot[None], axis=0)[0]
+
+
+def nearest_candidates(
+    points: Vector3, candidates: Int[Array, "candidates rows"], places: Vector3
+) -> Int[Array, " rows"]:
+    """Return for every point the nearest of its candidates, which are numbers of places.
+
+    Args:
+        points: By components, each of shape [rows].
+        candidates: One that names no place, being past the end, is farther than any that does.
+        places: By components.
+    """
+    count, nobody = candidates.shape[0], places[0].shape[0]
+    best = jnp.full(points[0].shape, _INFINITY, jnp.int32)
+    for slot, candidate in enumerate(candidates):
+        offset = sub3(points, take3(places, jnp.minimum(candidate, nobody - 1)))
+        key = _with_index(dot3(offset, offset), jnp.int32(slot), count)
+        best = jnp.minimum(best, jnp.where(candidate < nobody, key, _INFINITY))
+    slot = jnp.minimum(best & _index_mask(count), count - 1)
+    return jnp.take_along_axis(candidates, slot[None], axis=0)[0]

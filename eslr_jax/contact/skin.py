@@ -8,8 +8,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.nearest import CLEARANCE, find_contacts
+from eslr_jax.contact.search import face_corners, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
+from eslr_jax.numerics import Vector3, components, dot3, sub3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _LIFTS = 8  # of skinned cloth off the skin
@@ -57,11 +58,10 @@ def find_skin_contacts(
     normals = vertex_normals(body, surface.faces, surface.face_incidence)
     next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
 
-    def height(cloth: Array, points: Array, outward: Array) -> Float[Array, " surface_vertices"]:
-        place = sum(weights[:, k, None] * cloth[corners[:, k]] for k in range(3))
-        return jnp.sum((place - points) * outward, axis=-1)
-
-    over, next_over = height(position, body, normals), height(predicted, next_body, next_normals)
+    both = jnp.concatenate([position, predicted], axis=1)[corners.T]
+    here, ahead = jnp.split(sum(weights[:, k, None] * both[k] for k in range(3)), 2, axis=1)
+    over = jnp.sum((here - body) * normals, axis=-1)
+    next_over = jnp.sum((ahead - next_body) * next_normals, axis=-1)
     is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
     clearance = jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
     nearness, rows = jax.lax.top_k(-clearance, min(position.shape[0], clearance.shape[0] // 2))
@@ -98,7 +98,7 @@ def lift_off_skin(
     count = position.shape[0]
 
     def lift(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        nearest = find_contacts(position, body, body, surface)
+        nearest = find_contacts(position, body, body, surface, garment.vertex_blocks)
         skin = find_skin_contacts((position, position), (body, body), nearest, surface, garment)
         depth = jnp.where(skin.is_near, jnp.maximum(CLEARANCE - skin_heights(position, skin), 0.0), 0.0)
         # Corner k moves by w_k / |w|^2 times the depth, so that the place does by the depth; a corner of several
@@ -131,7 +131,7 @@ def _nearest_vertices(
     # The corner that follows a vertex in each of its faces: around an inner vertex, every neighbour once.
     neighbors = flat[jnp.where(is_neighbor, (surface.face_incidence + num_faces) % flat.size, 0)]
     own = jnp.arange(body.shape[0], dtype=jnp.int32)[:, None]
-    around = jnp.concatenate([own, jnp.where(is_neighbor, neighbors, own)], axis=1)
+    around = jnp.concatenate([own, jnp.where(is_neighbor, neighbors, own)], axis=1).T
     nobody = position.shape[0]
     is_seed = nearest.is_near[:, None]
     seeds = jnp.where(is_seed, surface.faces[nearest.faces], body.shape[0])
@@ -140,7 +140,7 @@ def _nearest_vertices(
     vertex = vertex.at[seeds].set(ids, mode="drop")
 
     def spread(_, vertex: Int[Array, " surface_vertices"]) -> Int[Array, " surface_vertices"]:
-        return _nearest_candidate(vertex[around], cloth, here)
+        return nearest_candidates(here, vertex[around], cloth)
 
     return jax.lax.fori_loop(0, _ROUNDS, spread, vertex)
 
@@ -153,27 +153,16 @@ def _descend(
 ) -> Int[Array, " surface_vertices"]:
     """Return cloth vertices that are nearer still, edges of the cloth away: its mesh may be the finer one."""
     cloth, here, nobody = components(position), components(body), position.shape[0]
+    own = jnp.arange(nobody, dtype=jnp.int32)[:, None]
+    neighbors = jnp.where(garment.neighbor_mask, garment.neighbors, own).T
 
     def walk(_, vertex: Int[Array, " surface_vertices"]) -> Int[Array, " surface_vertices"]:
         known = jnp.minimum(vertex, nobody - 1)
-        around = jnp.where(garment.neighbor_mask[known], garment.neighbors[known], known[:, None])
-        candidates = jnp.concatenate([known[:, None], around], axis=1)
-        nearer = _nearest_candidate(candidates, cloth, here)
+        candidates = jnp.concatenate([known[None], neighbors[:, known]])
+        nearer = nearest_candidates(here, candidates, cloth)
         return jnp.where(vertex < nobody, nearer, nobody)
 
     return jax.lax.fori_loop(0, _ROUNDS, walk, vertex)
-
-
-def _nearest_candidate(
-    candidates: Int[Array, "rows candidates"], cloth: Vector3, point: Vector3
-) -> Int[Array, " rows"]:
-    """Return each row's candidate that is nearest to its point; one that names no cloth vertex comes last."""
-    nobody = cloth[0].shape[0]
-    places = take3(cloth, jnp.minimum(candidates, nobody - 1))
-    squared = sum((p - b[:, None]) ** 2 for p, b in zip(places, point, strict=True))
-    squared = jnp.where(candidates < nobody, squared, jnp.inf)
-    slot = _first_smallest(squared)
-    return jnp.take_along_axis(candidates, slot[:, None], axis=1)[:, 0]
 
 
 def _nearest_places(
@@ -188,23 +177,10 @@ def _nearest_places(
 
     The distance is infinite where there is no vertex.
     """
-    num_faces, cloth, point = garment.faces.shape[0], components(position), components(body)
-    is_known = vertex < position.shape[0]
-    incidence = garment.face_incidence[jnp.minimum(vertex, position.shape[0] - 1)]
-    is_face = (incidence < garment.faces.size) & is_known[:, None]
-    candidates = jnp.where(is_face, incidence % num_faces, 0)
-    a, b, c = (take3(take3(cloth, garment.faces[:, k]), candidates) for k in range(3))
-    expanded = (point[0][:, None], point[1][:, None], point[2][:, None])
-    squared, u, v = point_triangle(expanded, a, b, c)
-    squared = jnp.where(is_face, squared, jnp.inf)
-    slot = _first_smallest(squared)[:, None]
-    face, u, v, squared = (jnp.take_along_axis(x, slot, axis=1)[:, 0] for x in (candidates, u, v, squared))
+    nobody, point = position.shape[0], components(body)
+    is_known = vertex < nobody
+    corners = face_corners(position, garment.faces)
+    face = nearest_face_around(point, (jnp.minimum(vertex, nobody - 1),), corners, garment.face_incidence)
+    squared, u, v = point_triangle(point, *(tuple(corner) for corner in corners[face].T.reshape(3, 3, -1)))
+    squared = jnp.where(is_known, squared, jnp.inf)
     return garment.faces[face], jnp.stack([1.0 - u - v, u, v], axis=1), squared
-
-
-def _first_smallest(values: Float[Array, "rows columns"]) -> Int[Array, " rows"]:
-    """Return the first column of every row's minimum; `argmin` is slow on XLA's CPU backend."""
-    width = values.shape[1]
-    columns = jnp.arange(width, dtype=jnp.int32)[None]
-    is_smallest = values <= jnp.min(values, axis=1)[:, None]
-    return jnp.min(jnp.where(is_smallest, columns, width - 1), axis=1)
