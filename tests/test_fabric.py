@@ -118,7 +118,8 @@ def test_unknown_fabrics_are_named(two_fabrics, text, message):
 @pytest.mark.parametrize("name", list(WOVEN))
 def test_woven_fabrics_bear_their_coupling(name):
     weave = WOVEN[name].weave
-    assert weave.stiffness and weave.rigidity
+    assert weave.stiffness
+    assert weave.rigidity
     along, across, coupling, shear = weave.stiffness
     assert coupling**2 < along * across
     assert shear > 0

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cloth import make_garment
-from flat_meshes import cantilever_rigidity, grid, irregular, tube
+from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.plate import prepare_plate, rest_corners

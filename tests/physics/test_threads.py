@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cloth import make_garment
 from draped_ball import drifting_ball, square
-from flat_meshes import irregular
+from known_answers.sheets import irregular
 from test_newton import assemble, dense_hessian
 
 from eslr_jax.fabric import Described, describe_fabric, on_threads

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import scipy.optimize
 import scipy.sparse.linalg
-from cloth import grid_faces
+from hard_cases.build import sheet
 from scipy.spatial import Delaunay
 
 
 def grid(length: float, width: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """A grid of squares with their diagonals [m], facing up."""
-    columns, rows = round(length / spacing) + 1, round(width / spacing) + 1
-    x, z = np.meshgrid(np.linspace(0, length, columns), np.linspace(0, width, rows))
-    return np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3), grid_faces(rows, columns)
+    """A grid of squares with alternating diagonals [m], facing up."""
+    counts = round(length / spacing) + 1, round(width / spacing) + 1
+    positions, faces = sheet(*counts, (length, width))
+    return positions + 0.5 * np.array([length, 0.0, width]), faces
 
 
 def irregular(length: float, width: float, spacing: float, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
