@@ -1,7 +1,7 @@
 """The drape test of Cusick: how much of a disc's shadow is left when its rim hangs over a round table.
 
-Source: Cusick 1968, The Measurement of Fabric Drape, Journal of the Textile Institute 59, and ISO 9073-9: a disc of
-30 cm over a table of 18 cm.
+Source: Cusick 1968, The Measurement of Fabric Drape, Journal of the Textile Institute 59; ISO 9073-9: a disc
+of 30 cm over a table of 18 cm.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def _apart(found: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 
 
 def _off_surface(found: np.ndarray, reference: np.ndarray, faces: np.ndarray) -> tuple[float, float]:
-    """Return the distance of vertices from another mesh [mm], rms and for 99 %; it is blind to sliding along it."""
+    """Return the distance of vertices from another mesh [mm], rms and for 99 %; sliding along it is not seen."""
     distances = []
     for points, surface in zip(found[1:], reference[1:], strict=True):
         nearest, weights = closest_points(points, surface, faces)
