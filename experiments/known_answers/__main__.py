@@ -3,8 +3,9 @@
     python experiments/known_answers [--smoke] [--out DIR] [--part answers drape walk]
 
 Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigidity of a cantilever and of a
-cylinder, a twisted sheet, a slope, a ball. Drape: Cusick's coefficient of the woven fabrics. Walk: millimetres by tolerance,
-timestep and mesh. Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png.
+cylinder, a twisted sheet, a slope, a ball. Drape: Cusick's coefficient of woven fabrics. Walk: millimetres by
+tolerance, timestep and mesh. Writes known_answers.json, part by part, and with matplotlib (extra `plot`)
+known_answers.png.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +22,27 @@ PARTS = ("answers", "drape", "walk")
 _DRAPED = ("wool", "satin-woven", "jersey-woven", "suiting-woven", "denim-woven", "brocade-woven")
 
 
-def measure(part: str, is_smoke: bool) -> tuple[list[dict[str, Any]], list]:
-    """Return a part's rows, and the drapes for the picture."""
+def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
+    """Yield a part's rows, each with its drape for the picture or None."""
     if part == "answers":
         from known_answers.cases import CASES
 
-        answers = [answer for case in CASES for answer in case(is_smoke)]
-        rows = [
-            {**answer._asdict(), "found": float(answer.found), "known": float(answer.known)}
-            for answer in answers
-        ]
-        return [{**row, "is_within": one.is_within} for row, one in zip(rows, answers, strict=True)], []
-    if part == "walk":
+        for case in CASES:
+            for one in case(is_smoke):
+                numbers = {"found": float(one.found), "known": float(one.known), "is_within": one.is_within}
+                yield {**one._asdict(), **numbers}, None
+    elif part == "walk":
         from known_answers.walk import refine
 
-        return [row._asdict() for row in refine(is_smoke)], []
-    from known_answers.drape import drape
+        for row in refine(is_smoke):
+            yield row._asdict(), None
+    else:
+        from known_answers.drape import drape
 
-    size = {"spacing": 0.03, "frames": 6} if is_smoke else {}
-    drapes = [drape(fabric, **size) for fabric in (_DRAPED[:1] if is_smoke else _DRAPED)]
-    return [
-        {key: value for key, value in one._asdict().items() if key != "outline"} for one in drapes
-    ], drapes
+        size = {"spacing": 0.03, "frames": 6} if is_smoke else {}
+        for fabric in _DRAPED[:1] if is_smoke else _DRAPED:
+            one = drape(fabric, **size)
+            yield {key: value for key, value in one._asdict().items() if key != "outline"}, one
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
@@ -105,17 +106,15 @@ def main() -> None:
     result = json.loads(path.read_text()) if path.exists() else {}
     drapes: list = []
     for part in arguments.part:
-        rows, drawn = measure(part, arguments.smoke)
-        drapes += drawn
-        result = {**result, part: rows, **environment()}
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
-        for row in rows:
-            print(
-                part,
-                {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()},
-                flush=True,
-            )
+        rows = []
+        for row, drawn in measure(part, arguments.smoke):
+            rows.append(row)
+            drapes += [] if drawn is None else [drawn]
+            result = {**result, part: rows, **environment()}
+            with atomic_write(path) as temporary:
+                temporary.write_text(json.dumps(result, indent=1) + "\n")
+            told = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
+            print(part, told, flush=True)
     draw(result, drapes, path.with_suffix(".png"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -62,25 +63,23 @@ def _off_surface(found: np.ndarray, reference: np.ndarray, faces: np.ndarray) ->
     return float(np.sqrt(np.mean(distance**2))), float(np.quantile(distance, 0.99))
 
 
-def refine(is_smoke: bool, garment: str = "tshirt") -> list[Refinement]:
-    """Return how far a walk is from itself with more iterations, smaller steps and a finer mesh."""
+def refine(is_smoke: bool, garment: str = "tshirt") -> Iterator[Refinement]:
+    """Yield how far a walk is from itself with more iterations, smaller steps and a finer mesh."""
     frames = 4 if is_smoke else 31
-    rows = []
     best, faces = run(garment, "1k", frames, iterations=_FINEST)
     for iterations in (20,) if is_smoke else (10, 20, 40, 100):
         found, _ = run(garment, "1k", frames, iterations=iterations)
-        rows.append(Refinement("tolerance", f"{iterations} iterations", f"{_FINEST}", *_apart(found, best)))
+        yield Refinement("tolerance", f"{iterations} iterations", f"{_FINEST}", *_apart(found, best))
     finest = 2 if is_smoke else 8
     for integrator in ("bdf2",) if is_smoke else ("euler", "bdf2"):
         reference, _ = run(garment, "1k", frames, iterations=100, steps=finest, integrator=integrator)
         for steps in (1,) if is_smoke else (1, 2, 4):
             found, _ = run(garment, "1k", frames, iterations=100, steps=steps, integrator=integrator)
             label = f"{integrator}, 1/{FPS * steps:g} s"
-            rows.append(Refinement("timestep", label, f"1/{FPS * finest:g} s", *_apart(found, reference)))
+            yield Refinement("timestep", label, f"1/{FPS * finest:g} s", *_apart(found, reference))
     if is_smoke:
-        return rows
+        return
     for coarse, fine in (("1k", "4k"), ("4k", "10k")):
         found, _ = run(garment, coarse, frames, iterations=200)
         reference, faces = run(garment, fine, frames, iterations=200)
-        rows.append(Refinement("mesh", coarse, fine, *_off_surface(found, reference, faces)))
-    return rows
+        yield Refinement("mesh", coarse, fine, *_off_surface(found, reference, faces))
