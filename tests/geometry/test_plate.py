@@ -9,6 +9,7 @@ from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.plate import prepare_plate, rest_corners
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
 from eslr_jax.physics.bending import bending_energy, dihedral_angles, plate_curvatures
@@ -80,7 +81,7 @@ def test_isotropic_bending_does_not_know_the_direction_of_the_warp():
 def test_padding_changes_nothing():
     positions, faces = irregular(0.1, 0.08, 0.01)
     garment = make_garment(positions, faces)
-    padded = pad_garment(garment)
+    padded = to_device(pad_garment(garment))
     bent = np.random.default_rng(0).standard_normal((len(padded.vertex_mask), 3)) * 0.004
     bent = bent.astype(np.float32)
     bent[: len(positions)] += positions
