@@ -1,10 +1,10 @@
 """Bending: dihedral angles at interior edges.
 
 A material says how stiff it is in one of two ways. `bending_stiffness` k [J] is HOOD's number: every hinge
-has its own energy, and what a sheet feels depends on its mesh. Of equilateral triangles it has the flexural
-rigidity D = k / 4 [N m]; across the rows of a grid likewise, along one of its diagonals 3 k / 4; a strip of
-irregular triangles of 20 to 5 mm measures .88 to 1.09 of k / 4. A `plate` has the rigidity that it says on
-any mesh, see `geometry.plate`.
+has its own energy, and what a sheet feels depends on its mesh. Equilateral triangles have the flexural
+rigidity D = k / 4 [N m], and so has a grid bent across its rows; bent across its diagonals a grid has up to 3
+k / 4. As a cantilever a grid measures .82 of k / 4, and irregular triangles of 20 to 5 mm .88 to 1.09 of it.
+A `plate` has the rigidity that it says on any mesh, see `geometry.plate`.
 """
 
 from __future__ import annotations
