@@ -2,25 +2,49 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.plate import prepare_plate
 from eslr_jax.geometry.topology import find_hinges, vertex_areas
+from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.physics.materials import COTTON, fabric_material, fabric_names
-from eslr_jax.types import Garment, Material
+from eslr_jax.physics.bending import RIGIDITY_PER_STIFFNESS
+from eslr_jax.physics.materials import COTTON, WOVEN, Weave, fabric_material, fabric_names, isotropic_nearest
+from eslr_jax.physics.validate import MATERIAL_RANGES
+from eslr_jax.types import Garment, Material, Threads
 
-_NUMBERS = tuple(field.name for field in dataclasses.fields(Material))
+_SHEET = tuple(MATERIAL_RANGES)  # numbers of an isotropic sheet
+_STIFFNESS = ("warp_stretch", "weft_stretch", "coupling", "shear")
+_RIGIDITY = ("flexural_rigidity", "warp_rigidity", "weft_rigidity")
+_LIMITS = ("stretch_limit", "warp_limit", "weft_limit")
+_NUMBERS = (*_SHEET, *_STIFFNESS, *_RIGIDITY, *_LIMITS)
 FABRIC_FORMS = "NAME or density=0.2,lame_mu=23600,..., for one part as PART:NAME"
+
+
+class Described(NamedTuple):
+    """A fabric that is not on a garment yet."""
+
+    sheet: Material  # the isotropic sheet, or the one nearest to the weave
+    weave: Weave | None  # None: the sheet is all
 
 
 def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile) -> Material:
     """Return the material that descriptions give to a garment.
+
+    A fabric may have warp and weft of its own, and bending by flexural rigidity: `denim-woven` and others of
+    `physics.materials.WOVEN`, or the numbers `flexural_rigidity` or `warp_rigidity` and `weft_rigidity` [N
+    m]; `warp_stretch`, `weft_stretch`, `coupling` and `shear` [N/m]; `stretch_limit`, or `warp_limit` and
+    `weft_limit`, the strain beyond which threads stiffen. The warp runs along the second texture coordinate
+    of the file, or up.
 
     Args:
         texts: Descriptions, each for the whole garment or, as `PART:DESCRIPTION`, for one part. A description is
@@ -37,19 +61,77 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
         ConfigError: A fabric or a part is unknown, or a number is impossible.
     """
     texts = tuple(texts) or tuple(str(text) for text in stored.metadata.get("fabrics", ()))
-    whole, parts = COTTON, {}
+    whole, parts = Described(COTTON, None), {}
     for text in texts:
         part, separator, rest = text.rpartition(":")
         if not separator:
-            whole = parse_fabric(text)
+            whole = describe_fabric(text)
         elif stored.face_parts is None or part not in stored.part_names:
             known = ", ".join(stored.part_names) or "none"
             raise ConfigError(f"fabric {text!r}: the garment has no part {part!r}; parts: {known}")
         else:
-            parts[stored.part_names.index(part)] = parse_fabric(rest)
+            parts[stored.part_names.index(part)] = describe_fabric(rest)
     if not parts or stored.face_parts is None:
-        return whole
-    return _mixed(whole, parts, np.asarray(stored.face_parts), garment)
+        sheet = whole.sheet
+    else:
+        sheets = {part: one.sheet for part, one in parts.items()}
+        sheet = _mixed(whole.sheet, sheets, np.asarray(stored.face_parts), garment)
+    if all(one.weave is None for one in (whole, *parts.values())):
+        return sheet
+    owners = np.full(int(np.sum(np.asarray(garment.rest_areas) > 0)), -1)
+    if parts and stored.face_parts is not None:
+        owners[:] = stored.face_parts
+    warp = warp_directions(garment, stored.corner_uvs)
+    fabrics = [(np.ones_like(owners, bool), whole), *((owners == part, one) for part, one in parts.items())]
+    return on_threads(sheet, garment, warp, fabrics)
+
+
+def on_threads(
+    sheet: Material,
+    garment: Garment,
+    warp: Float[np.ndarray, "faces 2"],
+    fabrics: Sequence[tuple[Bool[np.ndarray, " faces"], Described]],
+) -> Material:
+    """Return a material with the weave of fabrics on a garment.
+
+    Args:
+        sheet: What networks read, and vertices weigh.
+        garment: Prepared garment.
+        warp: Direction of the warp on its real faces, of `warp_directions`.
+        fabrics: The real faces of each fabric; later ones replace earlier ones.
+    """
+    count, num_faces = len(warp), len(np.asarray(garment.rest_areas))
+    stiffness, rigidity, limits = (
+        np.zeros((num_faces, 4)),
+        np.zeros((count, 2)),
+        np.full((num_faces, 2), np.inf),
+    )
+    weaves = [one.weave or Weave() for _, one in fabrics]
+    for (is_own, one), weave in zip(fabrics, weaves, strict=True):
+        stiffness[:count][is_own] = weave.stiffness or _sheet_stiffness(one.sheet)
+        rigidity[is_own] = weave.rigidity or [RIGIDITY_PER_STIFFNESS * float(one.sheet.bending_stiffness)] * 2
+        if weave.limits is not None:  # a length 1 + e has the Green strain e + e^2 / 2
+            limits[:count][is_own] = [limit + 0.5 * limit**2 for limit in weave.limits]
+    threads = plate = None
+    if any(weave.stiffness is not None or weave.limits is not None for weave in weaves):
+        directions = np.zeros((num_faces, 2), np.float32)
+        directions[:count] = warp
+        has_limits = any(weave.limits is not None for weave in weaves)
+        threads = Threads(
+            warp=jnp.asarray(directions),
+            stiffness=jnp.asarray(stiffness.T, jnp.float32),
+            # Finite, so that gradients are: no fabric reaches this strain.
+            limits=jnp.asarray(np.minimum(limits.T, 1e3), jnp.float32) if has_limits else None,
+        )
+    if any(weave.rigidity is not None for weave in weaves):
+        plate = jax.tree.map(jnp.asarray, prepare_plate(garment, warp, rigidity))
+    return sheet.replace(threads=threads, plate=plate)
+
+
+def _sheet_stiffness(sheet: Material) -> tuple[float, float, float, float]:
+    """Return the stiffness along any two threads of an isotropic sheet [N/m]."""
+    mu, lame = (float(value) * float(sheet.thickness) for value in (sheet.lame_mu, sheet.lame_lambda))
+    return 2.0 * mu + lame, 2.0 * mu + lame, lame, mu
 
 
 def beyond_training(material: Material) -> tuple[str, ...]:
@@ -68,18 +150,36 @@ def beyond_training(material: Material) -> tuple[str, ...]:
 
 
 def parse_fabric(text: str) -> Material:
-    """Return the fabric of a name or of numbers; see `garment_material`.
+    """Return the isotropic fabric of a name or of numbers; see `garment_material`.
+
+    Raises:
+        ConfigError: The name is unknown, a number is impossible, or the fabric has threads.
+    """
+    described = describe_fabric(text)
+    if described.weave is not None:
+        raise ConfigError(f"fabric {text!r} has threads, which lie on a mesh; give it to garment_material")
+    return described.sheet
+
+
+def describe_fabric(text: str) -> Described:
+    """Return the fabric of a name or of numbers, off any garment; see `garment_material`.
 
     Raises:
         ConfigError: The name is unknown, or a number is impossible.
     """
+    if text in WOVEN:
+        woven = WOVEN[text]
+        sheet = COTTON.replace(density=np.float32(woven.density))
+        return Described(isotropic_nearest(woven.weave, sheet), woven.weave)
     if "=" not in text:
         if text not in fabric_names():
-            close = difflib.get_close_matches(text, fabric_names(), n=1)
+            names = (*fabric_names(), *WOVEN)
+            close = difflib.get_close_matches(text, names, n=1)
             hint = f"did you mean {close[0]}? " if close else ""
-            known = ", ".join(fabric_names())
-            raise ConfigError(f"no fabric {text!r}: {hint}there are {known}; or write {FABRIC_FORMS}")
-        return fabric_material(text)
+            raise ConfigError(
+                f"no fabric {text!r}: {hint}there are {', '.join(names)}; or write {FABRIC_FORMS}"
+            )
+        return Described(fabric_material(text), None)
     values = {}
     for word in text.split(","):
         key, _, number = word.partition("=")
@@ -91,7 +191,36 @@ def parse_fabric(text: str) -> Material:
             raise ConfigError(f"fabric {text!r}: {number!r} is not a number") from error
         if not (np.isfinite(values[key.strip()]) and values[key.strip()] > 0):
             raise ConfigError(f"fabric {text!r}: {key.strip()} must be positive")
-    return COTTON.replace(**values)
+    sheet = COTTON.replace(**{key: value for key, value in values.items() if key in _SHEET})
+    weave = _weave({key: float(value) for key, value in values.items() if key not in _SHEET}, sheet, text)
+    return Described(sheet if weave is None else isotropic_nearest(weave, sheet), weave)
+
+
+def _weave(values: dict[str, float], sheet: Material, text: str) -> Weave | None:
+    """Return the weave of numbers; what is missing along one thread is taken from the other, or from the sheet.
+
+    Raises:
+        ConfigError: The coupling is more than the two threads bear.
+    """
+    if not values:
+        return None
+
+    def pair(both: str, warp: str, weft: str) -> tuple[float, float] | None:
+        along = values.get(warp, values.get(both, values.get(weft)))
+        across = values.get(weft, values.get(both, values.get(warp)))
+        return None if along is None or across is None else (along, across)
+
+    stiffness = None
+    if any(key in values for key in _STIFFNESS):
+        usual = _sheet_stiffness(sheet)
+        warp, weft = pair("", "warp_stretch", "weft_stretch") or usual[:2]
+        coupling, shear = values.get("coupling", 0.0), values.get("shear", usual[3])
+        if coupling**2 >= warp * weft:
+            raise ConfigError(
+                f"fabric {text!r}: coupling must be less than the mean of warp and weft stretch"
+            )
+        stiffness = warp, weft, coupling, shear
+    return Weave(stiffness, pair(*_RIGIDITY), pair(*_LIMITS))
 
 
 def _mixed(whole: Material, parts: dict[int, Material], face_parts: np.ndarray, garment: Garment) -> Material:

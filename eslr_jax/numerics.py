@@ -161,11 +161,18 @@ def gather_corners(
     Returns:
         For each corner the x, y and z arrays, each of shape [items].
     """
-    num_items, num_corners = indices.shape
     flat = indices.T.ravel()
     gathered = [_gather_flat.bind(component, flat, incidence) for component in components(x)]
-    parts = [jax.lax.split(component, (num_items,) * num_corners) for component in gathered]
+    parts = [jax.lax.split(component, indices.shape[:1] * indices.shape[1]) for component in gathered]
     return tuple(zip(*parts, strict=True))  # type: ignore[return-value]
+
+
+def gather_values(
+    x: Float[Array, " rows"], indices: Int[Array, "items corners"], incidence: Int[Array, "rows degree"]
+) -> tuple[Float[Array, " items"], ...]:
+    """Return one number of every corner of every item, corner by corner; see `gather_corners`."""
+    gathered = _gather_flat.bind(x, indices.T.ravel(), incidence)
+    return tuple(jax.lax.split(gathered, indices.shape[:1] * indices.shape[1]))
 
 
 # Two linear maps, each the other's transpose, as primitives of JAX. A `custom_vjp` would rule out forward mode,

@@ -74,14 +74,41 @@ class Garment:
 
 
 @struct.dataclass
+class Plate:
+    """Bending of a thin plate on one garment's mesh, see `geometry.plate`.
+
+    The energy is half the sum of squares of `rows` times the angles of the nine hinges around every face.
+    """
+
+    hinges: Int[Array, "faces 9"]  # of the face and its neighbours; zero where there is none
+    incidence: Int[Array, "hinges 6"]  # see numerics.gather_values
+    rows: Float[Array, "3 9 faces"]  # [sqrt(J)] by radian; zero where there is no hinge
+
+
+@struct.dataclass
+class Threads:
+    """Stretch of a fabric with warp and weft on one garment's faces, see `physics.membrane`."""
+
+    warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `geometry.weave`
+    stiffness: Float[Array, "4 faces"]  # [N/m] along warp, along weft, coupling of both, shear
+    limits: Float[Array, "2 faces"] | None = None  # Green strain where they begin to stiffen
+
+
+@struct.dataclass
 class Material:
-    """Fabric of a garment; scalars, or one value per face (stretch), hinge (bending) or vertex (density)."""
+    """Fabric of a garment; scalars, or one value per face (stretch), hinge (bending) or vertex (density).
+
+    A part that is None is not modelled: the energies are then those of an isotropic sheet with HOOD's bending.
+    Networks read the numbers of that sheet; beside a part these are its nearest.
+    """
 
     density: Float[Array, ...]  # [kg/m^2]
     lame_mu: Float[Array, ...]  # [Pa]
     lame_lambda: Float[Array, ...]  # [Pa]
-    bending_stiffness: Float[Array, ...]  # [J]
+    bending_stiffness: Float[Array, ...]  # [J], see `physics.bending.hinge_stiffnesses`
     thickness: Float[Array, ...]  # [m]
+    plate: Plate | None = None  # bending by flexural rigidity, in the place of `bending_stiffness`
+    threads: Threads | None = None  # stretch and shear, in the place of the Lame parameters
 
 
 @struct.dataclass

@@ -1,5 +1,6 @@
 """Fabrics by name, by numbers, per part; and what they do in the energies."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from garment_files import bundled
@@ -7,9 +8,11 @@ from garment_files import bundled
 from eslr_jax.assets import prepare_stored
 from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import beyond_training, garment_material, parse_fabric
+from eslr_jax.numerics import gather_corners
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.materials import COTTON, FABRICS, fabric_material, fabric_names
-from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.physics.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
+from eslr_jax.physics.membrane import green_strains, stretch_energy, thread_strains
+from eslr_jax.physics.validate import validate_material
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +106,80 @@ def test_fabric_of_the_file_is_the_default(two_fabrics):
     ("density=heavy", "is not a number"),
     ("density=-1", "must be positive"),
     ("density=nan", "must be positive"),
+    ("warp_stretch=100,coupling=100", "coupling must be less"),
     ("collar:silk", "no part 'collar'; parts: right, left"),
 ])  # fmt: skip
 def test_unknown_fabrics_are_named(two_fabrics, text, message):
     stored, garment = two_fabrics
     with pytest.raises(ConfigError, match=message):
         garment_material([text], garment, stored)
+
+
+@pytest.mark.parametrize("name", list(WOVEN))
+def test_woven_fabrics_bear_their_coupling(name):
+    weave = WOVEN[name].weave
+    assert weave.stiffness
+    assert weave.rigidity
+    along, across, coupling, shear = weave.stiffness
+    assert coupling**2 < along * across
+    assert shear > 0
+    assert all(1e-6 < rigidity < 5e-5 for rigidity in weave.rigidity)  # [N m], of clothes
+    assert WOVEN[name].source
+
+
+def test_woven_fabric_lies_on_the_garment_with_its_warp_up(two_fabrics):
+    stored, garment = two_fabrics
+    material = garment_material(["silk", "left:denim-woven"], garment, stored)
+    validate_material(material, garment)
+    left = stored.face_parts == 1
+    threads, expected = material.threads, WOVEN["denim-woven"].weave.stiffness
+    assert threads is not None
+    np.testing.assert_allclose(threads.stiffness[:, left].T, np.tile(expected, (left.sum(), 1)), rtol=1e-5)
+    silk = fabric_material("silk")
+    np.testing.assert_allclose(threads.stiffness[3, ~left], silk.lame_mu * silk.thickness, rtol=1e-5)
+    pulled = np.asarray(garment.rest_positions) * [1.0, 1.02, 1.0]
+    strains = green_strains(
+        gather_corners(jnp.asarray(pulled), garment.faces, garment.face_incidence), garment
+    )
+    along, across, _ = thread_strains(strains, threads)
+    steep = np.asarray(along) > 0.015  # faces of the body, which hang
+    assert steep.mean() > 0.3
+    assert np.abs(np.asarray(across)[steep]).max() < 0.005
+
+
+def test_texture_coordinates_turn_the_warp(two_fabrics):
+    import dataclasses
+
+    stored, garment = two_fabrics
+    corners = stored.rest_positions[stored.faces]
+    stored = dataclasses.replace(stored, corner_uvs=corners[:, :, [1, 0]])  # v along x
+    threads = garment_material(["wool"], garment, stored).threads
+    assert threads is not None
+    pulled = np.asarray(garment.rest_positions) * [1.02, 1.0, 1.0]
+    strains = green_strains(
+        gather_corners(jnp.asarray(pulled), garment.faces, garment.face_incidence), garment
+    )
+    along, across, _ = thread_strains(strains, threads)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    is_front = np.abs(normals[:, 2]) > 0.98 * np.linalg.norm(normals, axis=1)
+    assert is_front.sum() > 50
+    assert np.asarray(along)[is_front].min() > 0.018
+    assert np.abs(np.asarray(across)[is_front]).max() < 0.003
+
+
+def test_fabric_by_flexural_rigidity(two_fabrics):
+    stored, garment = two_fabrics
+    material = garment_material(["density=0.15,flexural_rigidity=1e-5"], garment, stored)
+    assert material.threads is None
+    assert material.plate is not None
+    assert material.plate.rows.shape == (3, 9, len(garment.faces))
+    assert float(material.bending_stiffness) == pytest.approx(4e-5)  # what networks read
+    with pytest.raises(ConfigError, match="lie on a mesh"):
+        parse_fabric("flexural_rigidity=1e-5")
+
+
+def test_a_weave_of_another_mesh_is_refused(two_fabrics):
+    stored, garment = two_fabrics
+    material = garment_material(["wool"], garment, stored)
+    with pytest.raises(ConfigError, match="plate is of"):
+        validate_material(material, prepare_stored(stored, pad=True))

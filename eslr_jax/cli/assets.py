@@ -90,11 +90,12 @@ def _export_body(path: Path, name: str) -> None:
 
 def _list_fabrics(as_json: bool) -> None:
     """Print the table of fabrics."""
-    from eslr_jax.physics.materials import FABRICS, describe_cotton
+    from eslr_jax.physics.materials import FABRICS, WOVEN, describe_cotton
 
     rows = {"cotton": describe_cotton(), **FABRICS}
     if as_json:
-        print(json.dumps({name: dataclasses.asdict(fabric) for name, fabric in rows.items()}, indent=2))
+        everything = {**rows, **WOVEN}
+        print(json.dumps({name: dataclasses.asdict(fabric) for name, fabric in everything.items()}, indent=2))
         return
     table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
     for name, fabric in rows.items():
@@ -104,6 +105,16 @@ def _list_fabrics(as_json: bool) -> None:
             f"{fabric.bending_stiffness:.1e}",
         )
         table.add_row(name, *numbers, fabric.what, fabric.source)
+    Console().print(table, markup=False)
+    table = Table(
+        "by threads", "kg/m2", "warp N/m", "weft N/m", "shear N/m", "warp N m", "weft N m", "source", box=None
+    )
+    for name, woven in WOVEN.items():
+        warp, weft, _, shear = woven.weave.stiffness or (0.0,) * 4
+        numbers = [f"{woven.density:.3f}", *(f"{number:.0f}" for number in (warp, weft, shear))]
+        table.add_row(
+            name, *numbers, *(f"{number:.1e}" for number in woven.weave.rigidity or ()), woven.source
+        )
     Console().print(table, markup=False)
 
 

@@ -90,7 +90,8 @@ def simulate(
             none is named.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
-            density=0.2,bending_stiffness=1e-5; behind PART: for one part of the garment. Cotton if not given.
+            density=0.2,bending_stiffness=1e-5 or flexural_rigidity=5e-6; behind PART: for one part of the
+            garment. Cotton if not given.
         frames: Simulate this many frames, the start included; all if not given.
         iterations: Iterations of the solver per frame. By default 100, or 10 behind a network; 0 leaves the
             network alone.

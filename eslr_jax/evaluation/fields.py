@@ -146,6 +146,9 @@ def energy_shares(
             ),
             material=material.replace(bending_stiffness=material.bending_stiffness * on_hinges),
         )
+        if material.plate is not None:  # its energy goes with the square of its rows
+            plate = material.plate.replace(rows=material.plate.rows * jnp.sqrt(on_faces))
+            scaled = scaled.replace(material=scaled.material.replace(plate=plate))
         if problem.body is not None:
             load = problem.body.friction_load * factors
             scaled = scaled.replace(body=problem.body.replace(friction_load=load))

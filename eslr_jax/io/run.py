@@ -72,10 +72,16 @@ def write_run(
         body=_body_track(scene, rig, poses),
         friction_loads=np.asarray(track.friction_loads),
         ground=None if scene.ground is None else float(scene.ground),
-        material=jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scene.material),
+        material=jax.tree.map(_stored_number, scene.material),
     )
     write_trajectory(folder / "trajectory.npz", file)
     export_trajectory(file, folder / "animation.glb", garment=stored)
+
+
+def _stored_number(leaf: Any) -> np.ndarray:
+    """Return an array of indices as it is, and one of numbers in float32."""
+    array = np.asarray(leaf)
+    return array if array.dtype.kind in "iu" else array.astype(np.float32)
 
 
 def _body_track(scene: Scene, rig: Body, poses: BodyMotion) -> BodyTrack:

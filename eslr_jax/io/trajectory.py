@@ -24,7 +24,7 @@ import numpy as np
 from eslr_jax.errors import AssetError
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.skin import Skin
-from eslr_jax.types import Material
+from eslr_jax.types import Material, Plate, Threads
 
 FORMAT = "eslr-trajectory-2"
 _OLD_FORMAT = "eslr-trajectory-1"  # its metadata is the run's report
@@ -37,7 +37,14 @@ _BODY = {  # field of BodyTrack -> array
     "contact_boundary": "contact_boundary",
 }
 _SKIN = {field.name: f"body_{field.name}" for field in dataclasses.fields(Skin)}
-_MATERIAL = {field.name: f"material_{field.name}" for field in dataclasses.fields(Material)}
+_PARTS: dict[str, Any] = {"plate": Plate, "threads": Threads}  # of a material, each whole or absent
+_MATERIAL = {
+    field.name: f"material_{field.name}" for field in dataclasses.fields(Material) if field.name not in _PARTS
+}
+_PART = {
+    part: {field.name: f"material_{part}_{field.name}" for field in dataclasses.fields(kind)}
+    for part, kind in _PARTS.items()
+}
 _LAYOUT = {
     "timestep": ("f", ""),
     "positions": ("f", "frames vertices 3"),
@@ -56,6 +63,12 @@ _LAYOUT = {
     "body_joint_names": ("U", "joints"),
     "body_skin_weights": ("f", "body_vertices influences"),
     "body_skin_indices": ("iu", "body_vertices influences", "joints"),
+    "material_plate_hinges": ("iu", "faces 9"),
+    "material_plate_incidence": ("iu", "hinges 6"),
+    "material_plate_rows": ("f", "3 9 faces"),
+    "material_threads_warp": ("f", "faces 2"),
+    "material_threads_stiffness": ("f", "4 faces"),
+    "material_threads_limits": ("f", "2 faces"),
 }
 _REMEDY = "write it again"
 
@@ -128,6 +141,10 @@ def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
     ):
         if part is not None:
             arrays |= {name: getattr(part, field) for field, name in names.items()}
+    for label, names in _PART.items():
+        part = getattr(trajectory.material, label, None)
+        values = {} if part is None else vars(part)
+        arrays |= {names[field]: value for field, value in values.items() if value is not None}
     result = {name: _stored(name, np.asarray(value)) for name, value in arrays.items()}
     _check(result, path)
     write_arrays(path, result)
@@ -173,6 +190,9 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         body = BodyTrack(**{field: arrays[name] for field, name in _BODY.items()}, skin=skin)
     if "material_density" in arrays:
         fabric: dict[str, Any] = {field: arrays[name] for field, name in _MATERIAL.items()}
+        for part, names in _PART.items():
+            found = {field: arrays[name] for field, name in names.items() if name in arrays}
+            fabric[part] = _PARTS[part](**found) if found else None
         material = Material(**fabric)
     return TrajectoryFile(
         arrays["positions"],

@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, gather_corners
-from eslr_jax.physics.bending import dihedral_angles, hinge_stiffnesses
+from eslr_jax.physics.bending import angle_energy, dihedral_angles
 from eslr_jax.physics.membrane import green_strains, strain_energies
 from eslr_jax.types import Garment
 
@@ -71,5 +71,5 @@ def damping_energy(position: Vector3, problem: FrameProblem) -> Float[Array, ""]
         turned / (2.0 * jnp.pi)
     )  # past a complete fold the angle jumps
     stretching = jnp.sum(strain_energies(change, garment, material))
-    bending = jnp.sum(hinge_stiffnesses(garment, material) * turned * turned)
+    bending = angle_energy(turned, garment, material)
     return past.rate * (stretching + bending)

@@ -10,11 +10,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 
 from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.types import Contacts, Garment, Material, Threads
 
 
 def project_symmetric_2x2(
@@ -52,6 +54,8 @@ def stretch_blocks(
     inverse = np.asarray(garment.inverse_rest_frames, np.float64)
     weights = np.stack([inverse[:, 0], inverse[:, 1], -inverse[:, 0] - inverse[:, 1]], axis=1)  # dF / dx_c
     gradient = np.einsum("fca,fcj->faj", corners, weights)
+    if material.threads is not None:
+        return _thread_blocks(gradient, weights, garment, material.threads)
     left, stretch, right = np.linalg.svd(gradient, full_matrices=True)
     s1, s2 = stretch[:, 0], stretch[:, 1]
     mu, lame_lambda = np.asarray(material.lame_mu, np.float64), np.asarray(material.lame_lambda, np.float64)
@@ -76,6 +80,52 @@ def stretch_blocks(
     scale = np.asarray(garment.rest_areas, np.float64) * np.asarray(material.thickness, np.float64)
     block = block.reshape(-1, 6, 6) * scale[:, None, None]
     return jacobian.transpose(0, 2, 1) @ block @ jacobian
+
+
+def _thread_blocks(
+    gradient: Float[np.ndarray, "faces 3 2"],
+    weights: Float[np.ndarray, "faces 3 2"],
+    garment: Garment,
+    threads: Threads,
+) -> Float[np.ndarray, "faces 9 9"]:
+    """Return the Hessian of the membrane energy of threads per face [N/m], without the part of compression.
+
+    Two terms: the stiffness by the strain's derivative on both sides, and the stress, projected, on dF twice.
+
+    Args:
+        gradient: Deformation gradient F.
+        weights: Its derivative by the corners, dF / dx_c [1/m].
+        garment: Rest areas.
+        threads: Their directions and stiffness.
+    """
+    warp = np.asarray(threads.warp, np.float64)
+    turn = np.stack([warp, np.stack([-warp[:, 1], warp[:, 0]], axis=1)], axis=2)
+    gradient, weights = gradient @ turn, weights @ turn
+    strain = 0.5 * (np.einsum("fai,faj->fij", gradient, gradient) - np.eye(2))
+    along, across, coupling, shear = np.asarray(threads.stiffness, np.float64)
+    on_warp = along * strain[:, 0, 0] + coupling * strain[:, 1, 1]
+    on_weft = across * strain[:, 1, 1] + coupling * strain[:, 0, 0]
+    if threads.limits is not None:
+        limits = np.asarray(threads.limits, np.float64)
+        beyond = [np.maximum(strain[:, k, k] - limits[k], 0.0) / STIFFENING for k in range(2)]
+        on_warp = on_warp + 0.5 * along * STIFFENING * beyond[0] ** 2
+        on_weft = on_weft + 0.5 * across * STIFFENING * beyond[1] ** 2
+        along, across = along * (1.0 + beyond[0]), across * (1.0 + beyond[1])
+    a, b, c = project_symmetric_2x2(on_warp, 2.0 * shear * strain[:, 0, 1], on_weft)
+    stress = np.stack([np.stack([a, b], axis=1), np.stack([b, c], axis=1)], axis=1)
+    # d(G_ij) by corner and axis, for warp, weft and mixed.
+    rows = [
+        np.einsum("fa,fc->fca", gradient[:, :, i], weights[:, :, j])
+        + np.einsum("fa,fc->fca", gradient[:, :, j], weights[:, :, i])
+        for i, j in ((0, 0), (1, 1), (0, 1))
+    ]
+    rows = 0.5 * np.stack(rows, axis=1).reshape(-1, 3, 9)
+    zero = np.zeros_like(along)
+    moduli = [[along, coupling, zero], [coupling, across, zero], [zero, zero, 4.0 * shear]]
+    block = np.einsum("fri,rsf,fsj->fij", rows, np.array(moduli), rows)
+    geometric = np.einsum("fci,fij,fdj->fcd", weights, stress, weights)
+    block = block + np.einsum("fcd,ab->fcadb", geometric, np.eye(3)).reshape(-1, 9, 9)
+    return block * np.asarray(garment.rest_areas, np.float64)[:, None, None]
 
 
 def dihedral_gradients(
@@ -105,9 +155,40 @@ def dihedral_gradients(
 def bending_blocks(
     position: Float[np.ndarray, "vertices 3"], garment: Garment, material: Material
 ) -> Float[np.ndarray, "hinges 12 12"]:
-    """Return the Gauss-Newton Hessian of the bending energy per hinge [N/m]: stiffness times g g^T."""
+    """Return the Gauss-Newton Hessian of the bending energy per hinge [N/m]: stiffness times g g^T.
+
+    Zero for a plate, whose hinges are not apart: see `plate_matrix`.
+    """
+    if material.plate is not None:
+        return np.zeros((len(garment.hinges), 12, 12))
     gradient = dihedral_gradients(position, garment).reshape(-1, 12)
     return bending_stiffnesses(garment, material)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+
+
+def plate_matrix(
+    position: Float[np.ndarray, "vertices 3"], garment: Garment, material: Material
+) -> scipy.sparse.csr_array:
+    """Return the Gauss-Newton Hessian of a plate's bending [N/m], by positions.ravel(); None has no entries."""
+    count, plate = position.size, material.plate
+    if plate is None:
+        return scipy.sparse.csr_array((count, count))
+    gradient = dihedral_gradients(position, garment).reshape(-1, 12)
+    places = (3 * np.asarray(garment.hinges)[:, :, None] + np.arange(3)).reshape(-1, 12)
+    angles = _sparse_rows(gradient, places, count)
+    rows = np.asarray(plate.rows, np.float64)
+    table = np.broadcast_to(np.asarray(plate.hinges), (len(rows), *plate.hinges.shape))
+    weights = rows.transpose(0, 2, 1)
+    curvatures = _sparse_rows(
+        weights.reshape(-1, table.shape[2]), table.reshape(-1, table.shape[2]), len(gradient)
+    )
+    by_position = curvatures @ angles
+    return scipy.sparse.csr_array(by_position.T @ by_position)
+
+
+def _sparse_rows(values: np.ndarray, columns: np.ndarray, width: int) -> scipy.sparse.csr_array:
+    """Return a matrix whose rows hold values at columns, both of shape [rows, entries]."""
+    rows = np.repeat(np.arange(len(values)), values.shape[1])
+    return scipy.sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width))
 
 
 def bending_stiffnesses(garment: Garment, material: Material) -> Float[np.ndarray, " hinges"]:

@@ -1,4 +1,4 @@
-"""Stretch: a Saint Venant-Kirchhoff membrane."""
+"""Stretch: a Saint Venant-Kirchhoff membrane, isotropic or with warp and weft."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, dot3, gather_corners, in_memory, sub3
-from eslr_jax.types import Garment, Material
+from eslr_jax.types import Garment, Material, Threads
+
+STIFFENING = 0.01  # strain beyond a thread's limit at which it is twice as stiff
 
 
 def deformation_gradient(corners: tuple[Vector3, ...], garment: Garment) -> tuple[Vector3, Vector3]:
@@ -45,7 +47,11 @@ def face_energies(
 
     Source: HOOD (arXiv 2212.07242), supplementary; Santesteban et al. 2022, eq. 5.
     """
-    return strain_energies(green_strains(corners, garment), garment, material)
+    strains = green_strains(corners, garment)
+    energies = strain_energies(strains, garment, material)
+    if material.threads is None or material.threads.limits is None:
+        return energies
+    return energies + _limit_energies(strains, garment, material.threads, material.threads.limits)
 
 
 def green_strains(corners: tuple[Vector3, ...], garment: Garment) -> Vector3:
@@ -64,12 +70,49 @@ def green_strains(corners: tuple[Vector3, ...], garment: Garment) -> Vector3:
 
 
 def strain_energies(strains: Vector3, garment: Garment, material: Material) -> Float[Array, " faces"]:
-    """Return the energy of every face [J] by its strain, of `green_strains`."""
+    """Return the quadratic energy of every face [J] by its strain, of `green_strains`.
+
+    With threads A (C_w G_ww^2 / 2 + C_f G_ff^2 / 2 + C_wf G_ww G_ff + 2 C_s G_wf^2), w along warp and f along
+    weft.
+    """
+    if material.threads is not None:
+        warp, weft, mixed = thread_strains(strains, material.threads)
+        along, across, coupling, shear = in_memory(*material.threads.stiffness)
+        quadratic = 0.5 * (along * warp * warp + across * weft * weft) + coupling * warp * weft
+        return garment.rest_areas * (quadratic + 2.0 * shear * mixed * mixed)
     g00, g11, g01 = strains
     trace = g00 + g11
     volumes = garment.rest_areas * material.thickness
     mu, half_lambda = in_memory(volumes * material.lame_mu, 0.5 * volumes * material.lame_lambda)
     return mu * (g00 * g00 + g11 * g11 + 2.0 * g01 * g01) + half_lambda * trace * trace
+
+
+def thread_strains(strains: Vector3, threads: Threads) -> Vector3:
+    """Return the Green strain of every face along warp, along weft and mixed, of `green_strains`."""
+    g00, g11, g01 = strains
+    c, s = in_memory(threads.warp[:, 0], threads.warp[:, 1])
+    turned = 2.0 * c * s * g01
+    return (
+        c * c * g00 + s * s * g11 + turned,
+        s * s * g00 + c * c * g11 - turned,
+        c * s * (g11 - g00) + (c * c - s * s) * g01,
+    )
+
+
+def _limit_energies(
+    strains: Vector3, garment: Garment, threads: Threads, limits: Float[Array, "2 faces"]
+) -> Float[Array, " faces"]:
+    """Return what threads add to the energy of every face [J] beyond their limits.
+
+    A C max(G - G_limit, 0)^3 / (6 s): the stiffness C of a thread grows in proportion to the strain beyond
+    its limit, to 2 C at s.
+    """
+    warp, weft, _ = thread_strains(strains, threads)
+    energy = jnp.zeros_like(warp)
+    for strain, limit, stiffness in zip((warp, weft), limits, threads.stiffness, strict=False):
+        limit, stiffness = in_memory(limit, stiffness)
+        energy = energy + stiffness * jnp.maximum(strain - limit, 0.0) ** 3
+    return garment.rest_areas * energy / (6.0 * STIFFENING)
 
 
 def principal_stretches(

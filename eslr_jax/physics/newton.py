@@ -42,6 +42,7 @@ class _Bands(NamedTuple):
     order: np.ndarray  # free degree of freedom at each row of the matrix, as an index into positions.ravel()
     entries: np.ndarray  # flat positions in all blocks, raveled one after the other, that are kept
     targets: np.ndarray  # flat position in the bands of every kept entry
+    places: np.ndarray  # row of the matrix of every degree of freedom, -1 where fixed
     shape: tuple[int, int]  # bands, rows
 
 
@@ -134,7 +135,8 @@ def _find_bands(problem: FrameProblem) -> _Bands:
         hessian.pair_table(tips, is_cloth=False),
         np.arange(count)[:, None],
     )
-    rows, columns = (np.concatenate(part) for part in zip(*map(_couples, tables), strict=True))
+    coupled = _plate_couples(problem)
+    rows, columns = (np.concatenate(part) for part in zip(*map(_couples, tables), coupled, strict=True))
     links = scipy.sparse.csr_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count))
     ordered = reverse_cuthill_mckee(links, symmetric_mode=True)
     ordered = ordered[is_free[ordered]]
@@ -145,9 +147,28 @@ def _find_bands(problem: FrameProblem) -> _Bands:
     row, column = (np.concatenate(part) for part in zip(*couples, strict=True))
     entries = np.flatnonzero((row >= column) & (column >= 0))
     row, column = row[entries], column[entries]
-    shape = (int(np.max(row - column, initial=0)) + 1, 3 * len(ordered))
+    width = int(np.max(row - column, initial=0)) + 1
+    is_moved = (place[coupled[0]] >= 0) & (place[coupled[1]] >= 0)
+    reach = np.abs(place[coupled[0]] - place[coupled[1]])[is_moved]
+    shape = (max(width, 3 * int(np.max(reach, initial=0)) + 3), 3 * len(ordered))
     order = (3 * ordered[:, None] + np.arange(3)).ravel()
-    return _Bands(order, entries, (row - column) * shape[1] + column, shape)
+    places = np.full(3 * count, -1)
+    places[order] = np.arange(len(order))
+    return _Bands(order, entries, (row - column) * shape[1] + column, places, shape)
+
+
+def _plate_couples(problem: FrameProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of vertices that the bending of a plate couples."""
+    garment, material = problem.garment, problem.material
+    if material.plate is None:
+        return np.zeros(0, int), np.zeros(0, int)
+    hinges = np.asarray(material.plate.hinges)
+    corners = np.asarray(garment.hinges)[hinges].reshape(len(hinges), -1)
+    near = scipy.sparse.csr_array(
+        (np.ones(corners.size), (np.repeat(np.arange(len(hinges)), corners.shape[1]), corners.ravel())),
+        shape=(len(hinges), len(garment.vertex_mask)),
+    )
+    return (near.T @ near).nonzero()
 
 
 def _couples(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -175,7 +196,13 @@ def _newton_direction(
     )
     values = np.concatenate([block.ravel() for block in blocks])[bands.entries]
     size = bands.shape[0] * bands.shape[1]
-    matrix = np.bincount(bands.targets, values, minlength=size).reshape(bands.shape)
+    matrix = np.bincount(bands.targets, values, minlength=size)
+    plate = hessian.plate_matrix(x, problem.garment, problem.material).tocoo()
+    row, column = bands.places[plate.row], bands.places[plate.col]
+    is_kept = (row >= column) & (column >= 0)
+    row, column = row[is_kept], column[is_kept]
+    matrix += np.bincount((row - column) * bands.shape[1] + column, plate.data[is_kept], minlength=size)
+    matrix = matrix.reshape(bands.shape)
     solution = scipy.linalg.solveh_banded(
         matrix, gradient.ravel()[bands.order], overwrite_ab=True, lower=True, check_finite=False
     )

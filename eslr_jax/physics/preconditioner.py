@@ -32,13 +32,16 @@ class Stiffness:
 def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " vertices"]:
     """Return the membrane's stiffness per vertex at rest [N/m], averaged over the triangle's plane.
 
-    Moving one corner along its height changes the strain by 1/height, so the curvature is
-    A h (lambda + 2 mu) / height^2 = h (lambda + 2 mu) |opposite edge|^2 / (4 A).
+    Moving one corner along its height changes the strain by 1/height, so the curvature is A h (lambda + 2 mu)
+    / height^2 = h (lambda + 2 mu) |opposite edge|^2 / (4 A); with threads their mean stiffness.
     """
     corners = garment.rest_positions[garment.faces]
     opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
     squared = jnp.sum(opposite * opposite, axis=-1)
-    modulus = material.thickness * (material.lame_lambda + 2.0 * material.lame_mu)
+    if material.threads is None:
+        modulus = material.thickness * (material.lame_lambda + 2.0 * material.lame_mu)
+    else:  # averaged over the plane as well
+        modulus = 0.5 * (material.threads.stiffness[0] + material.threads.stiffness[1])
     is_real = garment.rest_areas > 0
     scale = jnp.where(is_real, modulus / (4.0 * jnp.where(is_real, garment.rest_areas, 1.0)), 0.0)
     return scatter_corners(scale[:, None] * squared, garment.face_incidence)

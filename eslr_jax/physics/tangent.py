@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components, gather_corners, segment_sum
 from eslr_jax.physics.air import air_energy
-from eslr_jax.physics.bending import hinge_energies
+from eslr_jax.physics.bending import bending_energy, hinge_energies
 from eslr_jax.physics.damping import damping_energy
 from eslr_jax.physics.membrane import face_energies
 from eslr_jax.physics.potential import own_energy, pair_energies, vertex_terms
@@ -35,7 +35,7 @@ class Tangent(NamedTuple):
     blocks: Float[Array, "slots 3 3 vertices"]  # [N/m]; zero where a slot is not used
     pairs: (
         Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]] | None
-    )  # of contact with faces, air, damping, and own energies
+    )  # of contact with faces, air, damping, own energies, and of a plate beyond its hinges
     is_free: Bool[Array, "1 vertices"]
 
 
@@ -59,11 +59,15 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
     body, pairs = problem.body, None
     has_faces = body is not None and not (body.skin is None and body.tips is None)
     dissipates = problem.flow is not None or problem.strain is not None
-    if has_faces or dissipates or problem.layers is not None or problem.energies:
+    is_plate = material.plate is not None
+    if has_faces or dissipates or is_plate or problem.layers is not None or problem.energies:
 
         def others(x: Float[Array, "vertices 3"]) -> Float[Array, ""]:
             parts = components(x)
             lost = air_energy(parts, problem) + damping_energy(parts, problem)
+            if is_plate:  # the hinges alone stand in the matrix, where they precondition
+                lost += bending_energy(parts, garment, material)
+                lost -= bending_energy(parts, garment, material.replace(plate=None))
             return sum(pair_energies(parts, problem), lost + own_energy(x, problem))
 
         _, pairs = jax.linearize(jax.grad(others), position)

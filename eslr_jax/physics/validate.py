@@ -61,6 +61,16 @@ def validate_material(material: Material, garment: Garment | None = None) -> Non
         values = _check_range(f"material {name}", getattr(material, name), accepted)
         if garment is not None and values.ndim:
             _check_shape(name, values, garment)
+    if garment is None:
+        return
+    faces = len(np.asarray(garment.rest_areas))
+    for name, part in (("plate", material.plate), ("threads", material.threads)):
+        count = None if part is None else len(part.hinges if name == "plate" else part.warp)
+        if count not in (None, faces):
+            raise ConfigError(
+                f"material {name} is of {count} faces, the garment has {faces}; make it with garment_material "
+                "for this garment, padded if that is"
+            )
 
 
 def validate_constants(constants: PhysicsConstants) -> None:

@@ -12,7 +12,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.io.run import read_run
 from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.types import Material
+from eslr_jax.types import Material, Plate, Threads
 
 RNG = np.random.default_rng(0)
 FRAMES = 3
@@ -42,7 +42,13 @@ WHOLE = TrajectoryFile(
     body=BODY,
     friction_loads=np.abs(floats(FRAMES, 5)),
     material=Material(
-        np.abs(floats(5)), np.float32(23600), np.abs(floats(2)), np.float32(1e-5), np.float32(1e-3)
+        np.abs(floats(5)),
+        np.float32(23600),
+        np.abs(floats(2)),
+        np.float32(1e-5),
+        np.float32(1e-3),
+        Plate(np.tile(np.int32(0), (2, 9)), np.tile(np.int32(18), (1, 6)), floats(3, 9, 2)),
+        Threads(floats(2, 2), np.abs(floats(4, 2))),
     ),
 )
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hanging_strip import LENGTH, strip
 from jax.tree_util import Partial
+from known_answers.strip import LENGTH, strip
 from scipy.optimize import brentq
 
 from eslr_jax.config import SimConfig

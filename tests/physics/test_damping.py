@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hanging_strip import LENGTH, strip
+from known_answers.strip import LENGTH, strip
 from scipy.signal import find_peaks
 
 from eslr_jax.config import SimConfig

@@ -1,0 +1,1 @@
+"""What is known of cloth in closed form, against what is simulated; see `__main__.py`."""

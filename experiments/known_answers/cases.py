@@ -1,0 +1,210 @@
+"""The known answers: each case returns what was found beside what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from hard_cases.build import icosphere, make_cloth, make_scene, plane, sheet
+from jax.tree_util import Partial
+from scipy.optimize import brentq
+
+from eslr_jax.config import SimConfig
+from eslr_jax.fabric import Described, on_threads
+from eslr_jax.geometry.weave import warp_directions
+from eslr_jax.physics import hessian
+from eslr_jax.physics.bending import bending_energy, dihedral_angles, plate_curvatures
+from eslr_jax.physics.materials import COTTON, Weave, stretch_stiffness
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.types import Air, Garment, Material, PhysicsConstants
+from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
+from known_answers.strip import LENGTH, kept_per_period, strip
+
+GRAVITY = 9.81  # [m/s^2]
+RIGIDITY = 2e-5  # [N m]
+INTEGRATORS = ("euler", "bdf2")
+
+
+class Answer(NamedTuple):
+    """A figure that was found, and what is known of it."""
+
+    case: str
+    setting: str
+    unit: str
+    found: float
+    known: float
+    bar: float | None = None  # largest relative error; None: told, not judged
+
+    @property
+    def is_within(self) -> bool | None:
+        """Whether the error is within the bar; None without one."""
+        return None if self.bar is None else bool(abs(self.found - self.known) <= self.bar * abs(self.known))
+
+
+def with_rigidity(garment: Garment, rigidity: tuple[float, float]) -> Material:
+    """Return cotton with a flexural rigidity along z and along x [N m], of a level sheet."""
+    warp = warp_directions(garment, direction=(0.0, 0.0, 1.0))
+    every = np.ones(len(warp), bool)
+    return on_threads(COTTON, garment, warp, [(every, Described(COTTON, Weave(rigidity=rigidity)))])
+
+
+def free_fall(is_smoke: bool) -> list[Answer]:
+    """A strip that falls for a second in a vacuum: g t^2 / 2."""
+    answers = []
+    for name in INTEGRATORS:
+        scene = strip(name, frames=31, is_pinned=False)
+        end = rollout_scene(None, scene, SimConfig(iterations=5)).positions[-1]
+        fallen = float(jnp.mean(scene.initial_state.position[:, 1] - end[:, 1]))
+        answers.append(Answer("free fall, 1 s", name, "m", fallen, GRAVITY / 2, 0.04))
+    return answers
+
+
+def terminal_velocity(is_smoke: bool) -> list[Answer]:
+    """A level strip that falls in air until its weight is its drag."""
+    air = Air(jnp.zeros(3))
+    known = float(np.sqrt(2 * float(COTTON.density) * GRAVITY / (air.density * air.normal_drag)))
+    answers = []
+    for name in INTEGRATORS:
+        scene = strip(name, frames=40, is_pinned=False, tilt=np.pi / 2, air=air)
+        fall = -float(rollout_scene(None, scene, SimConfig(iterations=30)).velocities[-1, :, 1].mean())
+        answers.append(Answer("terminal velocity", name, "m/s", fall, known, 0.005))
+    return answers
+
+
+def swing(is_smoke: bool) -> list[Answer]:
+    """A strip that swings in a vacuum keeps its energy."""
+    return [
+        Answer("energy kept per period", f"{name}, 1/30 s", "", kept_per_period(name), 1.0)
+        for name in INTEGRATORS
+    ]
+
+
+def hanging_strip(is_smoke: bool) -> list[Answer]:
+    """A strip that hangs: the tension T at a point is the weight below it.
+
+    With Y the tension per width and Green strain of plane stress and s the stretch, Y (s^2 - 1) / 2 s = T.
+    """
+    scene = strip("euler", frames=61, is_pinned=True, timestep=0.1, tilt=0.0)
+    end = rollout_scene(None, scene, SimConfig(iterations=60)).positions[-1]
+    below = float(COTTON.density) * GRAVITY * (np.arange(200) + 0.5) / 200 * LENGTH
+    stiffness = float(stretch_stiffness(COTTON))
+    stretches = [brentq(lambda s, t=t: stiffness * (s * s - 1) / 2 * s - t, 1.0, 2.0) for t in below]
+    longer = float(-jnp.min(end[:, 1])) - LENGTH
+    return [
+        Answer(
+            "elongation of a hanging strip",
+            "euler",
+            "mm",
+            1e3 * longer,
+            1e3 * LENGTH * (np.mean(stretches) - 1),
+            0.05,
+        )
+    ]
+
+
+def rigidity(is_smoke: bool) -> list[Answer]:
+    """A cantilever of small deflection, and a sheet rolled to a tube, of a rigidity and by HOOD's number."""
+    answers = []
+    for spacing in (0.02,) if is_smoke else (0.02, 0.01, 0.005, 0.003):
+        for name, mesh in (("grid", grid), ("irregular", irregular)):
+            positions, faces = mesh(0.25, 0.1, spacing)
+            garment = make_cloth((positions, faces), {})
+            flat = np.asarray(garment.rest_positions, np.float64)
+            setting = f"{name}, {1e3 * spacing:g} mm"
+            material = with_rigidity(garment, (RIGIDITY, RIGIDITY))
+            matrix = hessian.plate_matrix(flat, garment, material)
+            across = matrix.tocsr()[1::3][:, 1::3]
+            found = cantilever_rigidity(garment, across)
+            answers.append(Answer("rigidity of a cantilever", setting, "N m", found, RIGIDITY, 0.05))
+            angles, _ = dihedral_angles(jnp.asarray(tube(positions, 0.12, 0.4), jnp.float32), garment)
+            energies = 0.5 * np.sum(np.asarray(plate_curvatures(angles, material.plate)) ** 2, axis=0)
+            # Free edges may unbend: faces in the middle tell the rigidity.
+            middle = positions[faces].mean(axis=1)
+            is_inner = np.all(np.abs(middle[:, [0, 2]] / [0.25, 0.1] - 0.5) < 0.5 - spacing / 0.07, axis=1)
+            if is_inner.any():
+                area = np.asarray(garment.rest_areas)[is_inner].sum()
+                found = float(energies[is_inner].sum() * 2 * 0.12**2 / area)
+                answers.append(Answer("rigidity of a cylinder", setting, "N m", found, RIGIDITY, 0.05))
+    return answers
+
+
+def twisted_sheet(is_smoke: bool) -> list[Answer]:
+    """A strip twisted to a helicoid w = t x z of small twist t: the plate's energy is D t^2 per area."""
+    answers, twist = [], 0.5  # [rad/m]
+    for name, mesh in (("grid", grid), ("irregular", irregular)):
+        positions, faces = mesh(0.3, 0.1, 0.01)
+        garment = make_cloth((positions, faces), {})
+        x, z = positions[:, 0] - 0.15, positions[:, 2] - 0.05
+        twisted = positions + np.outer(twist * x * z, [0.0, 1.0, 0.0])
+        material = with_rigidity(garment, (RIGIDITY, RIGIDITY))
+        found = float(bending_energy(jnp.asarray(twisted, jnp.float32), garment, material))
+        # At free edges the mixed curvature stays: nothing there can turn it away.
+        known = RIGIDITY * twist**2 * float(np.sum(garment.rest_areas))
+        answers.append(
+            Answer("bending energy of a twisted sheet", name, "uJ", 1e6 * found, 1e6 * known, 0.05)
+        )
+    return answers
+
+
+def slope(is_smoke: bool) -> list[Answer]:
+    """A sheet that slides down a slope: g (sin a - mu cos a) t^2 / 2 over 0.4 s from when it lies."""
+    answers, friction = [], 0.3
+    for degrees in (35.0,) if is_smoke else (25.0, 35.0, 45.0, 60.0):
+        tilt = np.radians(degrees)
+        mesh = sheet(7, 7, (0.2, 0.2))
+        garment = make_cloth(mesh, {})
+        along = np.array([np.cos(tilt), np.sin(tilt), 0.0])
+        normal = np.array([-np.sin(tilt), np.cos(tilt), 0.0])
+        start = np.outer(mesh[0][:, 0], along) + mesh[0] * [0, 0, 1] + 2.2e-3 * normal
+        scene = make_scene(
+            garment,
+            start + 0.8 * along,
+            49,
+            timestep=1 / 60,
+            body=plane(8.0, 41, tilt),
+            constants=PhysicsConstants(friction_coefficient=friction),
+        )
+        path = (
+            np.asarray(rollout_scene(None, scene, SimConfig(iterations=60)).positions).mean(axis=1) @ -along
+        )
+        # From the second differences, which do not know when it began to slide.
+        found = float(np.polyfit(np.arange(24) / 60, path[25:], 2)[0] * 2)
+        known = GRAVITY * (np.sin(tilt) - friction * np.cos(tilt))
+        answers.append(
+            Answer("acceleration down a slope", f"{degrees:g} degrees", "m/s2", found, known, 0.03)
+        )
+    return answers
+
+
+def sphere(is_smoke: bool) -> list[Answer]:
+    """A sheet at rest on a ball: what the ball presses with bears its weight, but for friction's part."""
+    count = 17
+    mesh = sheet(count, count, (0.4, 0.4))
+    garment, ball = make_cloth(mesh, {}), icosphere(3, 0.1)
+    brake = Partial(_brake, jnp.float32(2.0))
+    scene = make_scene(
+        garment,
+        mesh[0] + [0, 0.105, 0],
+        121,
+        body=ball,
+        constants=PhysicsConstants(friction_coefficient=0.1),
+    ).replace(energies=(brake,))
+    trajectory = rollout_scene(None, scene, SimConfig(iterations=60))
+    last, loads = np.asarray(trajectory.positions[-1]), np.asarray(trajectory.friction_loads[-1])
+    upward = last[:, 1] / np.linalg.norm(last, axis=1)
+    weight = float(COTTON.density) * GRAVITY * 0.16
+    found = float(np.sum(loads * upward))
+    return [Answer("weight on a ball", "friction 0.1", "N", found, weight, 0.05)]
+
+
+def _brake(rate, position, problem):
+    """Slow every vertex down at a rate [1/s], so that the sheet comes to rest."""
+    moved = position - problem.position
+    return 0.5 * rate / problem.timestep * jnp.sum(problem.masses[:, None] * moved * moved)
+
+
+CASES: tuple[Callable[[bool], list[Answer]], ...] = (
+    free_fall, terminal_velocity, swing, hanging_strip, rigidity, twisted_sheet, slope, sphere,
+)  # fmt: skip

@@ -1,0 +1,101 @@
+"""Flexural rigidity in newton metres: cylinders in every direction, and a cantilever, on any mesh."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cloth import make_garment
+from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
+
+from eslr_jax.geometry.padding import pad_garment
+from eslr_jax.geometry.plate import prepare_plate, rest_corners
+from eslr_jax.geometry.prepare import to_device
+from eslr_jax.geometry.weave import warp_directions
+from eslr_jax.physics import hessian
+from eslr_jax.physics.bending import bending_energy, dihedral_angles, plate_curvatures
+from eslr_jax.physics.materials import COTTON
+
+RIGIDITY = 2e-5  # [N m]
+
+
+def plate_of(garment, along=RIGIDITY, across=RIGIDITY, direction=(0.0, 0.0, 1.0)):
+    faces = int(np.sum(np.asarray(garment.rest_areas) > 0))
+    rigidity = np.broadcast_to([along, across], (faces, 2))
+    plate = prepare_plate(garment, warp_directions(garment, direction=direction), rigidity)
+    return jax.tree.map(jnp.asarray, plate)
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.01, 0.005])
+@pytest.mark.parametrize("mesh", [grid, irregular])
+def test_a_tube_has_the_energy_of_its_curvature(mesh, spacing):
+    """Flat rolled to a tube of radius r, around each axis: D / (2 r^2) per area, of faces off the free edges."""
+    positions, faces = mesh(0.24, 0.16, spacing)
+    garment = make_garment(positions, faces)
+    plate = plate_of(garment)
+    is_inner = ~np.isin(plate.hinges, np.flatnonzero(touches_edge(garment))).any(axis=1)
+    for angle in (0.0, 0.4, np.pi / 4, np.pi / 2, 2.2):
+        angles, _ = dihedral_angles(jnp.asarray(tube(positions, 0.12, angle), jnp.float32), garment)
+        curvatures = np.asarray(plate_curvatures(angles, plate))
+        energies = 0.5 * np.sum(curvatures**2, axis=0)[is_inner]
+        area = np.asarray(garment.rest_areas)[is_inner].sum()
+        assert energies.sum() * 2 * 0.12**2 / area == pytest.approx(RIGIDITY, rel=0.03)
+
+
+def touches_edge(garment):
+    """Return which hinges belong to a face with a free edge: there the sheet may unbend."""
+    corners = np.asarray(garment.hinges)
+    faces = np.asarray(garment.faces)
+    edges, counts = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    on_edge = np.zeros(len(garment.vertex_mask), bool)
+    on_edge[edges[counts == 1]] = True
+    return on_edge[corners].any(axis=1)
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.01, pytest.param(0.003, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mesh", [grid, irregular])
+def test_a_cantilever_has_the_rigidity_that_it_was_given(mesh, spacing):
+    """Along x, of a fabric that is stiffer along its other thread: small deflections, linear."""
+    positions, faces = mesh(0.25, 0.1, spacing)
+    garment = make_garment(positions, faces)
+    plate = plate_of(garment, along=5 * RIGIDITY, across=RIGIDITY)
+    flat = np.asarray(garment.rest_positions, np.float64)
+    matrix = hessian.plate_matrix(flat, garment, COTTON.replace(plate=plate)).tocsr()[1::3][:, 1::3]
+    assert cantilever_rigidity(garment, matrix) == pytest.approx(RIGIDITY, rel=0.05)
+
+
+def test_isotropic_bending_does_not_know_the_direction_of_the_warp():
+    positions, faces = irregular(0.1, 0.08, 0.01)
+    garment = make_garment(positions, faces)
+    bent = jnp.asarray(
+        positions + 0.004 * np.random.default_rng(0).standard_normal(positions.shape), jnp.float32
+    )
+    energies = [
+        float(bending_energy(bent, garment, COTTON.replace(plate=plate_of(garment, direction=direction))))
+        for direction in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.3))
+    ]
+    assert energies[0] == pytest.approx(energies[1], rel=1e-4)
+
+
+def test_padding_changes_nothing():
+    positions, faces = irregular(0.1, 0.08, 0.01)
+    garment = make_garment(positions, faces)
+    padded = to_device(pad_garment(garment))
+    bent = np.random.default_rng(0).standard_normal((len(padded.vertex_mask), 3)) * 0.004
+    bent = bent.astype(np.float32)
+    bent[: len(positions)] += positions
+    bent[len(positions) :] = bent[-1]
+    bent = jnp.asarray(bent)
+    plain = bending_energy(bent[: len(positions)], garment, COTTON.replace(plate=plate_of(garment)))
+    other = bending_energy(bent, padded, COTTON.replace(plate=plate_of(padded)))
+    assert float(other) == pytest.approx(float(plain), rel=1e-5)
+
+
+def test_corners_are_the_rest_faces():
+    positions, faces = irregular(0.1, 0.08, 0.02)
+    garment = make_garment(positions, faces)
+    corners, rest = rest_corners(garment), positions[np.asarray(garment.faces)]
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        found = np.linalg.norm(corners[:, a] - corners[:, b], axis=1)
+        np.testing.assert_allclose(found, np.linalg.norm(rest[:, a] - rest[:, b], axis=1), rtol=1e-5)
