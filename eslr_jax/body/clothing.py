@@ -27,11 +27,30 @@ _SMOOTHINGS = 6  # of the border of a limb, over the mesh
 class Skinned(Protocol):
     """What joints move: a `Body`, or the skin of a run."""
 
-    skin_weights: Any  # [vertices, influences]
-    skin_indices: Any  # [vertices, influences]
-    joint_rest_positions: Any  # [joints, 3] [m]
-    parents: Sequence[int]
-    joint_names: Sequence[str]
+    @property
+    def skin_weights(self) -> Any:
+        """Weights, [vertices, influences]."""
+        ...
+
+    @property
+    def skin_indices(self) -> Any:
+        """Their joints, [vertices, influences]."""
+        ...
+
+    @property
+    def joint_rest_positions(self) -> Any:
+        """Where joints are at rest [m], [joints, 3]."""
+        ...
+
+    @property
+    def parents(self) -> Sequence[int]:
+        """The joint above each, or -1."""
+        ...
+
+    @property
+    def joint_names(self) -> Sequence[str]:
+        """Names of the joints."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +106,7 @@ def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.
     joints = np.asarray(rig.joint_rest_positions, np.float64)
 
     def first(side: str, chain: str) -> int | None:
-        return parts.get((side, chain), [None])[0]
+        return next(iter(parts.get((side, chain), ())), None)
 
     sides = [
         [first(side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg")]
@@ -157,7 +176,7 @@ def _cut(
     new = weights[unique[:, 0]].multiply((1 - share)[:, None]) + weights[unique[:, 1]].multiply(
         share[:, None]
     )
-    to_left, to_right = weights.shape[0] + number.ravel().reshape(2, -1)
+    to_left, to_right = len(field) + number.ravel().reshape(2, -1)
     pieces = [(apex, to_left, to_right), (to_left, left, right), (to_left, right, to_right)]
     return (
         np.concatenate([faces[is_whole], *(np.stack(piece, axis=1) for piece in pieces)]),

@@ -26,7 +26,8 @@ def play(
 
     Args:
         garment: Name of a bundled garment (see `eslr assets`), or a mesh file, which is fitted to the body first.
-            Give it again for what is worn over it, as in --garment pants --garment tshirt. A T-shirt if not given.
+            Give it again for what is worn over it, as in --garment pants --garment tshirt. By default a
+            T-shirt.
         motion: Name of a bundled motion, or a motion file. It is played forth and back. By default the animation
             in the body's file, or else cmu_016_32.
         body: Name of a bundled body, or a SMPL model or a skinned character (glTF).

@@ -88,12 +88,16 @@ def render_frames(
     )
     indices = range(len(garment.positions)) if frame_indices is None else list(frame_indices)
 
-    rest = None if body is None else body.positions[0] if rest_positions is None else rest_positions
-    layers = [] if body is None else body_layers(rest, body.faces, None if rest_positions is None else rig)
+    layers = []
+    if body is not None and rest_positions is not None:
+        layers = body_layers(np.asarray(rest_positions), body.faces, rig)
+    elif body is not None:
+        layers = body_layers(body.positions[0], body.faces, None)
 
     def trace(index: int, view: Camera) -> np.ndarray:
         surfaces = [Surface("garment", garment.positions[index], garment.faces, colors[index], True)]
         for layer in layers:
+            assert body is not None
             place = layer.place(body.positions[index])
             surfaces.append(Surface(f"body {layer.kind}", place, layer.faces, BODY_COLORS[layer.kind], False))
         return trace_picture(surfaces, view, ground_height=ground_height, size=size, samples=samples)

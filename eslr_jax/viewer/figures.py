@@ -1,4 +1,4 @@
-"""What is drawn of a garment and a body: one mesh for every garment, for the skin, and for what the body wears."""
+"""What is drawn of a garment and a body: a mesh for every garment, for the skin, and for what is worn on it."""
 
 from __future__ import annotations
 

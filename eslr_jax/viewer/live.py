@@ -47,7 +47,7 @@ from eslr_jax.viewer.live_controls import (
 )
 
 MOST_RECORDED = 1800  # frames: a minute
-_FEWEST = 5  # iterations, with which cloth holds together
+_FEWEST = 15  # iterations: fewer save little time, and cloth lags behind the body
 _SHOWN = 10  # frames over which times are averaged
 _PATIENCE = 0.4  # [s] for which a choice must stand before it is loaded: a slider passes many
 
@@ -60,6 +60,7 @@ class Cast:
     rig: Body
     stored: GarmentFile
     poses: BodyMotion
+    spots: np.ndarray  # under the body, on the ground, in every frame [m]
     stage: Stage
     drawn: list[tuple[Piece, Any]]  # of the garments, with their meshes on the page
     drawn_body: list[tuple[Piece, Any]]
@@ -252,13 +253,14 @@ def _load(live: Live, choice: Choice) -> None:
     if live.cast is not None:
         for _, mesh in (*live.cast.drawn, *live.cast.drawn_body):
             mesh.remove()
+    spots = _spots(poses)
     drawn = [
-        _draw(live, f"/garments/{number}", piece, stage.scene.initial_state.position - _place(poses, 0))
-        for number, piece in enumerate(garment_pieces(cloth.faces, stored.outfit))
+        _draw(live, f"/garments/{number}", piece, np.asarray(stage.scene.initial_state.position) - spots[0])
+        for number, piece in enumerate(garment_pieces(np.asarray(cloth.faces), stored.outfit))
     ]
     for _, mesh in drawn:
         mesh.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
-    live.cast = Cast(choice, rig, stored, poses, stage, drawn, _draw_body(live, poses, rig))
+    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, _draw_body(live, poses, rig))
     live.recorded, live.is_compiled, live.refused = [], False, None
     _restart(live)
 
@@ -273,8 +275,8 @@ def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, A
 
 def _draw_body(live: Live, poses: BodyMotion, rig: Body) -> list[tuple[Piece, Any]]:
     """Draw a body at the first frame of its motion."""
-    positions = poses.positions[0] - _place(poses, 0)
-    pieces = body_pieces(poses.rest_positions, poses.faces, rig)
+    positions = np.asarray(poses.positions[0]) - _spots(poses)[0]
+    pieces = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
     return [_draw(live, f"/body/{piece.name}", piece, positions) for piece in pieces]
 
 
@@ -292,7 +294,7 @@ def _show(live: Live, cast: Cast, frame: int) -> None:
     """Show the cloth, and the body at a frame, which walks on the spot."""
     body = np.asarray(cast.poses.positions[frame])
     assert live.state is not None
-    place = _place(cast.poses, frame)
+    place = cast.spots[frame]
     cloth = np.asarray(live.state.position) - place
     with live.server.atomic():
         for piece, mesh in cast.drawn_body:
@@ -301,10 +303,11 @@ def _show(live: Live, cast: Cast, frame: int) -> None:
             mesh.vertices = piece.place(cloth)
 
 
-def _place(poses: BodyMotion, frame: int) -> np.ndarray:
-    """Return the place under the body on the ground [m]; on the page it is the origin."""
-    middle = np.asarray(poses.positions[frame]).mean(axis=0)
-    return np.array([middle[0], float(ground_height(poses)), middle[2]])
+def _spots(poses: BodyMotion) -> np.ndarray:
+    """Return the place under the body on the ground in every frame [m]; on the page it is the origin."""
+    spots = np.array(poses.positions).mean(axis=1)
+    spots[:, 1] = float(ground_height(poses))
+    return spots
 
 
 def _tell(live: Live, cast: Cast, iterations: int) -> None:
@@ -328,7 +331,7 @@ def _take_hold(live: Live, origin: Any, direction: Any) -> None:
     if live.cast is None or live.state is None:
         return
     _, frame = there_and_back(live.step - 1, live.cast.stage.scene.num_frames)
-    positions = np.asarray(live.state.position) - _place(live.cast.poses, frame)
+    positions = np.asarray(live.state.position) - live.cast.spots[frame]
     live.held = nearest_vertex(positions, origin, direction)
     handle = live.server.scene.add_transform_controls(
         "/hand", scale=0.15, disable_rotations=True, position=positions[live.held]
@@ -352,7 +355,7 @@ def _hand(live: Live) -> Hand:
     if handle is None or held is None or cast is None:
         return no_hand()
     _, frame = there_and_back(live.step, cast.stage.scene.num_frames)
-    return grasp(held, np.asarray(handle.position) + _place(cast.poses, frame))
+    return grasp(held, np.asarray(handle.position) + cast.spots[frame])
 
 
 def _save(live: Live, cast: Cast) -> None:

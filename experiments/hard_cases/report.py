@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.evaluation.report import environment
-from eslr_jax.render import render_frame, side_by_side
 from eslr_jax.io.palette import GARMENT_COLORS, SKIN_COLOR
+from eslr_jax.render import render_frame, side_by_side
 from hard_cases import CASES
 from hard_cases.case import Outcome, Run
 
