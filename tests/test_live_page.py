@@ -111,7 +111,7 @@ def test_a_vertex_is_dragged_and_let_go(player):
     vertex, handle = player.live.held, player.live.controls["hand"]
     before = player.positions()[vertex]
     handle.position = tuple(np.add(handle.position, [0.0, 0.0, 0.25]))
-    player.until(lambda: player.positions()[vertex][2] > before[2] + 0.03, seconds=60)
+    player.until(lambda: player.positions()[vertex][2] > before[2] + 0.03, seconds=240)
     _let_go(player.live)
     assert player.live.held is None
     player.wait(2)
@@ -149,7 +149,7 @@ def page(player):
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine")
     with launch() as page:
-        page.set_viewport_size({"width": 1280, "height": 1100})
+        page.set_viewport_size({"width": 700, "height": 500})  # small: WebGL is drawn in software
         page.errors = []
         page.on(
             "console", lambda message: page.errors.append(message.text) if message.type == "error" else None
@@ -178,15 +178,15 @@ def choose(page, label, option):
 def test_page_sliders_change_the_cloth(player, page):
     controls, before = player.live.controls, player.forward()
     enter(page, "speed, m/s", 10)
-    player.until(lambda: controls["wind"].value == 10 and player.forward() > before + 0.003, seconds=60)
+    player.until(lambda: controls["wind"].value == 10 and player.forward() > before + 0.003, seconds=240)
     enter(page, "towards, deg", 180)
-    player.until(lambda: player.forward() < before - 0.003, seconds=60)
+    player.until(lambda: player.forward() < before - 0.003, seconds=240)
     enter(page, "speed, m/s", 0)
     for label, name in (("weight x", "density"), ("stretch x", "stretch"), ("bending x", "bending")):
         enter(page, label, 3)
-        player.until(lambda name=name: controls[name].value == 3, seconds=60)
+        player.until(lambda name=name: controls[name].value == 3, seconds=240)
     choose(page, "fabric", "denim")
-    player.until(lambda: controls["fabric"].value == "denim", seconds=60)
+    player.until(lambda: controls["fabric"].value == "denim", seconds=240)
     player.wait(3)
     for label in ("weight x", "stretch x", "bending x"):
         enter(page, label, 1)
@@ -196,7 +196,7 @@ def test_page_sliders_change_the_cloth(player, page):
 
 def test_page_pauses_steps_and_restarts(player, page):
     page.get_by_label("play", exact=True).uncheck()
-    player.until(lambda: not player.live.controls["playing"].value, seconds=60)
+    player.until(lambda: not player.live.controls["playing"].value, seconds=240)
     time.sleep(0.5)
     stopped = player.frames
     page.get_by_role("button", name="one frame").click(timeout=60_000)
@@ -207,12 +207,12 @@ def test_page_pauses_steps_and_restarts(player, page):
     player.wait(10)
     step = player.live.step
     page.get_by_role("button", name="restart").click(timeout=60_000)
-    player.until(lambda: player.live.step < step, seconds=60)
+    player.until(lambda: player.live.step < step, seconds=240)
 
 
 def test_page_keeps_up_or_is_exact(player, page):
     page.get_by_label("keep up with real time").uncheck()
-    player.until(lambda: not player.live.controls["keep_up"].value, seconds=60)
+    player.until(lambda: not player.live.controls["keep_up"].value, seconds=240)
     player.wait(12)
     assert "within 1 % of the optimum" in player.live.controls["status"].content
     page.get_by_label("keep up with real time").check()
@@ -227,7 +227,8 @@ def test_page_takes_hold_and_drags(player, page):
     player.until(lambda: player.live.held is not None, seconds=120)
     vertex, handle = player.live.held, player.live.controls["hand"]
     before = np.array(handle.position)
-    for step in (15, 25, 35, 45):  # along an arrow, to the right
+    moved = np.zeros(3)
+    for step in (15, 20, 10, 25):  # along an arrow, to the right
         page.wait_for_timeout(3000)
         page.mouse.move(middle[0] + step, middle[1])
         page.wait_for_timeout(2000)
@@ -240,12 +241,12 @@ def test_page_takes_hold_and_drags(player, page):
         moved = np.array(handle.position) - before
         if np.linalg.norm(moved) > 0.02:
             break
-    assert np.linalg.norm(moved) > 0.02
     place = player.positions()[vertex]
     player.live.controls["playing"].value = True
-    player.until(lambda: (player.positions()[vertex] - place) @ moved > 0, seconds=60)
+    assert np.linalg.norm(moved) > 0.02
+    player.until(lambda: (player.positions()[vertex] - place) @ moved > 0, seconds=240)
     page.get_by_role("button", name="let go of the cloth").click(timeout=60_000)
-    player.until(lambda: player.live.held is None, seconds=60)
+    player.until(lambda: player.live.held is None, seconds=240)
 
 
 def test_page_records_a_file(player, page, tmp_path):

@@ -14,9 +14,10 @@ def layers(body):
 
 def area(points, faces):
     corners = points[faces]
-    return 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    ).sum()
+    return (
+        0.5
+        * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    )
 
 
 def test_layers_are_the_body_s_surface(body, layers):
