@@ -237,13 +237,19 @@ def report(frames: int) -> np.ndarray:
     return np.concatenate(pictures, axis=1)
 
 
-def limits(frames: int) -> np.ndarray:
-    """A dress of 1,000 and of 4,000 vertices: coarse cloth has no small folds."""
-    sizes: tuple[Literal["1k", "4k"], ...] = ("1k", "4k")
-    pictures = [
-        figures(shoot(("dress",), frames, vertices=size), [frames - 1], zoom=1.3)[0] for size in sizes
+def limits(_: int) -> np.ndarray:
+    """A T-shirt in all bundled resolutions: a face can't fold."""
+    sizes: tuple[Literal["1k", "4k", "10k"], ...] = ("1k", "4k", "10k")
+    garments = [load_garment_file("tshirt", vertices=size) for size in sizes]
+    edges = [
+        stored.rest_positions[stored.faces[:, 0]] - stored.rest_positions[stored.faces[:, 1]]
+        for stored in garments
     ]
-    return side_by_side(pictures, sizes)
+    labels = [
+        f"{size}: edges of {100 * np.median(np.linalg.norm(edge, axis=1)):.1f} cm"
+        for size, edge in zip(sizes, edges, strict=True)
+    ]
+    return side_by_side([worn(stored, load_body(), zoom=1.6) for stored in garments], labels)
 
 
 def play(frames: int) -> np.ndarray | None:

@@ -175,6 +175,20 @@ def choose(page, label, option):
     page.get_by_role("option", name=option, exact=True).click()
 
 
+def pixel(player, canvas, point):
+    """Return where on the page a point [m] is drawn."""
+    (client,) = player.live.server.get_clients().values()
+    camera = client.camera
+    ahead = camera.look_at - camera.position
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 1.0, 0.0])
+    right = right / np.linalg.norm(right)
+    offset = point - camera.position
+    scale = 0.5 * canvas["height"] / np.tan(0.5 * camera.fov) / (offset @ ahead)
+    across, up = offset @ right * scale, offset @ np.cross(right, ahead) * scale
+    return canvas["x"] + 0.5 * canvas["width"] + across, canvas["y"] + 0.5 * canvas["height"] - up
+
+
 def test_page_sliders_change_the_cloth(player, page):
     controls, before = player.live.controls, player.forward()
     enter(page, "speed, m/s", 10)
@@ -228,13 +242,13 @@ def test_page_takes_hold_and_drags(player, page):
     vertex, handle = player.live.held, player.live.controls["hand"]
     before = np.array(handle.position)
     moved = np.zeros(3)
-    for step in (15, 20, 10, 25):  # along an arrow, to the right
+    for along in (0.08, 0.1, 0.06, 0.04):  # [m] along the handle's arrow to the right
         page.wait_for_timeout(3000)
-        page.mouse.move(middle[0] + step, middle[1])
+        page.mouse.move(*pixel(player, canvas, before + np.array([along, 0.0, 0.0])))
         page.wait_for_timeout(2000)
         page.mouse.down()
         page.wait_for_timeout(1000)
-        page.mouse.move(middle[0] + step + 40, middle[1], steps=5)
+        page.mouse.move(*pixel(player, canvas, before + np.array([along + 0.2, 0.0, 0.0])), steps=5)
         page.wait_for_timeout(1000)
         page.mouse.up()
         page.wait_for_timeout(2000)
