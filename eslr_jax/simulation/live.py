@@ -22,8 +22,8 @@ from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
 
 TOLERANCE = 1e-2  # relative gap at which a frame ends
 MOST_ITERATIONS = 100
-# A step at 1k compiles in 24 instead of 40 s of one core's time, and takes a sixth more. Other releases of XLA may
-# not know the option, and refuse it.
+# A step at 1k compiles in 24 s of one core's time instead of 40, and takes up to a sixth more. Other releases of
+# XLA may not know the option, and refuse it.
 QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False} if jax.__version__.startswith("0.10.") else None
 _HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
 
