@@ -265,15 +265,14 @@ def play(frames: int) -> np.ndarray | None:
     from eslr_jax.viewer.live_controls import Choice
 
     shown, end = threading.Semaphore(0), threading.Event()
-    live = open_live(Choice(("dress",), "1k", _CLIP), out=Path("live"), port=8871)
+    live = open_live(Choice(("tshirt",), "1k", "cmu_016_32"), out=Path("live"), port=8871)
     loop = {"until": end, "on_frame": shown.release}
     thread = threading.Thread(target=run_live, args=(live,), kwargs=loop)
     thread.start()
-    live.controls["wind"].value = 3.0
     with sync_api.sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
         flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         browser = playwright.chromium.launch(executable_path=chromium, args=flags)
-        page = browser.new_page(viewport={"width": 1100, "height": 720})
+        page = browser.new_page(viewport={"width": 1000, "height": 680})
         page.goto(live.url)
         page.get_by_text("ms a frame").wait_for(timeout=300_000)
         for _ in range(frames):
