@@ -61,6 +61,7 @@ def main() -> None:
             np.asarray(scene.garment.faces),
             frame_indices=range(0, frames, _EVERY),
             rest_positions=np.asarray(poses.rest_positions),
+            rig=body,
             camera=_CAMERA,
             size=_SIZE,
             garment_color=color,

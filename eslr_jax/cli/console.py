@@ -16,6 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 app = tyro.extras.SubcommandApp()
 stderr = Console(stderr=True)
@@ -60,9 +61,9 @@ def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
     if "slide_m" in report:  # else the body is not known whole
         words = describe_report(report)
         for text in words.good:
-            print(f"good: {text}")
+            _print_word("good", "green", text)
         for text in words.warnings:
-            print(f"warning: {text}")
+            _print_word("warning", "yellow", text)
     terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
     rows = {
         "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
@@ -78,3 +79,9 @@ def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
     for label, text in (rows | more).items():
         table.add_row(label, text)
     Console().print(table, markup=False, highlight=False)
+
+
+def _print_word(word: str, color: str, text: str) -> None:
+    """Print a line on stdout that begins with a word, which has a colour on a terminal."""
+    line = Text.assemble((f"{word}: ", f"bold {color}"), (text, color))
+    Console().print(line, soft_wrap=True)

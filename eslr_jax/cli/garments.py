@@ -115,7 +115,15 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
     try:
         with stderr.status("rendering"):
             pictures = [
-                render_frame(*body, positions, stored.faces, camera=25.0, size=(420, 560))
+                render_frame(
+                    *body,
+                    positions,
+                    stored.faces,
+                    rest_positions=body[0],
+                    rig=rig,
+                    camera=25.0,
+                    size=(420, 560),
+                )
                 for positions in (stored.sewn_positions, stored.rest_positions)
             ]
     except MissingExtraError as error:

@@ -77,6 +77,7 @@ def render(
         samples: Camera rays per pixel.
     """
     from eslr_jax.evaluation.fields import run_field
+    from eslr_jax.io.palette import outfit_colors
     from eslr_jax.io.run import read_run
     from eslr_jax.render import (
         add_color_bar,
@@ -100,7 +101,8 @@ def render(
     content = read_run(run)
     trajectory = content.trajectory
     chosen = None if at is None else _frame_at(at, trajectory)
-    colors, bar = None, None
+    worn = content.garment
+    colors, bar = None if worn is None else outfit_colors(list(worn.outfit.values())), None
     if color != "fabric":
         field = run_field(content, color)
         colors = color_scale(field.values, field.low, field.high)
@@ -110,7 +112,9 @@ def render(
     body_mesh = (None, None) if body is None else (body.positions, body.faces)
     meshes = *body_mesh, trajectory.positions, trajectory.faces
     look: dict[str, Any] = {
-        "rest_positions": body.rest_positions if body is not None and follow else None,
+        "rest_positions": None if body is None else body.rest_positions,
+        "rig": None if body is None else body.skin,
+        "follows": follow,
         "camera": angle,
         "zoom": zoom,
         "vertex_colors": colors,

@@ -181,7 +181,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.fabric import beyond_training, garment_material
-    from eslr_jax.fit.outfit import combine_garments
+    from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.run import ClothTrack, write_run
     from eslr_jax.physics.air import blowing
@@ -202,7 +202,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             )
             for name in names
         ]
-        stored = combine_garments(garments, _part_names(names)) if len(garments) > 1 else garments[0]
+        stored = wear_together(garments, names)
         num_vertices = len(stored.rest_positions)
         method = _choose_method(options, request, num_vertices, choice)
         cloth = prepare_stored(stored, name=label, **method.garment_options)
@@ -282,7 +282,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
     if has_pictures and not is_unfinished:
-        _write_sheet(out, np.asarray(trajectory.positions), stored, poses)
+        _write_sheet(out, np.asarray(trajectory.positions), stored, (rig, poses))
     return report
 
 
@@ -392,27 +392,20 @@ def _expected_ms(method: _Method, num_vertices: int) -> float:
     return expected_ms(read_calibration(), num_vertices, method.model or SOLVER, method.config.iterations)
 
 
-def _part_names(garments: tuple[str, ...]) -> list[str]:
-    """Return what the parts of an outfit are called: bundled garments by their names, others by their files'."""
-    return [name.partition("#")[2] or Path(name).stem for name in garments]
-
-
 def _say_if_any(text: str | None) -> None:
     """Print a line on stderr, if there is one."""
     if text:
         say(text)
 
 
-def _write_sheet(out: Path, positions, stored: GarmentFile, poses) -> None:
+def _write_sheet(out: Path, positions, stored: GarmentFile, actor) -> None:
     """Render the contact sheet, garments of an outfit in their colours; without the extra `render` say so."""
     import numpy as np
 
+    from eslr_jax.io.palette import outfit_colors
     from eslr_jax.render import contact_sheet, write_png
-    from eslr_jax.render.pictures import OUTFIT_COLORS
 
-    counts = list(stored.metadata.get("outfit", {"all": len(stored.rest_positions)}).values())
-    colors = np.resize(OUTFIT_COLORS, (len(counts), 3)).repeat(counts, axis=0)
-
+    rig, poses = actor
     try:
         with progress("rendering", 8) as advance:
             sheet = contact_sheet(
@@ -420,8 +413,9 @@ def _write_sheet(out: Path, positions, stored: GarmentFile, poses) -> None:
                 np.asarray(poses.faces),
                 positions,
                 stored.faces,
-                vertex_colors=colors,
+                vertex_colors=outfit_colors(list(stored.outfit.values())),
                 rest_positions=np.asarray(poses.rest_positions),
+                rig=rig,
                 timestep=float(poses.timestep),
                 on_picture=advance,
             )

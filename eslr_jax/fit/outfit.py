@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +18,21 @@ LAYER_GAP = 5e-3  # [m] left between two layers at rest: two millimetres over th
 _REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
 _ROUNDS = 20
 _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
+
+
+def wear_together(garments: Sequence[GarmentFile], files: Sequence[str]) -> GarmentFile:
+    """Return one garment as it is, or several as an outfit whose parts have the names of assets or files.
+
+    Args:
+        garments: Garments of one body, the innermost first.
+        files: The asset or the file of each; `FILE#NAME` is called NAME.
+
+    Raises:
+        MeshError: See `combine_garments`.
+    """
+    if len(garments) == 1:
+        return garments[0]
+    return combine_garments(garments, [name.partition("#")[2] or Path(name).stem for name in files])
 
 
 def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> GarmentFile:

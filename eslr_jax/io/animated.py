@@ -8,10 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from eslr_jax.errors import MeshError, MotionError
+from eslr_jax.io.palette import GARMENT_COLORS, Color
 from eslr_jax.io.skin import Skin, check_skin
-
-CLOTH_COLOR = (0.20, 0.42, 0.62, 1.0)  # sRGB and opacity
-BODY_COLOR = (0.80, 0.64, 0.55, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +19,7 @@ class AnimatedMesh:
     name: str
     positions: np.ndarray  # [frames, vertices, 3] [m]
     faces: np.ndarray  # [faces, 3]
-    color: tuple[float, float, float, float] = CLOTH_COLOR
+    color: Color = GARMENT_COLORS[0]
     corner_uvs: np.ndarray | None = None  # texture coordinates of each face's corners, v up [faces, 3, 2]
     velocities: np.ndarray | None = None  # [frames, vertices, 3] [m/s]
     rest_positions: np.ndarray | None = None  # [vertices, 3] [m], what `skin` moves

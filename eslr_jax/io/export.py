@@ -11,12 +11,13 @@ from typing import Literal, get_args
 import numpy as np
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.animated import BODY_COLOR, AnimatedMesh, check_meshes, split_seams
+from eslr_jax.io.animated import AnimatedMesh, check_meshes, split_seams
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
-from eslr_jax.io.garment import GarmentFile, first_rows
+from eslr_jax.io.garment import GarmentFile, first_rows, split_outfit
 from eslr_jax.io.gltf import write_animated_glb
 from eslr_jax.io.mesh_sequence import frame_name, obj_text
 from eslr_jax.io.npz import write_arrays
+from eslr_jax.io.palette import SKIN_COLOR, garment_color
 from eslr_jax.io.point_cache import write_mdd, write_pc2
 from eslr_jax.io.trajectory import TrajectoryFile
 from eslr_jax.io.usd import write_usd
@@ -56,7 +57,10 @@ def export_trajectory(
     content = content or ("both" if chosen in _SCENES and run.body is not None else "garment")
     if content == "both" and chosen not in _SCENES:
         raise AssetError(f"{chosen} holds one mesh; export garment and body to a file each")
-    meshes = [mesh for kind, mesh in _meshes(run, garment).items() if content in (kind, "both")]
+    both = _meshes(run, garment)
+    meshes = [mesh for kind, mesh in both.items() if content in (kind, "both")]
+    if chosen in _SCENES and content != "body" and garment is not None and len(garment.outfit) > 1:
+        meshes[:1] = _garments(both["garment"], garment.outfit)
     if not meshes:
         raise AssetError("this run has no body; export the garment")
     check_meshes(meshes, run.timestep)
@@ -109,11 +113,26 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
         "body",
         run.body.positions,
         run.body.faces,
-        BODY_COLOR,
+        SKIN_COLOR,
         rest_positions=run.body.rest_positions,
         skin=run.body.skin,
     )
     return {"garment": cloth, "body": body}
+
+
+def _garments(cloth: AnimatedMesh, outfit: dict[str, int]) -> list[AnimatedMesh]:
+    """Return the garments of an outfit as a mesh each, in a colour each."""
+    return [
+        AnimatedMesh(
+            name,
+            cloth.positions[:, rows],
+            cloth.faces[is_own] - rows.start,
+            garment_color(number),
+            corner_uvs=None if cloth.corner_uvs is None else cloth.corner_uvs[is_own],
+            velocities=None if cloth.velocities is None else cloth.velocities[:, rows],
+        )
+        for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, outfit))
+    ]
 
 
 def _write_npz(path: Path, mesh: AnimatedMesh, timestep: float) -> None:

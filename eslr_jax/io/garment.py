@@ -51,6 +51,28 @@ class GarmentFile:
     vertex_map: Int[np.ndarray, " source_vertices"] | None = None  # vertex of each source vertex, or -1
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # fabrics, how it was fitted, ...
 
+    @property
+    def outfit(self) -> dict[str, int]:
+        """Numbers of vertices of the garments that are worn together, by name; one entry for a single garment."""
+        return self.metadata.get("outfit") or {"garment": len(self.rest_positions)}
+
+
+def split_outfit(
+    faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]
+) -> list[tuple[str, slice, Bool[np.ndarray, " faces"]]]:
+    """Return the garments of an outfit: the name, the vertices and which faces.
+
+    Args:
+        faces: Triangles of all of them.
+        outfit: `GarmentFile.outfit`.
+    """
+    garments, start = [], 0
+    for name, count in outfit.items():
+        is_own = (faces[:, 0] >= start) & (faces[:, 0] < start + count)
+        garments.append((name, slice(start, start + count), is_own))
+        start += count
+    return garments
+
 
 @dataclasses.dataclass(frozen=True)
 class GarmentSource:

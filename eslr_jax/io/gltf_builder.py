@@ -6,6 +6,7 @@ import numpy as np
 import pygltflib as gltf
 
 from eslr_jax.io.color import srgb_to_linear
+from eslr_jax.io.palette import Color
 
 _COMPONENT_TYPES = {
     np.dtype(np.float32): gltf.FLOAT,
@@ -87,17 +88,17 @@ class GlbBuilder:
             faces.reshape(-1).astype(dtype), gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER
         )
 
-    def add_material(self, name: str, color: tuple[float, float, float, float]) -> int:
+    def add_material(self, name: str, color: Color) -> int:
         """Append a rough two-sided material and return its index."""
-        linear = [float(value) for value in srgb_to_linear(color[:3])]
+        linear = [float(value) for value in srgb_to_linear(color)]
         surface = gltf.PbrMetallicRoughness(
-            baseColorFactor=[*linear, float(color[3])], metallicFactor=0.0, roughnessFactor=0.9
+            baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9
         )
         material = gltf.Material(
             name=name,
             pbrMetallicRoughness=surface,
             doubleSided=True,
-            alphaMode=gltf.OPAQUE if color[3] >= 1 else gltf.BLEND,
+            alphaMode=gltf.OPAQUE,
             alphaCutoff=None,
         )
         return append(self.document.materials, material)

@@ -17,6 +17,7 @@ from eslr_jax.extras import require
 from eslr_jax.io.animated import AnimatedMesh, check_meshes, vertex_normals
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.color import srgb_to_linear
+from eslr_jax.io.palette import Color
 from eslr_jax.io.skin import Skin, corrections, influences, local_motion
 
 SUFFIXES = (".usd", ".usda", ".usdc")
@@ -137,11 +138,11 @@ def _set_points(
         prim.CreateVelocitiesAttr().Set(vectors(velocities), time)
 
 
-def _add_material(stage: Any, path: str, color: tuple[float, float, float, float], prim: Any) -> None:
+def _add_material(stage: Any, path: str, color: Color, prim: Any) -> None:
     """Bind a rough UsdPreviewSurface of a colour, and show it where materials are not drawn."""
     from pxr import Gf, Sdf, UsdShade  # pyright: ignore[reportMissingImports]
 
-    linear = Gf.Vec3f(*(float(value) for value in srgb_to_linear(color[:3])))
+    linear = Gf.Vec3f(*(float(value) for value in srgb_to_linear(color)))
     prim.CreateDisplayColorAttr([linear])
     material = UsdShade.Material.Define(stage, path)
     shader = UsdShade.Shader.Define(stage, f"{path}/surface")
@@ -149,7 +150,6 @@ def _add_material(stage: Any, path: str, color: tuple[float, float, float, float
     for name, kind, value in (
         ("diffuseColor", Sdf.ValueTypeNames.Color3f, linear),
         ("roughness", Sdf.ValueTypeNames.Float, 0.9),
-        ("opacity", Sdf.ValueTypeNames.Float, float(color[3])),
     ):
         shader.CreateInput(name, kind).Set(value)
     material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from eslr_jax.body.clothing import Skinned, body_layers
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
 from eslr_jax.extras import require
+from eslr_jax.io.palette import BODY_COLORS, GARMENT_COLORS
 from eslr_jax.render.annotate import side_by_side
 from eslr_jax.render.camera import Camera, facing_angles, follow, parse_angle
 from eslr_jax.render.scene import Surface, trace_picture
 
-GARMENT_COLOR = (0.30, 0.50, 0.70)  # sRGB
-OUTFIT_COLORS = (GARMENT_COLOR, (0.80, 0.47, 0.32), (0.45, 0.62, 0.38), (0.62, 0.45, 0.66))  # sRGB, in turns
-BODY_COLOR = (0.88, 0.73, 0.64)  # sRGB
 _PICTURE_SIZE = (480, 640)  # width, height [pixels]
 _SHEET_PICTURE_SIZE = (252, 360)  # width, height [pixels]
 _SAMPLES = 9  # camera rays per pixel; with the denoiser 1 % from a picture with twenty times as many
@@ -32,10 +31,12 @@ def render_frames(
     *,
     frame_indices: Sequence[int] | None = None,
     rest_positions: np.ndarray | None = None,
+    rig: Skinned | None = None,
+    follows: bool = True,
     camera: str | float = "front",
     zoom: float = 1.0,
     size: tuple[int, int] = _PICTURE_SIZE,
-    garment_color: tuple[float, float, float] = GARMENT_COLOR,
+    garment_color: tuple[float, float, float] = GARMENT_COLORS[0],
     vertex_colors: np.ndarray | None = None,
     samples: int = _SAMPLES,
 ) -> Iterator[np.ndarray]:
@@ -47,8 +48,10 @@ def render_frames(
         garment_positions: Garment vertex positions [m], shape [frames, vertices, 3].
         garment_faces: Garment triangles, shape [faces, 3].
         frame_indices: Which frames, in which order; None renders all.
-        rest_positions: The body at rest, facing +Z [m], shape [body_vertices, 3]. With it the camera turns with
-            the body; without it the camera looks along the world's axes, and "front" is +Z.
+        rest_positions: The body at rest, facing +Z [m], shape [body_vertices, 3].
+        rig: What moves the body; with it and the body at rest, the body wears neutral shorts and a top.
+        follows: Turn the camera with the body; otherwise, or without the body at rest, it looks along the world's
+            axes, and "front" is +Z.
         camera: "front", "side" (the body's left), "back", or degrees from the front towards the left.
         zoom: How many times larger than with the whole body in the picture; above 1 it looks at the garment.
         size: Width and height [pixels].
@@ -76,7 +79,7 @@ def render_frames(
         )
     colors = _frame_colors(garment, garment_color, vertex_colors)
     angles = np.full(len(garment.positions), angle)
-    if body is not None and rest_positions is not None:
+    if body is not None and rest_positions is not None and follows:
         angles += facing_angles(body.positions, np.asarray(rest_positions))
     subject = garment if body is None else body
     focus = garment.positions if zoom > 1 else None
@@ -85,10 +88,18 @@ def render_frames(
     )
     indices = range(len(garment.positions)) if frame_indices is None else list(frame_indices)
 
+    layers = []
+    if body is not None and rest_positions is not None:
+        layers = body_layers(np.asarray(rest_positions), body.faces, rig)
+    elif body is not None:
+        layers = body_layers(body.positions[0], body.faces, None)
+
     def trace(index: int, view: Camera) -> np.ndarray:
         surfaces = [Surface("garment", garment.positions[index], garment.faces, colors[index], True)]
-        if body is not None:
-            surfaces.append(Surface("body", body.positions[index], body.faces, BODY_COLOR, False))
+        for layer in layers:
+            assert body is not None
+            place = layer.place(body.positions[index])
+            surfaces.append(Surface(f"body {layer.kind}", place, layer.faces, BODY_COLORS[layer.kind], False))
         return trace_picture(surfaces, view, ground_height=ground_height, size=size, samples=samples)
 
     return (trace(index, cameras[index]) for index in indices)

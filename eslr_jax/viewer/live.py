@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from eslr_jax.assets import asset_names, load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.motion import pose_body
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.extras import require
+from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import ClothTrack, write_run
-from eslr_jax.physics.materials import fabric_material, fabric_names
-from eslr_jax.render.pictures import BODY_COLOR, GARMENT_COLOR
 from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
@@ -34,22 +35,21 @@ from eslr_jax.simulation.live import (
     set_stage,
     there_and_back,
 )
-from eslr_jax.types import Body, BodyMotion, ClothState, Material
-from eslr_jax.viewer.page import byte_color
+from eslr_jax.types import Body, BodyMotion, ClothState
+from eslr_jax.viewer.figures import Piece, body_pieces, garment_pieces
+from eslr_jax.viewer.live_controls import (
+    Choice,
+    add_controls,
+    describe_fabric,
+    read_choice,
+    read_fabric,
+    read_wind,
+)
 
-FACTORS = (0.1, 10.0)  # of a fabric's constants
-_FEWEST = 5  # iterations, with which cloth holds together
+MOST_RECORDED = 1800  # frames: a minute
+_FEWEST = 15  # iterations: fewer save little time, and cloth lags behind the body
 _SHOWN = 10  # frames over which times are averaged
-_STRONGEST = 12.0  # [m/s], of the wind
-
-
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    """What is on stage."""
-
-    garment: str
-    vertices: str
-    motion: str
+_PATIENCE = 0.4  # [s] for which a choice must stand before it is loaded: a slider passes many
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +60,10 @@ class Cast:
     rig: Body
     stored: GarmentFile
     poses: BodyMotion
-    ground: float  # height of the lowest point of the moving body [m]
+    spots: np.ndarray  # under the body, on the ground, in every frame [m]
     stage: Stage
+    drawn: list[tuple[Piece, Any]]  # of the garments, with their meshes on the page
+    drawn_body: list[tuple[Piece, Any]]
 
 
 @dataclasses.dataclass
@@ -70,12 +72,16 @@ class Live:
 
     server: Any  # viser.ViserServer
     controls: dict[str, Any]
+    body: str  # name or file
     out: Path  # folder of recordings
     cast: Cast | None = None
+    wanted: tuple[Choice | None, float] = (None, 0.0)  # the last choice that was seen, and since when [s]
+    refused: Choice | None = None  # what did not load
     state: ClothState | None = None
     step: int = 0  # since the cloth was put on
     iterations: int = MOST_ITERATIONS  # at most, of the next frame
     times: list[float] = dataclasses.field(default_factory=list)  # of the last frames [s]
+    is_compiled: bool = False
     held: int | None = None  # vertex in the hand
     recorded: list[tuple[int, ClothState]] = dataclasses.field(default_factory=list)
     asked: threading.Event = dataclasses.field(default_factory=threading.Event)  # for one step
@@ -96,45 +102,23 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
         port: Port, or the next free one.
 
     Raises:
+        AssetError: There is no such body.
         MissingExtraError: The extra `view` is not installed.
     """
     viser = require("viser", extra="view")
+    num_shapes = load_body(choice.body).shape_directions.shape[-1]
     server = viser.ViserServer(host=host, port=port, verbose=False)
-    gui = server.gui
-    garments = sorted({name.rpartition("_")[0] for name in asset_names("garment")})
-    controls: dict[str, Any] = {"status": gui.add_markdown("loading")}
-    with gui.add_folder("scene"):
-        controls |= {
-            "garment": gui.add_dropdown(
-                "garment", _with(garments, choice.garment), initial_value=choice.garment
-            ),
-            "vertices": gui.add_dropdown("vertices", ("1k", "4k", "10k"), initial_value=choice.vertices),
-            "motion": gui.add_dropdown(
-                "motion", _with(sorted(asset_names("motion")), choice.motion), initial_value=choice.motion
-            ),
-        }
-    with gui.add_folder("fabric"):
-        controls["fabric"] = gui.add_dropdown("fabric", fabric_names(), initial_value="cotton")
-        for name in ("density", "stretch", "bending"):  # powers of ten
-            controls[name] = gui.add_slider(f"{name}, 10^", *np.log10(FACTORS).tolist(), 0.05, 0.0)
-    with gui.add_folder("wind"):
-        controls["wind"] = gui.add_slider("speed [m/s]", 0.0, _STRONGEST, 0.1, 0.0)
-        controls["direction"] = gui.add_slider("direction [degrees]", -180.0, 180.0, 5.0, 0.0)
-    with gui.add_folder("time"):
-        controls |= {
-            "playing": gui.add_checkbox("play", True),
-            "keep_up": gui.add_checkbox("keep up with real time", True),
-            "single": gui.add_button("one frame"),
-            "restart": gui.add_button("restart"),
-            "let_go": gui.add_button("let go", visible=False),
-            "record": gui.add_checkbox("record", False),
-        }
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="fixed")
+    server.gui.set_panel_label("eslr play")
+    controls = add_controls(server.gui, choice, num_shapes)
     server.scene.set_up_direction("+y")
     server.scene.add_grid("/floor", width=4.0, height=4.0, plane="xz", cell_size=0.25)
-    server.initial_camera.position = (0.0, 1.3, 3.2)
-    server.initial_camera.look_at = (0.0, 0.95, 0.0)
+    server.initial_camera.position = (1.2, 1.3, 3.6)
+    server.initial_camera.look_at = (0.0, 0.9, 0.0)
+    server.initial_camera.fov = np.deg2rad(40.0)
     server.initial_camera.up = (0.0, 1.0, 0.0)
-    live = Live(server, controls, Path(out))
+    live = Live(server, controls, choice.body, Path(out))
+    controls["playing"].on_update(lambda _: _show_single(live))
     controls["single"].on_click(lambda _: live.asked.set())
     controls["restart"].on_click(lambda _: _restart(live))
     controls["let_go"].on_click(lambda _: _let_go(live))
@@ -157,7 +141,7 @@ def run_live(
         try:
             is_moved = one_frame(live)
         except EslrError as error:
-            live.controls["playing"].value = False
+            live.refused = read_choice(live.controls, live.body)
             live.controls["status"].content = f"**{error}**"
             is_moved = False
         if is_moved:
@@ -172,59 +156,133 @@ def one_frame(live: Live) -> bool:
     Raises:
         EslrError: What is chosen does not load, or the body is too fast.
     """
-    choice = Choice(*(live.controls[name].value for name in ("garment", "vertices", "motion")))
-    if live.cast is None or live.cast.choice != choice:
+    choice = read_choice(live.controls, live.body)
+    if _is_due(live, choice):
         _load(live, choice)
     cast = live.cast
-    assert cast is not None
-    if not live.controls["record"].value and live.recorded:
+    if cast is None or choice == live.refused:
+        return False
+    is_full = len(live.recorded) >= MOST_RECORDED
+    if live.recorded and (is_full or not live.controls["record"].value):
+        live.controls["record"].value = False
         _save(live, cast)
     if not (live.controls["playing"].value or live.asked.is_set()):
         return False
     live.asked.clear()
     if live.state is None:
         live.state, live.step = cast.stage.scene.initial_state, 0
-        live.controls["status"].content = f"compiling {choice.garment} of {choice.vertices} vertices"
-    began = time.perf_counter()
     frames = there_and_back(live.step, cast.stage.scene.num_frames)
-    stage = changed(cast.stage, _fabric(live), _wind(live), _hand(live))
-    step = jax.block_until_ready(advance(stage, live.state, frames, live.iterations))
-    took = time.perf_counter() - began
+    fabric = read_fabric(live.controls)
+    with (
+        contextlib.nullcontext()
+        if live.is_compiled
+        else _busy(live, "compiling, which is kept for the next time")
+    ):
+        began = time.perf_counter()
+        stage = changed(cast.stage, fabric, read_wind(live.controls), _hand(live))
+        step = jax.block_until_ready(advance(stage, live.state, frames, live.iterations))
+        took = time.perf_counter() - began
+    if live.state is None:  # restarted meanwhile
+        return False
     status = Status(int(step.state.status))
     if status != Status.OK:
         _restart(live)
         live.controls["status"].content = f"put on anew: {status.describe()}"
         return False
     live.state, live.step = step.state, live.step + 1
-    live.times = [*live.times[-_SHOWN + 1 :], took]
+    if live.is_compiled:
+        live.times = [*live.times[-_SHOWN + 1 :], took]
+    live.is_compiled = True
     if live.controls["record"].value:
         live.recorded.append((frames[1], jax.tree.map(np.asarray, step.state)))
     _show(live, cast, frames[1])
-    _tell(live, cast, int(step.report.iterations))
+    live.controls["constants"].content = describe_fabric(fabric)
+    if live.times:
+        _tell(live, cast, int(step.report.iterations))
     return True
+
+
+def _is_due(live: Live, choice: Choice) -> bool:
+    """Return whether a choice is to be loaded: it is new, and has stood for a while."""
+    if choice == live.refused or (live.cast is not None and live.cast.choice == choice):
+        live.wanted = (None, 0.0)
+        return False
+    if live.cast is None:
+        return True
+    if live.wanted[0] != choice:
+        live.wanted = (choice, time.monotonic())
+    return time.monotonic() - live.wanted[1] > _PATIENCE
+
+
+@contextlib.contextmanager
+def _busy(live: Live, text: str) -> Iterator[None]:
+    """Say on the page what is done, and for how many seconds already."""
+    end, began = threading.Event(), time.monotonic()
+
+    def tick() -> None:
+        while not end.wait(0.5):
+            live.controls["status"].content = f"{text}: {time.monotonic() - began:.0f} s"
+
+    live.controls["status"].content = text
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
 
 
 def _load(live: Live, choice: Choice) -> None:
     """Put what is chosen on stage."""
-    live.controls["status"].content = f"loading {choice.garment} and {choice.motion}"
-    rig = load_body()
-    poses = pose_body(rig, load_motion(choice.motion, body=rig))
-    stored = load_garment_file(choice.garment, vertices=choice.vertices, body=rig)  # type: ignore[arg-type]
-    cloth = prepare_stored(stored, name=Path(choice.garment).name)
+    live.refused = choice  # until it is there
+    with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
+        rig = load_body(choice.body, betas=choice.betas)
+        poses = pose_body(rig, load_motion(choice.motion, body=rig))
+        if live.cast is None:
+            _draw_body(live, poses, rig)
+        # A shape of the body is tried once: its garments are not kept on disk.
+        garments = [
+            load_garment_file(name, vertices=choice.vertices, body=rig, cache=not choice.betas)  # type: ignore[arg-type]
+            for name in choice.garments
+        ]
+        stored = wear_together(garments, choice.garments)
+        cloth = prepare_stored(stored, name="+".join(Path(name).name for name in choice.garments))
+        stage = set_stage(cloth, poses, read_fabric(live.controls))
     _let_go(live)
-    ground = float(ground_height(poses))
-    live.cast = Cast(choice, rig, stored, poses, ground, set_stage(cloth, poses, _fabric(live)))
-    live.recorded = []
+    if live.cast is not None:
+        for _, mesh in (*live.cast.drawn, *live.cast.drawn_body):
+            mesh.remove()
+    spots = _spots(poses)
+    drawn = [
+        _draw(live, f"/garments/{number}", piece, np.asarray(stage.scene.initial_state.position) - spots[0])
+        for number, piece in enumerate(garment_pieces(np.asarray(cloth.faces), stored.outfit))
+    ]
+    for _, mesh in drawn:
+        mesh.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
+    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, _draw_body(live, poses, rig))
+    live.recorded, live.is_compiled, live.refused = [], False, None
     _restart(live)
-    scene, first = live.server.scene, np.asarray(live.cast.stage.scene.initial_state.position)
-    scene.add_mesh_simple(
-        "/body", np.asarray(poses.positions[0]), np.asarray(poses.faces), color=byte_color(BODY_COLOR)
+
+
+def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, Any]:
+    """Draw a piece of garment or body, given where the whole is [m]; return it with its mesh on the page."""
+    mesh = live.server.scene.add_mesh_simple(
+        name, piece.place(positions), piece.faces, color=byte_color(piece.color), side="double"
     )
-    garment = scene.add_mesh_simple(
-        "/garment", first, np.asarray(cloth.faces), color=byte_color(GARMENT_COLOR), side="double"
-    )
-    garment.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
-    live.controls["meshes"] = (scene.get_handle_by_name("/body"), garment)
+    return piece, mesh
+
+
+def _draw_body(live: Live, poses: BodyMotion, rig: Body) -> list[tuple[Piece, Any]]:
+    """Draw a body at the first frame of its motion."""
+    positions = np.asarray(poses.positions[0]) - _spots(poses)[0]
+    pieces = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
+    return [_draw(live, f"/body/{piece.name}", piece, positions) for piece in pieces]
+
+
+def _show_single(live: Live) -> None:
+    """Offer single frames while the simulation is paused."""
+    live.controls["single"].visible = not live.controls["playing"].value
 
 
 def _restart(live: Live) -> None:
@@ -236,17 +294,20 @@ def _show(live: Live, cast: Cast, frame: int) -> None:
     """Show the cloth, and the body at a frame, which walks on the spot."""
     body = np.asarray(cast.poses.positions[frame])
     assert live.state is not None
-    place = _place(cast, frame)
-    shown, garment = live.controls["meshes"]
+    place = cast.spots[frame]
+    cloth = np.asarray(live.state.position) - place
     with live.server.atomic():
-        shown.vertices = (body - place).astype(np.float32)
-        garment.vertices = (np.asarray(live.state.position) - place).astype(np.float32)
+        for piece, mesh in cast.drawn_body:
+            mesh.vertices = piece.place(body - place)
+        for piece, mesh in cast.drawn:
+            mesh.vertices = piece.place(cloth)
 
 
-def _place(cast: Cast, frame: int) -> np.ndarray:
-    """Return the place under the body on the ground [m]; on the page it is the origin."""
-    middle = np.asarray(cast.poses.positions[frame]).mean(axis=0)
-    return np.array([middle[0], cast.ground, middle[2]])
+def _spots(poses: BodyMotion) -> np.ndarray:
+    """Return the place under the body on the ground in every frame [m]; on the page it is the origin."""
+    spots = np.array(poses.positions).mean(axis=1)
+    spots[:, 1] = float(ground_height(poses))
+    return spots
 
 
 def _tell(live: Live, cast: Cast, iterations: int) -> None:
@@ -261,30 +322,8 @@ def _tell(live: Live, cast: Cast, iterations: int) -> None:
     is_exact = iterations < live.iterations
     exact = f"within {100 * TOLERANCE:g} % of the optimum" if is_exact else "stopped before the tolerance"
     speed = "in real time" if took <= timestep else f"at {timestep / took:.2f} of real time"
-    live.controls[
-        "status"
-    ].content = f"{1e3 * took:.0f} ms a frame, {speed}; {iterations} iterations, {exact}"
-
-
-def _fabric(live: Live) -> Material:
-    """Return the fabric that the controls ask for."""
-    fabric = fabric_material(live.controls["fabric"].value)
-    density, stretch, bending = (
-        10.0 ** live.controls[name].value for name in ("density", "stretch", "bending")
-    )
-    return fabric.replace(
-        density=np.float32(fabric.density * density),
-        lame_mu=np.float32(fabric.lame_mu * stretch),
-        lame_lambda=np.float32(fabric.lame_lambda * stretch),
-        bending_stiffness=np.float32(fabric.bending_stiffness * bending),
-        thickness=np.float32(fabric.thickness),
-    )
-
-
-def _wind(live: Live) -> tuple[float, float, float]:
-    """Return the wind that the controls ask for [m/s]; at zero degrees it blows along z."""
-    angle, speed = np.deg2rad(live.controls["direction"].value), live.controls["wind"].value
-    return float(speed * np.sin(angle)), 0.0, float(speed * np.cos(angle))
+    figures = f"{1e3 * took:.0f} ms a frame, {iterations} iterations, {exact}"
+    live.controls["status"].content = f"**{speed}**\n\n{figures}"
 
 
 def _take_hold(live: Live, origin: Any, direction: Any) -> None:
@@ -292,7 +331,7 @@ def _take_hold(live: Live, origin: Any, direction: Any) -> None:
     if live.cast is None or live.state is None:
         return
     _, frame = there_and_back(live.step - 1, live.cast.stage.scene.num_frames)
-    positions = np.asarray(live.state.position) - _place(live.cast, frame)
+    positions = np.asarray(live.state.position) - live.cast.spots[frame]
     live.held = nearest_vertex(positions, origin, direction)
     handle = live.server.scene.add_transform_controls(
         "/hand", scale=0.15, disable_rotations=True, position=positions[live.held]
@@ -316,7 +355,7 @@ def _hand(live: Live) -> Hand:
     if handle is None or held is None or cast is None:
         return no_hand()
     _, frame = there_and_back(live.step, cast.stage.scene.num_frames)
-    return grasp(held, np.asarray(handle.position) + _place(cast, frame))
+    return grasp(held, np.asarray(handle.position) + cast.spots[frame])
 
 
 def _save(live: Live, cast: Cast) -> None:
@@ -336,20 +375,15 @@ def _save(live: Live, cast: Cast) -> None:
             for name in ("position", "velocity", "friction_load")
         )
     )
-    scene = cast.stage.scene.replace(material=_fabric(live))
+    scene = cast.stage.scene.replace(material=read_fabric(live.controls))
     report = {
-        "garment": cast.choice.garment,
+        "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,
         "integrator": "bdf2",
         "skin_contacts": True,
-        "wind_m_s": _wind(live),
+        "wind_m_s": read_wind(live.controls),
     }
     write_run(live.out, track, scene, (cast.rig, poses, cast.stored), report=report)
     data = (live.out / "animation.glb").read_bytes()
     for client in live.server.get_clients().values():
         client.send_file_download("animation.glb", data, save_immediately=True)
-
-
-def _with(names: list[str], name: str) -> tuple[str, ...]:
-    """Return names with one more in front, such as a file's, if it is not among them."""
-    return tuple(names) if name in names else (name, *names)

@@ -7,7 +7,7 @@ import io
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -15,15 +15,23 @@ import trimesh
 from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.evaluation.fields import FIELDS, Field, run_field
 from eslr_jax.extras import require
+from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import Run
 from eslr_jax.render.colors import color_scale
-from eslr_jax.render.pictures import BODY_COLOR, GARMENT_COLOR
 from eslr_jax.viewer.curves import add_plot, frame_values, show_plot, worst_frame
+from eslr_jax.viewer.figures import Piece, body_pieces, garment_pieces
 
 PLAIN = "fabric"  # colour by nothing
 _SPACING = 1.3  # [m] between runs: arms held out pass each other
 _LABEL_HEIGHT = 0.2  # [m] of a run's name above its head
 _PICTURE_SIZE = (1280, 960)  # width, height [pixels]
+
+
+class Figure(NamedTuple):
+    """What is drawn of a run."""
+
+    garments: list[Piece]
+    body: list[Piece]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +42,7 @@ class View:
     runs: tuple[Run, ...]
     fields: dict[tuple[int, str], Field]  # of a run's number and a field's name, filled as they are asked for
     controls: dict[str, Any]
+    pieces: tuple[Figure, ...]  # of every run
     lock: threading.Lock
 
     @property
@@ -79,7 +88,7 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
         "follow": gui.add_checkbox("follow", True),
         "save": gui.add_button("save picture"),
     }
-    view = View(server, tuple(runs), {}, controls, threading.Lock())
+    view = View(server, tuple(runs), {}, controls, tuple(map(_figure, runs)), threading.Lock())
     _place_scene(view)
     for name in ("frame", "wireframe", "body", "follow"):
         controls[name].on_update(lambda _: show(view))
@@ -168,29 +177,43 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
     ]
     scene.add_label(f"/runs/{k}/name", run.name, position=tuple(top + offset))
     points = (trajectory.positions[frame] + offset).astype(np.float32)
-    name = f"/runs/{k}/garment"
+    name, figure = f"/runs/{k}/garment", view.pieces[k]
     if colors is None or wireframe:
-        scene.add_mesh_simple(
-            name,
-            points,
-            trajectory.faces,
-            color=byte_color(GARMENT_COLOR),
-            wireframe=wireframe,
-            side="double",
-        )
+        for number, piece in enumerate(figure.garments):
+            scene.add_mesh_simple(
+                name if number == 0 else f"{name}_{number}",
+                piece.place(points),
+                piece.faces,
+                color=byte_color(piece.color),
+                wireframe=wireframe,
+                side="double",
+            )
     else:
+        for number in range(1, len(figure.garments)):
+            scene.remove_by_name(f"{name}_{number}")
         mesh = trimesh.Trimesh(
             points, trajectory.faces, vertex_colors=np.round(255 * colors).astype(np.uint8), process=False
         )
         scene.add_mesh_trimesh(name, mesh)
     if trajectory.body is not None:
-        scene.add_mesh_simple(
-            f"/runs/{k}/body",
-            (trajectory.body.positions[frame] + offset).astype(np.float32),
-            trajectory.body.faces,
-            color=byte_color(BODY_COLOR),
-            visible=bool(view.controls["body"].value),
-        )
+        for number, piece in enumerate(figure.body):
+            scene.add_mesh_simple(
+                f"/runs/{k}/body" if number == 0 else f"/runs/{k}/body_{piece.name}",
+                piece.place(trajectory.body.positions[frame] + offset),
+                piece.faces,
+                color=byte_color(piece.color),
+                visible=bool(view.controls["body"].value),
+            )
+
+
+def _figure(run: Run) -> Figure:
+    """Return what is drawn of a run."""
+    trajectory, body = run.trajectory, run.trajectory.body
+    outfit = run.garment.outfit if run.garment is not None else {"garment": trajectory.positions.shape[1]}
+    return Figure(
+        garment_pieces(trajectory.faces, outfit),
+        [] if body is None else body_pieces(body.rest_positions, body.faces, body.skin),
+    )
 
 
 def _fields(view: View, name: str) -> tuple[list[Field], str]:
@@ -230,9 +253,3 @@ def _save_picture(client: Any) -> None:
     stream = io.BytesIO()
     require("PIL.Image", extra="view").fromarray(picture).save(stream, format="PNG")
     client.send_file_download("garment.png", stream.getvalue(), save_immediately=True)  # else a link
-
-
-def byte_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
-    """Return sRGB in [0, 1] as bytes."""
-    red, green, blue = (round(255 * value) for value in color)
-    return red, green, blue

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.evaluation.report import environment
+from eslr_jax.io.palette import GARMENT_COLORS, SKIN_COLOR
 from eslr_jax.render import render_frame, side_by_side
-from eslr_jax.render.pictures import BODY_COLOR, GARMENT_COLOR
 from hard_cases import CASES
 from hard_cases.case import Outcome, Run
 
@@ -61,12 +61,12 @@ def draw_sheet(outcomes: Sequence[Outcome]) -> np.ndarray | None:
 def _render(run: Run, frame: int) -> np.ndarray:
     """Return a picture of one frame; cloth and body are one mesh, so that the camera takes in both."""
     positions, faces = run.positions[frame], run.faces
-    colors = np.broadcast_to(GARMENT_COLOR, positions.shape)
+    colors = np.broadcast_to(GARMENT_COLORS[0], positions.shape)
     if run.scene.body is not None:
         obstacle = np.asarray(run.scene.body.positions[frame], np.float64)
         faces = np.concatenate([faces, np.asarray(run.scene.body.surface.faces) + len(positions)])
         positions = np.concatenate([positions, obstacle])
-        colors = np.concatenate([colors, np.broadcast_to(BODY_COLOR, obstacle.shape)])
+        colors = np.concatenate([colors, np.broadcast_to(SKIN_COLOR, obstacle.shape)])
     return render_frame(
         None, None, positions, faces, camera=_CAMERA, size=_PICTURE_SIZE, vertex_colors=colors
     )

@@ -291,8 +291,38 @@ def test_usd_materials_are_bound(tmp_path, run):
         shader, _, _ = material.ComputeSurfaceSource()
         assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
         colors.append(tuple(shader.GetInput("diffuseColor").Get()))
-    np.testing.assert_allclose(colors[0], [0.0331, 0.1474, 0.3419], atol=1e-3)  # sRGB .20 .42 .62, linear
+    np.testing.assert_allclose(colors[0], [0.0732, 0.2140, 0.4480], atol=1e-3)  # sRGB .30 .50 .70, linear
     assert colors[0] != colors[1]
+
+
+def test_garments_of_an_outfit_are_meshes_of_their_own_colours(tmp_path, run):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    both = np.concatenate([run.positions, run.positions + np.float32(1)], axis=1)
+    faces = np.concatenate([run.faces, run.faces + VERTICES])
+    worn = replace(run, positions=both, velocities=np.zeros_like(both), faces=faces, body=None)
+    stored = GarmentFile(
+        both[0],
+        faces,
+        np.ones((2 * VERTICES, 1)),
+        np.zeros((2 * VERTICES, 1), int),
+        np.zeros(2 * VERTICES, bool),
+        metadata={"outfit": {"pants": VERTICES, "tshirt": VERTICES}},
+    )
+    document = gltf.GLTF2().load(str(export_trajectory(worn, tmp_path / "a.glb", garment=stored)))
+    assert [node.mesh for node in document.nodes if node.name in ("pants", "tshirt")] == [0, 1]
+    colors = [material.pbrMetallicRoughness.baseColorFactor for material in document.materials]
+    assert colors[0] != colors[1]
+    stage = usd.Stage.Open(str(export_trajectory(worn, tmp_path / "a.usda", garment=stored)))
+    for name, moved in (("pants", 0), ("tshirt", 1)):
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}"))
+        np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get(2)), run.positions[2] + moved, atol=1e-6)
+    assert len(read_points(export_trajectory(worn, tmp_path / "a.npz", garment=stored))) == FRAMES
+
+
+def read_points(path):
+    return np.load(path)["positions"]
 
 
 def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):

@@ -1,0 +1,184 @@
+"""Neutral shorts and a top that a body wears in pictures, where no simulated cloth covers it (host).
+
+They are the body's own surface in another colour, cut along smooth hems: skin-tight, and no part of any scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Float, Int
+
+from eslr_jax.body.joints import find_named_parts
+
+SKIN, TOP, SHORTS = 0, 1, 2
+_LEG = 0.42  # share of the thigh that the shorts cover
+_STRAP = 0.8  # of the distance from the middle to a shoulder joint: where the top ends
+_ARMHOLE = 0.75  # of that distance beneath the shoulder joints: how low the armholes reach
+_NECKLINE = 0.45  # of that distance: radius of the neckline
+_LIMB = 0.1  # [m] over which the weight of a limb goes from none to one
+_SMOOTHINGS = 6  # of the border of a limb, over the mesh
+
+
+class Skinned(Protocol):
+    """What joints move: a `Body`, or the skin of a run."""
+
+    @property
+    def skin_weights(self) -> Any:
+        """Weights, [vertices, influences]."""
+        ...
+
+    @property
+    def skin_indices(self) -> Any:
+        """Their joints, [vertices, influences]."""
+        ...
+
+    @property
+    def joint_rest_positions(self) -> Any:
+        """Where joints are at rest [m], [joints, 3]."""
+        ...
+
+    @property
+    def parents(self) -> Sequence[int]:
+        """The joint above each, or -1."""
+        ...
+
+    @property
+    def joint_names(self) -> Sequence[str]:
+        """Names of the joints."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A part of a body's surface that has one colour."""
+
+    kind: int  # SKIN, TOP or SHORTS
+    faces: Int[np.ndarray, "faces 3"]  # of its own vertices
+    weights: sparse.csr_array  # [own_vertices, body_vertices]: its vertices from those of the body
+
+    def place(self, positions: Float[np.ndarray, "body_vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+        """Return where its vertices are [m], given those of the body [m]."""
+        return np.asarray(self.weights @ np.asarray(positions, np.float32), np.float32)
+
+
+def body_layers(
+    rest_positions: Float[np.ndarray, "body_vertices 3"],
+    faces: Int[np.ndarray, "body_faces 3"],
+    rig: Skinned | None,
+) -> list[Layer]:
+    """Return skin, top and shorts of a body; all of it is skin if its joints have no common names.
+
+    Args:
+        rest_positions: The body at rest, upright [m].
+        faces: Its triangles.
+        rig: What moves it; None shows skin only.
+    """
+    positions, faces = np.asarray(rest_positions, np.float64), np.asarray(faces)
+    weights = sparse.eye_array(len(positions), format="csr")
+    fields = None if rig is None else _fields(positions, faces, rig)
+    if fields is None:
+        return [Layer(SKIN, faces, weights.astype(np.float32))]
+    cloth, waist = fields
+    faces, weights = _cut(faces, weights, cloth)
+    faces, weights = _cut(faces, weights, weights @ waist)
+    is_cloth = (weights @ cloth)[faces].mean(axis=1) > 0
+    is_top = (weights @ waist)[faces].mean(axis=1) > 0
+    kinds = np.where(is_cloth, np.where(is_top, TOP, SHORTS), SKIN)
+    return [
+        _layer(kind, faces[kinds == kind], weights) for kind in (SKIN, TOP, SHORTS) if (kinds == kind).any()
+    ]
+
+
+def _layer(kind: int, faces: np.ndarray, weights: sparse.csr_array) -> Layer:
+    """Return a layer with the vertices of its faces alone."""
+    vertices, own = np.unique(faces, return_inverse=True)
+    return Layer(kind, own.reshape(-1, 3), weights[vertices].astype(np.float32))
+
+
+def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return how far every vertex is inside the clothing, and over the waist [m]; None for unknown joints."""
+    parts = find_named_parts(rig.joint_names)
+    joints = np.asarray(rig.joint_rest_positions, np.float64)
+
+    def first(side: str, chain: str) -> int | None:
+        return next(iter(parts.get((side, chain), ())), None)
+
+    sides = [
+        [first(side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg")]
+        for side in ("left", "right")
+    ]
+    neck, spine = first("", "neck"), first("", "spine")
+    if neck is None or spine is None or any(joint is None for side in sides for joint in side):
+        return None
+    arms, legs, knees = (joints[[side[k] for side in sides]] for k in range(3))
+    middle, half = arms.mean(axis=0), 0.5 * np.linalg.norm(arms[0] - arms[1])
+    is_limb = [_below(rig.parents, joint) for joint in (sides[0][0], sides[1][0], neck)]
+    limbs = _smooth(_share(rig, np.any(is_limb, axis=0)), faces)
+    inside = [
+        _LIMB * (0.5 - limbs),
+        np.maximum(
+            _STRAP * half - abs(positions[:, 0] - middle[0]), middle[1] - _ARMHOLE * half - positions[:, 1]
+        ),
+        np.linalg.norm(positions - joints[neck], axis=1) - _NECKLINE * half,
+    ]
+    for hip, knee in zip(legs, knees, strict=True):
+        length = np.linalg.norm(knee - hip)
+        along = (positions - hip) @ (knee - hip) / length
+        is_its_side = (positions - legs.mean(axis=0)) @ (hip - legs.mean(axis=0)) > 0
+        inside.append(np.where(is_its_side, _LEG * length - along, _LIMB))
+    return np.min(inside, axis=0), positions[:, 1] - joints[spine][1]
+
+
+def _below(parents: Sequence[int], joint: int) -> np.ndarray:
+    """Return which joints are a joint or hang on it."""
+    result = np.zeros(len(parents), bool)
+    result[joint] = True
+    for _ in parents:
+        result |= np.array([parent >= 0 and result[parent] for parent in parents])
+    return result
+
+
+def _share(rig: Skinned, is_chosen: np.ndarray) -> np.ndarray:
+    """Return the share of every vertex that chosen joints move."""
+    return np.sum(np.asarray(rig.skin_weights, np.float64) * is_chosen[np.asarray(rig.skin_indices)], axis=1)
+
+
+def _smooth(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return values averaged with their neighbours, a few times."""
+    rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
+    near = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(len(values), len(values)))
+    counts = np.maximum(near.sum(axis=1), 1.0)
+    for _ in range(_SMOOTHINGS):
+        values = 0.5 * values + 0.5 * (near @ values) / counts
+    return values
+
+
+def _cut(
+    faces: np.ndarray, weights: sparse.csr_array, field: np.ndarray
+) -> tuple[np.ndarray, sparse.csr_array]:
+    """Cut faces where a field, linear on each of them, is zero; return faces and vertices that follow the old."""
+    is_in = field > 0
+    count = is_in[faces].sum(axis=1)
+    is_whole = (count == 0) | (count == 3)
+    mixed = faces[~is_whole]
+    lonely = np.where((count[~is_whole] == 1)[:, None], is_in[mixed], ~is_in[mixed])  # alone on its side
+    turn = (lonely.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    apex, left, right = np.take_along_axis(mixed, turn, axis=1).T
+    edges = np.concatenate([np.stack([apex, left], 1), np.stack([apex, right], 1)])
+    unique, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    start, end = field[unique].T
+    share = start / (start - end)
+    new = weights[unique[:, 0]].multiply((1 - share)[:, None]) + weights[unique[:, 1]].multiply(
+        share[:, None]
+    )
+    to_left, to_right = len(field) + number.ravel().reshape(2, -1)
+    pieces = [(apex, to_left, to_right), (to_left, left, right), (to_left, right, to_right)]
+    return (
+        np.concatenate([faces[is_whole], *(np.stack(piece, axis=1) for piece in pieces)]),
+        sparse.csr_array(sparse.vstack([weights, new])),
+    )

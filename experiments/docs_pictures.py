@@ -1,0 +1,306 @@
+"""The pictures of the guides.
+
+    python experiments/docs_pictures.py [--smoke] [--only NAME ...] [--out DIR]
+
+Writes PNG files of less than 150 kB. Figures of other experiments are copied from experiments/results. The
+picture of `eslr play` needs Chromium and the package playwright; without them it is left as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from PIL import Image
+
+from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.fields import run_field
+from eslr_jax.fabric import garment_material
+from eslr_jax.fit.fit import fit_garment
+from eslr_jax.fit.options import FitOptions
+from eslr_jax.fit.outfit import wear_together
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.garment import read_garment_source
+from eslr_jax.io.mesh_sequence import obj_text
+from eslr_jax.io.palette import outfit_colors
+from eslr_jax.io.run import ClothTrack, read_run, write_run
+from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.simulate import simulate
+
+RESULTS = Path(__file__).parent / "results"
+COPIED = {
+    "speed": RESULTS / "speed_vs_error.png",
+    "train": RESULTS / "eslr_small_curves.png",
+    "gradients": RESULTS / "inverse" / "fabric.png",
+}
+MOST_BYTES = 150_000
+_SIZE = (230, 330)  # of one figure, width and height [pixels]
+_CAMERA = 25.0  # [degrees] from the front towards the side
+_CONFIG = SimConfig(iterations=300, tolerance=1e-2)
+_FRAMES, _SMOKE_FRAMES = 40, 3
+_CLIP = "cmu_069_23"
+_WIND = 4.0  # [N/m2], of the guide's own energy
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """A simulated scene."""
+
+    stored: Any  # GarmentFile
+    body: Any
+    poses: Any
+    scene: Any
+    trajectory: Any
+
+
+def main() -> None:
+    """Make what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="two pictures of few frames")
+    parser.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    frames = _SMOKE_FRAMES if chosen.smoke else _FRAMES
+    names = chosen.only or (["install", "first-cloth"] if chosen.smoke else [*COPIED, *PICTURES])
+    for name in names:
+        if name in COPIED:
+            picture = np.asarray(Image.open(COPIED[name]).convert("RGB"))
+        else:
+            picture = PICTURES[name](frames)
+        if picture is not None:
+            print(write_small(chosen.out / f"{name}.png", picture), flush=True)
+
+
+def write_small(path: Path, picture: np.ndarray) -> str:
+    """Write a picture as PNG with a palette of 256 colours, scaled down until it is small; return what it is."""
+    image = Image.fromarray(picture)
+    while True:
+        with atomic_write(path) as temporary:
+            image.quantize(256, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+        if path.stat().st_size < MOST_BYTES:
+            return f"{path}: {image.width} x {image.height}, {path.stat().st_size} bytes"
+        image = image.resize((round(0.9 * image.width), round(0.9 * image.height)), Image.Resampling.LANCZOS)
+
+
+def shoot(
+    garments: tuple[str, ...],
+    frames: int,
+    *,
+    fabric: tuple[str, ...] = (),
+    vertices: Literal["1k", "4k"] = "1k",
+    **options: Any,
+) -> Shot:
+    """Simulate garments on a walk, as `eslr simulate` does."""
+    body = load_body()
+    poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
+    stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
+    cloth = prepare_stored(stored, name="+".join(garments))
+    modelled = SceneOptions(has_skin=True, integrator="bdf2", **options)
+    scene = prepare_scene(cloth, poses, material=garment_material(fabric, cloth, stored), options=modelled)
+    return Shot(stored, body, poses, scene, simulate(None, scene, config=_CONFIG).trajectory)
+
+
+def figures(
+    shot: Shot, indices: list[int], colors: np.ndarray | None = None, **options: Any
+) -> list[np.ndarray]:
+    """Render frames of a scene."""
+    given = outfit_colors(list(shot.stored.outfit.values())) if colors is None else colors
+    return list(
+        render_frames(
+            np.asarray(shot.poses.positions),
+            np.asarray(shot.poses.faces),
+            np.asarray(shot.trajectory.positions),
+            np.asarray(shot.scene.garment.faces),
+            frame_indices=indices,
+            rest_positions=np.asarray(shot.poses.rest_positions),
+            rig=shot.body,
+            vertex_colors=given,
+            **{"camera": _CAMERA, "size": _SIZE} | options,
+        )
+    )
+
+
+def worn(stored: Any, body: Any, positions: np.ndarray | None = None, **options: Any) -> np.ndarray:
+    """Render a garment on a body at rest."""
+    rest = np.asarray(body.rest_positions)
+    cloth = stored.rest_positions if positions is None else positions
+    look = {"camera": _CAMERA, "size": _SIZE} | options
+    return next(
+        render_frames(
+            rest[None],
+            np.asarray(body.faces),
+            cloth[None],
+            stored.faces,
+            rest_positions=rest,
+            rig=body,
+            **look,
+        )
+    )
+
+
+def install(_: int) -> np.ndarray:
+    """The bundled garments on the bundled body."""
+    body = load_body()
+    names = ("tshirt", "longsleeve", "dress", "pants", "shorts")
+    return side_by_side([worn(load_garment_file(name), body, size=(190, 330)) for name in names], names)
+
+
+def first_cloth(frames: int) -> np.ndarray:
+    """A T-shirt on a walk."""
+    indices = np.linspace(0, frames - 1, 4).round().astype(int).tolist()
+    shot = shoot(("tshirt",), frames)
+    return side_by_side(figures(shot, indices), [f"{k / 30:.2f} s" for k in indices])
+
+
+def own_garment(_: int) -> np.ndarray:
+    """A shirt in centimetres, lying on its back, before and after the fit."""
+    body, tshirt = load_body(), load_garment_file("tshirt")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "shirt.obj"
+        scanned = 100 * np.stack([tshirt.rest_positions[:, k] for k in (0, 2, 1)], axis=1) * [1, -1, 1]
+        file.write_text(obj_text("shirt", scanned, tshirt.faces))
+        fitted = fit_garment(read_garment_source(file), body, FitOptions())
+    before = scanned / 100 + [0.0, 0.0, 0.7]
+    pictures = [worn(fitted, body, before), worn(fitted, body)]
+    return side_by_side(pictures, ("the file, as 1 unit = 1 cm", "fitted"))
+
+
+def own_body(_: int) -> np.ndarray:
+    """A dress on bodies of four shapes."""
+    shapes = {"average": (), "tall": (2.0,), "short": (-2.0,), "heavy": (0.0, 0.0, 0.0, 2.5)}
+    bodies = [load_body(betas=betas) for betas in shapes.values()]
+    heights = np.array([np.ptp(np.asarray(body.rest_positions)[:, 1]) for body in bodies])
+    pictures = [
+        worn(load_garment_file("dress", body=body), body, zoom=float(size))
+        for body, size in zip(bodies, heights / heights.max(), strict=True)
+    ]
+    return side_by_side(pictures, list(shapes))
+
+
+def outfits(frames: int) -> np.ndarray:
+    """Trousers and a T-shirt over them."""
+    shot = shoot(("pants", "tshirt"), frames, fabric=("pants:denim", "tshirt:jersey"))
+    indices = [0, frames // 2, frames - 1]
+    return side_by_side(figures(shot, indices), [f"{k / 30:.2f} s" for k in indices])
+
+
+def fabrics(frames: int) -> np.ndarray:
+    """One dress of four fabrics."""
+    names = ("silk", "cotton", "sweatshirt", "denim")
+    pictures = [figures(shoot(("dress",), frames, fabric=(name,)), [frames - 1])[0] for name in names]
+    return side_by_side(pictures, names)
+
+
+def extend(frames: int) -> np.ndarray:
+    """A T-shirt without and with the guide's own energy."""
+    blown = shoot(("tshirt",), frames, energies=(Partial(_push, _WIND),))
+    still = shoot(("tshirt",), frames, energies=(Partial(_push, 0.0),))
+    pictures = [figures(shot, [frames - 1], camera=0.0)[0] for shot in (still, blown)]
+    return side_by_side(pictures, ("0 N/m2", f"{_WIND:g} N/m2"))
+
+
+def _push(pressure: Any, position: Any, problem: Any) -> Any:
+    """Return the energy [J] of a steady wind along x."""
+    moved = position[:, 0] - problem.position[:, 0]
+    return -pressure * jnp.sum(problem.garment.vertex_areas * moved)
+
+
+def report(frames: int) -> np.ndarray:
+    """Stretch of a long-sleeved shirt, and its distance from the body."""
+    shot = shoot(("longsleeve",), frames)
+    with tempfile.TemporaryDirectory() as folder:
+        track = ClothTrack(
+            shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads
+        )
+        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
+        run = read_run(Path(folder))
+        pictures = []
+        for name in ("stretch", "distance"):
+            field = run_field(run, name)
+            colors = color_scale(field.values, field.low, field.high)
+            picture = figures(shot, [frames - 1], colors)[0]
+            label = f"{name} [{field.unit}]" if field.unit else name
+            pictures.append(add_color_bar(picture, field.low, field.high, label))
+    return np.concatenate(pictures, axis=1)
+
+
+def limits(_: int) -> np.ndarray:
+    """A T-shirt in all bundled resolutions: a face can't fold."""
+    sizes: tuple[Literal["1k", "4k", "10k"], ...] = ("1k", "4k", "10k")
+    garments = [load_garment_file("tshirt", vertices=size) for size in sizes]
+    edges = [
+        stored.rest_positions[stored.faces[:, 0]] - stored.rest_positions[stored.faces[:, 1]]
+        for stored in garments
+    ]
+    labels = [
+        f"{size}: edges of {100 * np.median(np.linalg.norm(edge, axis=1)):.1f} cm"
+        for size, edge in zip(sizes, edges, strict=True)
+    ]
+    return side_by_side([worn(stored, load_body(), zoom=1.6) for stored in garments], labels)
+
+
+def play(frames: int) -> np.ndarray | None:
+    """The page of `eslr play`."""
+    try:
+        from playwright import sync_api
+    except ImportError:
+        return None
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        return None
+    from eslr_jax.viewer.live import open_live, run_live
+    from eslr_jax.viewer.live_controls import Choice
+
+    shown, end = threading.Semaphore(0), threading.Event()
+    live = open_live(Choice(("tshirt",), "1k", "cmu_016_32"), out=Path("live"), port=8871)
+    loop = {"until": end, "on_frame": shown.release}
+    thread = threading.Thread(target=run_live, args=(live,), kwargs=loop)
+    thread.start()
+    with sync_api.sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
+        flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=chromium, args=flags)
+        page = browser.new_page(viewport={"width": 1000, "height": 680})
+        page.goto(live.url)
+        page.get_by_text("ms a frame").wait_for(timeout=300_000)
+        for _ in range(frames):
+            shown.acquire(timeout=60)
+        for close in page.locator("button.mantine-Notification-closeButton").all():
+            close.click()
+        page.screenshot(path=Path(folder) / "page.png", timeout=180_000)
+        picture = np.asarray(Image.open(Path(folder) / "page.png").convert("RGB"))
+        browser.close()
+    end.set()
+    thread.join()
+    live.server.stop()
+    return picture
+
+
+PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
+    "install": install,
+    "first-cloth": first_cloth,
+    "own-garment": own_garment,
+    "own-body": own_body,
+    "outfits": outfits,
+    "fabrics": fabrics,
+    "extend": extend,
+    "report": report,
+    "limits": limits,
+    "play": play,
+}
+
+
+if __name__ == "__main__":
+    main()
