@@ -153,7 +153,7 @@ def test_texture_coordinates_turn_the_warp(two_fabrics):
     stored, garment = two_fabrics
     corners = stored.rest_positions[stored.faces]
     stored = dataclasses.replace(stored, corner_uvs=corners[:, :, [1, 0]])  # v along x
-    threads = garment_material(["wool"], garment, stored).threads
+    threads = garment_material(["suiting-woven"], garment, stored).threads
     assert threads is not None
     pulled = np.asarray(garment.rest_positions) * [1.02, 1.0, 1.0]
     strains = green_strains(
@@ -180,6 +180,6 @@ def test_fabric_by_flexural_rigidity(two_fabrics):
 
 def test_a_weave_of_another_mesh_is_refused(two_fabrics):
     stored, garment = two_fabrics
-    material = garment_material(["wool"], garment, stored)
+    material = garment_material(["suiting-woven"], garment, stored)
     with pytest.raises(ConfigError, match="plate is of"):
         validate_material(material, prepare_stored(stored, pad=True))

@@ -117,15 +117,8 @@ WOVEN: dict[str, Woven] = {
     "denim-woven": _woven("denim", (205.35, 10.234, 1013.9, 53.387), (64.196e-6, 96.952e-6)),
     "crepe-woven": _woven("crepe", (2002.1, 0.3456, 2027.5, 19.189), (51.714e-6, 31.283e-6)),
     "suiting-woven": _woven("suiting", (2016.6, 9.1705, 2035.0, 104.76), (125.41e-6, 125.41e-6)),
-    "wool": Woven(
-        0.168,
-        Weave((1250.0, 1020.0, 0.0, 26.17), (5.56e-6, 5.02e-6)),
-        "plain weave, 100 % wool",
-        "FAST of a laboratory report, majortests.com/essay/Fabric-Assurance-by-Simple-TestingF-A-S-P3S9UTUQSS: "
-        "bending, shear and weight as given; stretch from E5 and E20, 0.67 to 1.87 % and 0.40 to 1.87 %",
-    ),
 }
-"""Fabrics along their threads, at small strain. Coupling was not measured of the last one."""
+"""Fabrics along their threads, at small strain."""
 
 
 def isotropic_nearest(weave: Weave, base: Material) -> Material:

@@ -19,7 +19,7 @@ from typing import Any
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
 PARTS = ("answers", "drape", "walk")
-_DRAPED = ("wool", "satin-woven", "jersey-woven", "suiting-woven", "denim-woven", "brocade-woven")
+_DRAPED = ("satin-woven", "jersey-woven", "suiting-woven", "denim-woven", "brocade-woven", "crepe-woven")
 
 
 def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
