@@ -129,6 +129,7 @@ def changed(scene, change):
     fabric = {
         field.name: getattr(material, field.name) * (1 + change[field.name])
         for field in dataclasses.fields(material)
+        if field.name in change
     }
     factors = {
         name: getattr(constants, name) * (1 + change[name]) for name in vars(constants) if name in change

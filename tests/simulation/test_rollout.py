@@ -20,8 +20,9 @@ from eslr_jax.simulation.simulate import raise_for_status
 SOLVER = SimConfig(iterations=15)
 SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
 NETWORK = SimConfig(model=SMALL, iterations=0)
-# [m] Two programs round differently, and contact amplifies that in three frames; in float64 they differ by 5e-14.
-ROUNDING = 1e-4
+# [m] Two programs round differently, and 15 iterations on contact amplify that to 2e-4 in three frames; in
+# float64 they differ by 5e-14.
+ROUNDING = 4e-4
 FABRICS = [COTTON, COTTON.replace(density=np.float32(0.4)), COTTON.replace(lame_mu=np.float32(6e4))]
 
 
