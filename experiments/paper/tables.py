@@ -133,9 +133,7 @@ def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterato
         known: Result of before, whose rows are kept if it has the same setting.
     """
     shared = json.loads(json.dumps(setting._asdict()))
-    if any(known.get(name) != value for name, value in shared.items()):
-        known = {}
-    parts = {name: dict(known.get(name, {})) for name in ("mean", "seeds", "garments")}
+    parts = rows_of_setting(known, setting)
     references = find_references(setting)
     for label, names in rows.items():
         if label in parts["mean"]:
@@ -156,6 +154,19 @@ def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterato
             row = parts["mean"][with_control]
             row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
         yield {**shared, **parts}
+
+
+def rows_of_setting(known: dict[str, Any], setting: Setting) -> dict[str, dict[str, Any]]:
+    """Return the parts of a table that was written before, row by row; empty ones if its setting was another."""
+    parts = {name: dict(known.get(name, {})) for name in ("mean", "seeds", "garments")}
+    is_alike = [known.get(name) for name in ("clips", "frames", "vertices")] == [
+        list(setting.clips),
+        setting.frames,
+        setting.vertices,
+    ]
+    if is_alike and all(set(row) == set(setting.garments) for row in parts["garments"].values()):
+        return parts
+    return {name: {} for name in parts}
 
 
 def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
