@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,9 +21,6 @@ from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
 
 TOLERANCE = 1e-2  # relative gap at which a frame ends
 MOST_ITERATIONS = 100
-# A step at 1k compiles in 24 s of one core's time instead of 40, and takes up to a sixth more. Other releases of
-# XLA may not know the option, and refuse it.
-QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False} if jax.__version__.startswith("0.10.") else None
 _HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
 
 
@@ -120,7 +116,7 @@ def advance(stage: Stage, state: ClothState, frames: tuple[int, int], iterations
     return _step(stage.constant, state, frame, jnp.int32(iterations))
 
 
-@partial(jax.jit, compiler_options=QUICK_COMPILATION)
+@jax.jit
 def _step(scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""]) -> Step:
     stepper = make_stepper(None, SimConfig(iterations=MOST_ITERATIONS, tolerance=TOLERANCE), iterations)
     return Step(*stepper(frame_problem(scene, state, frame), state))
