@@ -14,6 +14,7 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from eslr_jax.body.joints import find_named_parts
+from eslr_jax.geometry.skinning import smooth
 
 SKIN, TOP, SHORTS = 0, 1, 2
 _LEG = 0.42  # share of the thigh that the shorts cover
@@ -118,7 +119,7 @@ def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.
     arms, legs, knees = (joints[[side[k] for side in sides]] for k in range(3))
     middle, half = arms.mean(axis=0), 0.5 * np.linalg.norm(arms[0] - arms[1])
     is_limb = [_below(rig.parents, joint) for joint in (sides[0][0], sides[1][0], neck)]
-    limbs = _smooth(_share(rig, np.any(is_limb, axis=0)), faces)
+    limbs = smooth(_share(rig, np.any(is_limb, axis=0))[:, None], faces, _SMOOTHINGS)[:, 0]
     inside = [
         _LIMB * (0.5 - limbs),
         np.maximum(
@@ -146,16 +147,6 @@ def _below(parents: Sequence[int], joint: int) -> np.ndarray:
 def _share(rig: Skinned, is_chosen: np.ndarray) -> np.ndarray:
     """Return the share of every vertex that chosen joints move."""
     return np.sum(np.asarray(rig.skin_weights, np.float64) * is_chosen[np.asarray(rig.skin_indices)], axis=1)
-
-
-def _smooth(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return values averaged with their neighbours, a few times."""
-    rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
-    near = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(len(values), len(values)))
-    counts = np.maximum(near.sum(axis=1), 1.0)
-    for _ in range(_SMOOTHINGS):
-        values = 0.5 * values + 0.5 * (near @ values) / counts
-    return values
 
 
 def _cut(

@@ -154,7 +154,7 @@ def vertex_normals(
     """Return the unit normal of every vertex, weighted by face areas; zero where a vertex has no face."""
     crosses = np.repeat(face_cross_products(positions, faces), 3, axis=0)
     sums = [np.bincount(faces.ravel(), crosses[:, axis], minlength=len(positions)) for axis in range(3)]
-    return _normalize(np.stack(sums, axis=1))
+    return normalize(np.stack(sums, axis=1))
 
 
 def vertex_areas(
@@ -198,9 +198,9 @@ def hinge_angles(
     Source: HOOD, `bending_energy.py`.
     """
     start, end, left, right = (positions[hinges[:, k]] for k in range(4))
-    edge = _normalize(end - start)
-    normal_left = _normalize(np.cross(end - start, left - start))
-    normal_right = _normalize(np.cross(start - end, right - end))
+    edge = normalize(end - start)
+    normal_left = normalize(np.cross(end - start, left - start))
+    normal_right = normalize(np.cross(start - end, right - end))
     sine = np.sum(edge * np.cross(normal_left, normal_right), axis=1)
     return np.arctan2(sine, np.sum(normal_left * normal_right, axis=1))
 
@@ -241,7 +241,7 @@ def is_on_boundary(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> Bool
     return result
 
 
-def _normalize(vectors: np.ndarray) -> np.ndarray:
+def normalize(vectors: np.ndarray) -> np.ndarray:
     """Return unit vectors; a zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

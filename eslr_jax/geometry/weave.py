@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry.plate import rest_corners
+from eslr_jax.geometry.topology import normalize
 from eslr_jax.types import Garment
 
 _UP = (0.0, 1.0, 0.0)
@@ -49,7 +50,7 @@ def warp_directions(
     columns = np.linalg.solve(
         np.where(is_mapped[:, None, None], in_texture, np.eye(2)), np.array([[0.0], [1.0]])
     )
-    along = _unit((in_plane @ columns)[:, :, 0])
+    along = normalize((in_plane @ columns)[:, :, 0])
     return np.where(is_mapped[:, None], along, warp)
 
 
@@ -61,8 +62,8 @@ def _laid(garment: Garment, corners: np.ndarray, direction: Sequence[float]) -> 
     wanted = wanted / np.linalg.norm(wanted)
     faces = np.asarray(garment.faces)[: len(corners)]
     points = np.asarray(garment.rest_positions, np.float64)[faces]
-    first = _unit(points[:, 0] - points[:, 2])
-    normal = _unit(np.cross(points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]))
+    first = normalize(points[:, 0] - points[:, 2])
+    normal = normalize(np.cross(points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]))
     second = np.cross(normal, first)
     seen = wanted - np.sum(normal * wanted, axis=1, keepdims=True) * normal
     length = np.linalg.norm(seen, axis=1)
@@ -81,10 +82,4 @@ def _laid(garment: Garment, corners: np.ndarray, direction: Sequence[float]) -> 
         seen = np.where(found[:, None], mean, seen)
         length = np.linalg.norm(seen, axis=1)
     seen = np.where((length < _LEAST)[:, None], first, seen)
-    return _unit(np.stack([np.sum(seen * first, axis=1), np.sum(seen * second, axis=1)], axis=1))
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Return unit vectors; a zero vector stays zero."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)
+    return normalize(np.stack([np.sum(seen * first, axis=1), np.sum(seen * second, axis=1)], axis=1))

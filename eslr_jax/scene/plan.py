@@ -98,7 +98,7 @@ def plan_scene(
         surface = _surface_near(reachable_vertices(garment, skinned, poses, radii), poses)
     has_ground = options.ground == "on"
     if needs_ground:
-        has_ground = _could_fall(garment, poses) or _reaches_ground(garment, skinned, poses, radii)
+        has_ground = _could_fall(garment, poses, piece) or _reaches_ground(garment, skinned, poses, radii)
     return ScenePlan(
         surface=surface,
         constants=constants or PhysicsConstants(),
@@ -206,13 +206,13 @@ def ground_height(poses: BodyMotion) -> Float[Array, ""]:
     return jnp.min(poses.positions[..., 1])
 
 
-def _could_fall(garment: Garment, poses: BodyMotion) -> bool:
+def _could_fall(garment: Garment, poses: BodyMotion, piece: np.ndarray) -> bool:
     """Tell whether a part of a garment has no pin, and no cloth above the shoulders that it could hang from."""
     is_real = np.asarray(garment.vertex_mask)
     height = np.asarray(garment.rest_positions)[is_real, 1]
     body = np.asarray(poses.rest_positions)[:, 1]
     shoulders = body.min() + SHOULDERS * np.ptp(body)
-    piece = piece_of_vertices(garment)[is_real]
+    piece = piece[is_real]
     is_held = np.asarray(garment.is_pinned)[is_real] | (height > shoulders)
     return bool(np.setdiff1d(piece, piece[is_held]).size)
 
