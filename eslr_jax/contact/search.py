@@ -330,8 +330,7 @@ def nearest_face_around(
 
     # In a loop, so that all candidates are not in memory at once.
     best = jax.lax.fori_loop(0, count, try_face, jnp.full(points[0].shape, _INFINITY, jnp.int32))
-    slot = jnp.minimum(best & _index_mask(count), count - 1)
-    return jnp.take_along_axis(faces, slot[None], axis=0)[0]
+    return _chosen(faces, best)
 
 
 def nearest_candidates(
@@ -350,5 +349,11 @@ def nearest_candidates(
         offset = sub3(points, take3(places, jnp.minimum(candidate, nobody - 1)))
         key = _with_index(dot3(offset, offset), jnp.int32(slot), count)
         best = jnp.minimum(best, jnp.where(candidate < nobody, key, _INFINITY))
+    return _chosen(candidates, best)
+
+
+def _chosen(candidates: Int[Array, "candidates ..."], best: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """Return the candidates whose slots stand in the lowest bits; the first where none was found."""
+    count = candidates.shape[0]
     slot = jnp.minimum(best & _index_mask(count), count - 1)
     return jnp.take_along_axis(candidates, slot[None], axis=0)[0]
