@@ -26,7 +26,8 @@ def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> F
 
 def safe_normalize(x: Float[Array, ...], axis: int = -1) -> Float[Array, ...]:
     """Return unit vectors; a zero vector stays zero and has a zero gradient."""
-    squared = jnp.sum(x * x, axis=axis, keepdims=True)
+    parts = jnp.split(x, x.shape[axis], axis=axis)  # added one by one: a sum is a kernel of its own on a CPU
+    squared = sum(part * part for part in parts)
     is_zero = squared == 0
     return jnp.where(is_zero, 0.0, x * jax.lax.rsqrt(jnp.where(is_zero, 1.0, squared)))
 
@@ -50,8 +51,9 @@ def true_rows(mask: Bool[Array, " rows"], capacity: int) -> tuple[Int[Array, " c
 class TrueEntries(NamedTuple):
     """The true entries of a matrix in order, each to be found by its number."""
 
-    words: Int[Array, "rows words"]  # 32 columns each, the first in the lowest bit
-    running: Int[Array, " rows"]  # true entries up to the end of every row
+    words: Int[Array, " words"]  # 32 columns each, the first in the lowest bit, row after row
+    running: Int[Array, " words"]  # true entries up to the end of every word
+    words_per_row: int
 
     @property
     def count(self) -> Int[Array, ""]:
@@ -60,23 +62,19 @@ class TrueEntries(NamedTuple):
 
     def find(self, number: Int[Array, " entries"]) -> tuple[Int[Array, " entries"], Int[Array, " entries"]]:
         """Return row and column of the entries with these numbers; of some entry where there is none."""
-        last_row = self.running.shape[0] - 1
-        row = jnp.minimum(jnp.searchsorted(self.running, number, side="right"), last_row)
-        counts = jax.lax.population_count(self.words)
-        left = number - (self.running - jnp.sum(counts, axis=1, dtype=counts.dtype))[row]
-        column = jnp.zeros_like(row)
-        # Halve the span again and again: first in words, then in bits of the word.
-        before = (jnp.cumsum(counts, axis=1) - counts)[row]
-        word = jnp.sum(before <= left[:, None], axis=1, dtype=row.dtype) - 1
-        left = left - jnp.take_along_axis(before, word[:, None], axis=1)[:, 0]
-        bits = self.words[row, word].astype(jnp.uint32)
+        word = jnp.searchsorted(self.running, number, side="right")
+        word = jnp.minimum(word, self.running.shape[0] - 1).astype(jnp.int32)
+        bits = self.words[word].astype(jnp.uint32)
+        left = number - self.running[word] + jax.lax.population_count(bits).astype(jnp.int32)
+        bit = jnp.zeros_like(word)
+        # Halve the span again and again.
         for width in (16, 8, 4, 2, 1):
             low = jax.lax.population_count(bits & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
             is_higher = left >= low
             left = jnp.where(is_higher, left - low, left)
             bits = jnp.where(is_higher, bits >> jnp.uint32(width), bits)
-            column = column + jnp.where(is_higher, width, 0)
-        return row.astype(jnp.int32), (32 * word + column).astype(jnp.int32)
+            bit = bit + jnp.where(is_higher, width, 0)
+        return word // self.words_per_row, 32 * (word % self.words_per_row) + bit
 
 
 def true_entries(mask: Bool[Array, "rows columns"]) -> TrueEntries:
@@ -84,8 +82,13 @@ def true_entries(mask: Bool[Array, "rows columns"]) -> TrueEntries:
     padded = jnp.pad(mask, ((0, 0), (0, -mask.shape[1] % 32))).reshape(mask.shape[0], -1, 32)
     bits = jnp.left_shift(jnp.uint32(1), jnp.arange(32, dtype=jnp.uint32))
     words = jnp.sum(jnp.where(padded, bits[None, None], jnp.uint32(0)), axis=2, dtype=jnp.uint32)
-    counts = jnp.sum(jax.lax.population_count(words), axis=1, dtype=jnp.uint32).astype(jnp.int32)
-    return TrueEntries(words.astype(jnp.int32), jnp.cumsum(counts, dtype=jnp.int32))
+    return entries_of_words(words.astype(jnp.int32))
+
+
+def entries_of_words(words: Int[Array, "rows words"]) -> TrueEntries:
+    """Return the true entries of a matrix that is given by its bits, 32 columns a word."""
+    flat = words.ravel()
+    return TrueEntries(flat, jnp.cumsum(jax.lax.population_count(flat), dtype=jnp.int32), words.shape[1])
 
 
 def segment_sum(
@@ -120,7 +123,8 @@ def sub3(a: Vector3, b: Vector3) -> Vector3:
 
 def take3(a: Vector3, rows: Int[Array, ...]) -> Vector3:
     """Return the chosen rows of vectors given by components."""
-    return a[0][rows], a[1][rows], a[2][rows]
+    x, y, z = jnp.stack(a)[:, rows]
+    return x, y, z
 
 
 def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, sub3, take3, vertex_normals
+from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, vertex_normals
 from eslr_jax.types import Garment
 
 # Of a direction along a normal (cosine) at rest, below which it says nothing. A T-shirt's sleeve and trunk, which
@@ -57,14 +57,13 @@ def _sides_at_rest(
     Along the line from the face to the vertex: in front where the normals look at each other, behind where they
     look away from each other. Layers that look the same way are on the side that the line points to.
     """
-    rest = components(garment.rest_positions)
-    a, b, c = (take3(rest, corners[:, k]) for k in range(3))
-    foot = jnp.sum(weights[None] * jnp.stack([jnp.stack(corner) for corner in (a, b, c)], axis=-1), axis=-1)
-    x, y, z = safe_normalize(jnp.stack(take3(rest, vertices)) - foot, axis=0)
-    face = safe_normalize(jnp.stack(cross3(sub3(b, a), sub3(c, a))), axis=0)
-    normals = vertex_normals(garment.rest_positions, garment.faces, garment.face_incidence)
-    at_face = dot3((x, y, z), (face[0], face[1], face[2]))
-    at_vertex = dot3((x, y, z), take3(components(normals), vertices))
+    rest = garment.rest_positions
+    corner = rest[corners]  # [pairs, 3, 3]
+    line = safe_normalize(rest[vertices] - jnp.sum(weights[:, :, None] * corner, axis=1))
+    face = safe_normalize(jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    normals = vertex_normals(rest, garment.faces, garment.face_incidence)
+    at_face = jnp.sum(line * face, axis=-1)
+    at_vertex = jnp.sum(line * normals[vertices], axis=-1)
     is_stacked = at_face * at_vertex > _LEAST_COSINE**2
     clearness = jnp.where(is_stacked, at_face, at_face - at_vertex)
     return jnp.where(jnp.abs(clearness) > _LEAST_COSINE, jnp.sign(clearness), 0.0)
@@ -77,22 +76,27 @@ def _are_crossed(
     garment: Garment,
 ) -> Bool[Array, " pairs"]:
     """Return where an edge of the vertex pierces the face, or an edge of the face a face of the vertex."""
-    x = components(position)
-    face = [take3(x, corners[:, k, None]) for k in range(3)]
+    x = position.T
+    face = _corners(x[:, corners.T[:, :, None]])
     ends = garment.neighbors[vertices]  # [pairs, degree], padded with the vertex itself
     is_apart = ~jnp.any(ends[:, :, None] == corners[:, None, :], axis=2)
-    pierced = is_apart & _pierces(take3(x, vertices[:, None]), take3(x, ends), face)
+    pierced = is_apart & _pierces(tuple(x[:, vertices[:, None]]), tuple(x[:, ends]), face)
     slots = garment.face_incidence[vertices]
     around = garment.faces[slots % garment.faces.shape[0]]  # [pairs, degree, 3]
     is_real = slots < garment.faces.size
-    faces = [take3(x, around[:, :, k]) for k in range(3)]
+    faces = _corners(x[:, jnp.moveaxis(around, 2, 0)])
     crossed = jnp.any(pierced, axis=1)
     for k in range(3):
         first, second = corners[:, k, None], corners[:, (k + 1) % 3, None]
         is_apart = is_real & ~jnp.any((around == first[:, None]) | (around == second[:, None]), axis=2)
-        pierced = is_apart & _pierces(take3(x, first), take3(x, second), faces)
+        pierced = is_apart & _pierces(face[k], face[(k + 1) % 3], faces)
         crossed = crossed | jnp.any(pierced, axis=1)
     return crossed
+
+
+def _corners(places: Float[Array, "3 corners ..."]) -> list[Vector3]:
+    """Return the corners of triangles, each by components."""
+    return [tuple(places[:, k]) for k in range(places.shape[1])]  # type: ignore[misc]
 
 
 def _pierces(start: Vector3, end: Vector3, corners: list[Vector3]) -> Bool[Array, ...]:

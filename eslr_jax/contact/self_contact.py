@@ -14,15 +14,13 @@ from eslr_jax.contact.search import box_gaps
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.errors import Status
 from eslr_jax.numerics import (
-    TrueEntries,
     Vector3,
-    components,
     cross3,
     dot3,
+    entries_of_words,
     safe_norm,
     safe_normalize,
     sub3,
-    take3,
     true_entries,
 )
 from eslr_jax.types import Garment, PairCapacity
@@ -105,8 +103,9 @@ def find_self_contacts(
         radius: Radius of the search [m].
     """
     blocks = garment.vertex_blocks
-    points = _Points(position, predicted, garment.vertex_mask, garment.vertex_areas, blocks)
-    cloth = _Cloth(position, predicted, garment, has_points=True, pieces=pieces)
+    ends = _ends(position, predicted)
+    points = _Points(ends, garment.vertex_mask, garment.vertex_areas, blocks)
+    cloth = _Cloth(ends, garment, has_points=True, pieces=pieces)
     pairs = _find_pairs(points, cloth, radius, capacity)
     rows = (pairs.vertices, pairs.corners, pairs.weights)
     return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment, radius))
@@ -136,15 +135,22 @@ def find_tip_contacts(
     count = body.shape[0]
     capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count))
     area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), blocks)
-    return _find_pairs(points, _Cloth(position, predicted, garment, has_points=False), TIP_RADIUS, capacity)
+    points = _Points(_ends(body, next_body), jnp.ones(count, bool), jnp.full(count, area), blocks)
+    cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
+    return _find_pairs(points, cloth, TIP_RADIUS, capacity)
+
+
+def _ends(
+    position: Float[Array, "vertices 3"], predicted: Float[Array, "vertices 3"]
+) -> Float[Array, "ends 3 vertices"]:
+    """Return positions at t and at t + 1 by components, in one array: every gather of it is one kernel."""
+    return jnp.stack([position.T, predicted.T])
 
 
 class _Points(NamedTuple):
     """What is paired with the faces of the cloth."""
 
-    position: Float[Array, "points 3"]  # at t [m]
-    predicted: Float[Array, "points 3"]  # at t + 1 [m]
+    ends: Float[Array, "ends 3 points"]  # at t and at t + 1 [m]
     mask: Bool[Array, " points"]
     areas: Float[Array, " points"]  # of cloth [m^2]
     blocks: Int[Array, "blocks rows"]  # compact groups of points
@@ -153,8 +159,7 @@ class _Points(NamedTuple):
 class _Cloth(NamedTuple):
     """Whose faces the points are paired with."""
 
-    position: Float[Array, "vertices 3"]  # at t [m]
-    predicted: Float[Array, "vertices 3"]  # at t + 1 [m]
+    ends: Float[Array, "ends 3 vertices"]  # at t and at t + 1 [m]
     garment: Garment
     has_points: bool  # the points are the vertices of the faces
     pieces: Int[Array, " vertices"] | None = None  # only cloth of different pieces is paired
@@ -172,14 +177,14 @@ class _FaceTable(NamedTuple):
 def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
     # What is found has no derivative, where it is found has one.
-    still = _Cloth(*jax.lax.stop_gradient(cloth[:3]), *cloth[3:])
+    still = cloth._replace(ends=jax.lax.stop_gradient(cloth.ends))
     point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
     pairs = _exactly(point, face, points, cloth, radius)
     is_used = jnp.arange(capacity.pairs) < count
     is_full = count > capacity.pairs
     return pairs.replace(
-        vertices=jnp.where(is_used, point, points.position.shape[0] - 1),
-        corners=jnp.where(is_used[:, None], pairs.corners, cloth.position.shape[0] - 1),
+        vertices=jnp.where(is_used, point, points.ends.shape[2] - 1),
+        corners=jnp.where(is_used[:, None], pairs.corners, cloth.ends.shape[2] - 1),
         weights=jnp.where(is_used[:, None], pairs.weights, 1.0 / 3.0),
         side=jnp.where(is_used, pairs.side, 0.0),
         areas=jnp.where(is_used, pairs.areas, 0.0),
@@ -207,7 +212,7 @@ def _search(
         block, faces = boxes.find(number)
         words = _candidates(points.blocks[block], faces, points, table, (radius, cloth.has_points))
         words = jnp.where((number < boxes.count)[:, None], words, 0)
-        candidates = TrueEntries(words, jnp.cumsum(jnp.sum(jax.lax.population_count(words), axis=1)))
+        candidates = entries_of_words(words)
 
         def test(carry):
             first, found = carry
@@ -222,10 +227,10 @@ def _search(
         _, found = jax.lax.while_loop(lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found))
         return first + size, found
 
-    nobody = jnp.zeros(capacity.pairs + rows, jnp.int32)
+    nobody = jnp.zeros(capacity.pairs, jnp.int32)
     start = (jnp.int32(0), (nobody, nobody, jnp.int32(0)))
     _, (point, face, count) = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, start)
-    return point[: capacity.pairs], face[: capacity.pairs], count
+    return point, face, count
 
 
 def _append(
@@ -233,30 +238,31 @@ def _append(
 ) -> tuple[Array, Array, Array]:
     """Return points, faces and their number with some more behind; beyond the capacity they are counted alone."""
     *before, count = found
-    width = is_pair.shape[0]
-    entries = true_entries(jnp.pad(is_pair, (0, -width % 32)).reshape(-1, 32))
-    row, column = entries.find(jnp.arange(width, dtype=jnp.int32))
-    order = jnp.minimum(32 * row + column, width - 1)
-    start = jnp.minimum(count, capacity)
-    point, face = (
-        jax.lax.dynamic_update_slice(old, new[order], (start,)) for old, new in zip(before, rows, strict=True)
-    )
-    return point, face, count + entries.count
+    slot = jnp.where(is_pair, count + jnp.cumsum(is_pair, dtype=jnp.int32) - 1, capacity)
+    point, face = (old.at[slot].set(new, mode="drop") for old, new in zip(before, rows, strict=True))
+    return point, face, count + jnp.sum(is_pair, dtype=jnp.int32)
 
 
 def _are_close(points: _Points, cloth: _Cloth, radius: float) -> Bool[Array, "blocks face_blocks"]:
     """Return which blocks of points and of faces have boxes closer than the radius."""
     garment = cloth.garment
     is_real = (garment.rest_areas > 0)[garment.face_blocks]
-    corners = garment.faces[garment.face_blocks]  # [face_blocks, members, 3]
     is_point = points.mask[points.blocks]
-    own, others = [], []
-    for x, y in zip(components(points.position), components(cloth.position), strict=True):
-        at, values = x[points.blocks], y[corners]
-        own.append((jnp.where(is_point, at, jnp.inf).min(1), jnp.where(is_point, at, -jnp.inf).max(1)))
-        low, high = values.min(2), values.max(2)
-        others.append((jnp.where(is_real, low, jnp.inf).min(1), jnp.where(is_real, high, -jnp.inf).max(1)))
+    corners = jnp.moveaxis(garment.faces[garment.face_blocks], 2, 0)  # [3, face_blocks, members]
+    at, values = points.ends[0][:, points.blocks], cloth.ends[0][:, corners]
+    own = _range(at, at, is_point)
+    others = _range(values.min(1), values.max(1), is_real)
     return box_gaps(own, others) < radius**2
+
+
+def _range(
+    low: Float[Array, "3 blocks members"],
+    high: Float[Array, "3 blocks members"],
+    is_real: Bool[Array, "blocks members"],
+) -> list[tuple[Array, Array]]:
+    """Return the least and the greatest of the real members of every block, axis by axis."""
+    least, most = jnp.where(is_real, low, jnp.inf).min(2), jnp.where(is_real, high, -jnp.inf).max(2)
+    return list(zip(least, most, strict=True))
 
 
 def _face_table(cloth: _Cloth) -> _FaceTable:
@@ -266,12 +272,9 @@ def _face_table(cloth: _Cloth) -> _FaceTable:
     def plane(normal: Array, through: Array) -> Array:
         return jnp.concatenate([normal, jnp.sum(normal * through, axis=0, keepdims=True)])
 
-    here, ahead = (
-        [jnp.stack(take3(components(x), garment.faces[:, k])) for k in range(3)]
-        for x in (cloth.position, cloth.predicted)
-    )
+    here, ahead = jnp.moveaxis(cloth.ends[:, :, garment.faces.T], 2, 1)  # by corners and components
 
-    def upright(corners: list[Array]) -> Array:
+    def upright(corners: Array) -> Array:
         return safe_normalize(jnp.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0)
 
     normal = upright(here)
@@ -306,7 +309,7 @@ def _candidates(
         scope: Radius of the search [m], and whether the points are vertices of the faces.
     """
     radius, has_points = scope
-    at, ahead = take3(components(points.position), ids), take3(components(points.predicted), ids)
+    at, ahead = (tuple(end) for end in points.ends[:, :, ids])
     is_point = points.mask[ids]
 
     def add_member(k: Array, words: Int[Array, "pairs rows"]) -> Int[Array, "pairs rows"]:
@@ -339,13 +342,12 @@ def _exactly(
     """Return candidates with the place on the face and the side; the side is zero where they are no pair."""
     garment = cloth.garment
     corner = garment.faces[face]
-    here = take3(components(points.position), point)
-    a, b, c = (take3(components(cloth.position), corner[:, k]) for k in range(3))
-    squared, u, v = point_triangle(here, a, b, c)
+    here, ahead = (tuple(end) for end in points.ends[:, :, point])
+    a_b_c, moved = ([tuple(place) for place in end] for end in jnp.moveaxis(cloth.ends[:, :, corner.T], 2, 1))
+    squared, u, v = point_triangle(here, *a_b_c)
     weights = (1.0 - u - v, u, v)
-    height, size = _height(here, (a, b, c), weights)
-    moved = [take3(components(cloth.predicted), corner[:, k]) for k in range(3)]
-    predicted_height, _ = _height(take3(components(points.predicted), point), moved, weights)
+    height, size = _height(here, a_b_c, weights)
+    predicted_height, _ = _height(ahead, moved, weights)
     side = jnp.where(height < 0, -1.0, 1.0).astype(squared.dtype)
     is_over = jnp.abs(height) >= _MIN_COSINE * jnp.sqrt(squared)
     is_reached = (squared < _NEAR**2) | (side * predicted_height < _NEAR)

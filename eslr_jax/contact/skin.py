@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.contact.nearest import CLEARANCE, find_contacts
 from eslr_jax.contact.search import face_corners, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, components, dot3, sub3, vertex_normals
+from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _LIFTS = 8  # of skinned cloth off the skin
@@ -76,8 +76,8 @@ def find_skin_contacts(
 
 def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts) -> Float[Array, " rows"]:
     """Return how high the places of the cloth are over the body vertices at t + 1 [m]."""
-    x = components(position)
-    place = tuple(sum(skin.weights[:, k] * axis[skin.corners[:, k]] for k in range(3)) for axis in x)
+    corners = take3(components(position), skin.corners.T)
+    place = tuple(sum(skin.weights[:, k] * axis[k] for k in range(3)) for axis in corners)
     return dot3(sub3(place, components(skin.next_points)), components(skin.next_normals))  # type: ignore[arg-type]
 
 

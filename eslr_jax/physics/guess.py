@@ -32,13 +32,18 @@ def initial_guess(problem: FrameProblem) -> InitialGuess:
     the optimum, which L-BFGS misses by millimetres a second, since its first steps bend what only has to move.
     The potential decides.
     """
-    inertial = pushed_out_guess(problem)
     fall = problem.constants.gravity * jnp.square(problem.inertial_timestep)
-    falling = problem.inertial_guess - jnp.array([[0.0, 1.0, 0.0]], inertial.dtype) * fall
-    ballistic = pushed_out_guess(problem.replace(inertial_guess=falling))
-    guesses = jnp.stack([inertial, ballistic])
-    values = jax.lax.map(lambda guess: potential(guess, problem), guesses)
-    lower = jnp.where(values[1] < values[0], ballistic, inertial)
+    down = jnp.array([[0.0, 1.0, 0.0]], problem.position.dtype) * fall
+
+    def try_guess(moved: Float[Array, "vertices 3"]) -> tuple[Array, Array]:
+        guess = pushed_out_guess(problem.replace(inertial_guess=moved))
+        return guess, potential(guess, problem)
+
+    # In a loop, so that pushing out and the potential are compiled once for both.
+    guesses, values = jax.lax.map(
+        try_guess, jnp.stack([problem.inertial_guess, problem.inertial_guess - down])
+    )
+    lower = jnp.where(values[1] < values[0], guesses[1], guesses[0])
     return InitialGuess(spread_collapsed(lower, problem), values[0])
 
 

@@ -5,11 +5,12 @@ The points are vertices of the same cloth (self-contact), or of the body (`next_
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.self_contact import FacePairs
-from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3
+from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3, take3
 
 _SWEEPS = 4  # of `push_apart`
 
@@ -25,8 +26,12 @@ def pair_heights(
     with the cloth, and its four forces have no resultant and no moment. Unused rows give zero.
     """
     x = components(position)
-    point = tuple(c[pairs.vertices] for c in (x if next_body is None else components(next_body)))
-    corners = [tuple(c[pairs.corners[:, k]] for c in x) for k in range(3)]
+    if next_body is None:  # all four places in one read
+        places = take3(x, jnp.concatenate([pairs.vertices[None], pairs.corners.T]))
+        point, *corners = (tuple(c[k] for c in places) for k in range(4))
+    else:
+        point, places = take3(components(next_body), pairs.vertices), take3(x, pairs.corners.T)
+        corners = [tuple(c[k] for c in places) for k in range(3)]
     weights = [pairs.weights[:, k] for k in range(3)]
     foot = tuple(sum(weights[k] * corners[k][axis] for k in range(3)) for axis in range(3))
     normal = cross3(sub3(corners[1], corners[0]), sub3(corners[2], corners[0]))  # type: ignore[arg-type]
@@ -96,31 +101,31 @@ def push_apart(
     """
     num_vertices = position.shape[0]
     share = 0.5 if next_body is None else 1.0
-    for _ in range(_SWEEPS):
+
+    def sweep(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
         height, direction = pair_heights(position, pairs, next_body)
         depth = jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
         is_deep = (depth > 0).astype(position.dtype)
         # Moving corner k by w_k / |w|^2 moves the foot by one.
         scale = share * pairs.weights / jnp.sum(pairs.weights**2, axis=1, keepdims=True)
         touched = jnp.where(pairs.weights > 0, is_deep[:, None], 0.0)
-        asked = _scatter(pairs, is_deep if next_body is None else None, touched, num_vertices)
-        moves = []
-        for axis in direction:
-            lift = depth * axis
-            at_point = share * lift if next_body is None else None
-            moves.append(_scatter(pairs, at_point, -lift[:, None] * scale, num_vertices))
-        position = position + jnp.stack(moves, axis=-1) / jnp.maximum(asked, 1.0)[:, None]
-    return position
+        lift = depth[:, None] * jnp.stack(direction, axis=-1)
+        at_corners = jnp.concatenate([-scale[:, :, None] * lift[:, None], touched[:, :, None]], axis=2)
+        at_point = jnp.concatenate([share * lift, is_deep[:, None]], axis=1) if next_body is None else None
+        moved = _scatter(pairs, at_point, at_corners, num_vertices)
+        return position + moved[:, :3] / jnp.maximum(moved[:, 3:], 1.0)
+
+    return jax.lax.fori_loop(0, _SWEEPS, sweep, position)  # a loop: unrolled, every sweep is compiled anew
 
 
 def _scatter(
     pairs: FacePairs,
-    at_point: Float[Array, " pairs"] | None,
-    at_corners: Float[Array, "pairs 3"],
+    at_point: Float[Array, "pairs ..."] | None,
+    at_corners: Float[Array, "pairs 3 ..."],
     num_vertices: int,
-) -> Float[Array, " vertices"]:
+) -> Float[Array, "vertices ..."]:
     """Sum what pairs give to their three corners and, where it is of the cloth, to their point."""
-    values, ids = at_corners.T.ravel(), pairs.corners.T.ravel()
+    values, ids = jnp.concatenate(jnp.moveaxis(at_corners, 1, 0)), pairs.corners.T.ravel()
     if at_point is not None:
         values, ids = jnp.concatenate([at_point, values]), jnp.concatenate([pairs.vertices, ids])
     return segment_sum(values, ids, num_vertices)
