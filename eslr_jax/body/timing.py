@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -147,12 +150,23 @@ def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
     check_length(poses)
     if num_frames < 0:
         raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
-    step = (poses.positions[1] - poses.positions[0]).mean(axis=0)
+    positions, transforms = _glide(poses.positions, poses.joint_transforms, num_frames)
+    return poses.replace(positions=positions, joint_transforms=transforms)
+
+
+@partial(jax.jit, static_argnames="num_frames")  # outside jit, every operation is a program of its own
+def _glide(
+    positions: Float[Array, "frames vertices 3"],
+    transforms: Float[Array, "frames joints 3 4"],
+    num_frames: int,
+) -> tuple[Float[Array, "more vertices 3"], Float[Array, "more joints 3 4"]]:
+    """Return vertices [m] and joints of a body that glides up to its first frame, and goes on from there."""
+    step = (positions[1] - positions[0]).mean(axis=0)
     shifts = jnp.arange(-num_frames, 0, dtype=step.dtype)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
-    held = jnp.repeat(poses.joint_transforms[:1], num_frames, axis=0)
-    return poses.replace(
-        positions=jnp.concatenate([poses.positions[:1] + shifts[:, None], poses.positions]),
-        joint_transforms=jnp.concatenate([held.at[..., 3].add(shifts[:, None]), poses.joint_transforms]),
+    held = jnp.repeat(transforms[:1], num_frames, axis=0)
+    return (
+        jnp.concatenate([positions[:1] + shifts[:, None], positions]),
+        jnp.concatenate([held.at[..., 3].add(shifts[:, None]), transforms]),
     )
 
 

@@ -18,6 +18,7 @@ from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _DEEP = 1e-3  # [m] inside the body, from which a depth is measured again
 _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
+_stretches = jax.jit(principal_stretches)
 
 
 Parts = tuple[np.ndarray | None, tuple[str, ...]]
@@ -52,9 +53,7 @@ def trajectory_report(
         "total": sum(terms.values()),
         "max_principal_stretch": float(measures.max_stretch.max()),
         "p99_principal_stretch": float(measures.p99_stretch.max()),
-        "start_principal_stretch": float(
-            np.max(principal_stretches(trajectory.positions[0], scene.garment)[0])
-        ),
+        "start_principal_stretch": float(np.max(_stretches(trajectory.positions[0], scene.garment)[0])),
         "worst_stretch": _worst_stretch(trajectory, scene, int(np.argmax(measures.max_stretch)) + 1, parts),
         "penetration_p999_mm": None,
         "penetration_max_mm": None,
@@ -101,7 +100,7 @@ def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion)
 
 def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:
     """Return where a frame is stretched most."""
-    stretch = np.asarray(principal_stretches(trajectory.positions[frame], scene.garment)[0])
+    stretch = np.asarray(_stretches(trajectory.positions[frame], scene.garment)[0])
     return _place(frame, int(np.asarray(scene.garment.faces)[stretch.argmax(), 0]), scene, parts)
 
 

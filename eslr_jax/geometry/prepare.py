@@ -124,8 +124,9 @@ def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list
 
 def to_device(garment: Garment) -> Garment:
     """Return a garment with float32, int32 and bool JAX leaves."""
-    dtypes = {"f": jnp.float32, "i": jnp.int32, "u": jnp.int32, "b": jnp.bool_}
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtypes[leaf.dtype.kind]), garment)
+    dtypes = {"f": np.float32, "i": np.int32, "u": np.int32, "b": np.bool_}
+    # Converted by NumPy: JAX would compile a program for every shape.
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtypes[leaf.dtype.kind])), garment)
 
 
 def _check_rows(name: str, num_vertices: int, skin_weights: np.ndarray, skin_indices: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -155,13 +156,19 @@ def stretch_stiffness(material: Material) -> Float[Array, " *faces"]:
     return 4.0 * jnp.asarray(material.thickness) * mu * (mu + lame_lambda) / (2.0 * mu + lame_lambda)
 
 
+@jax.jit  # outside jit, every operation is a program of its own
+def _excess(material: Material) -> Float[Array, ""]:
+    """Return how many times as stiff as HOOD's stiffest a fabric is, at least once."""
+    return jnp.maximum(jnp.max(stretch_stiffness(material)) / _STIFFEST, 1.0)
+
+
 def constants_for(material: Material) -> PhysicsConstants:
     """Return the physical constants of a scene of this fabric.
 
     A sheet under tension presses on what it is bent over. How deep it sinks in is to depend on its strain alone:
     contacts with a fabric beyond HOOD's ranges are stiffer by as much as the fabric is, by its stiffest face.
     """
-    excess = jnp.maximum(jnp.max(stretch_stiffness(material)) / _STIFFEST, 1.0)
+    excess = _excess(material)
     usual = PhysicsConstants()
     return usual.replace(
         collision_stiffness=usual.collision_stiffness * excess,

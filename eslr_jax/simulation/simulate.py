@@ -93,6 +93,9 @@ def simulate(
     return Simulation(trajectory, timing, scene)
 
 
+_join = jax.jit(join_frames)
+
+
 class _Loop(NamedTuple):
     """What the host does between chunks; see `simulate`."""
 
@@ -107,7 +110,7 @@ def _in_chunks(
     """Simulate a scene a few frames at a time, and time compilation apart."""
     total = scene.num_frames - 1
     chunk = min(_CHUNK, total)
-    inputs = frame_inputs(scene)
+    inputs = frame_inputs(jax.device_get(scene))  # cut on the host, where it compiles nothing
     constant = jax.tree.map(jnp.asarray, without_tracks(scene).replace(num_frames=chunk + 1))
 
     def part(first: int) -> FrameInput:
@@ -131,15 +134,15 @@ def _in_chunks(
         if loop.pace is not None:
             iterations = loop.pace(iterations, took * 1e3 / chunk)
         count = min(chunk, total - first)
-        done.append(jax.tree.map(lambda leaf, count=count: leaf[:count], frames))
+        done.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], frames))
         is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
         if count == chunk or is_bad:
             state = end
         loop.on_frames(first + count, total)
         if is_bad or loop.is_stopping():
             break
-    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
-    trajectory = join_frames(start, joined, state)
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *done)
+    trajectory = _join(start, joined, state)
     if before is not None:
         trajectory = _appended(before, trajectory)
     return trajectory, Timing(compile_s, seconds * 1e3 / (chunk * len(done)))
@@ -153,7 +156,7 @@ def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
 
 def _slice_frames(trajectory: Trajectory, frames: slice) -> Trajectory:
     """Return some frames of a trajectory, with its status."""
-    return _map_frames(lambda leaf: leaf[frames], trajectory)
+    return _map_frames(lambda leaf: jnp.asarray(np.asarray(leaf)[frames]), trajectory)
 
 
 def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory) -> Trajectory:
@@ -169,12 +172,14 @@ def _map_frames(function: Callable, trajectory: Trajectory, *before: Trajectory)
 def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothState:
     """Return the state of the cloth at a frame of a trajectory without an error, the last by default."""
     frame = range(trajectory.num_frames)[frame]
-    position, velocity = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)  # or a file's
+    # Cut by NumPy: JAX would compile a program for every array.
+    position, velocity = np.asarray(trajectory.positions), np.asarray(trajectory.velocities)
     past = scene.initial_state.past
     if past is not None and frame > 0:
-        past = past_state(position[frame - 1], velocity[frame - 1], trajectory.residuals[frame])
-    state = initial_state(position[frame], velocity[frame])
-    load = jnp.asarray(trajectory.friction_loads[frame])
+        before = jnp.asarray(position[frame - 1]), jnp.asarray(velocity[frame - 1])
+        past = past_state(*before, np.asarray(trajectory.residuals)[frame])
+    state = initial_state(jnp.asarray(position[frame]), jnp.asarray(velocity[frame]))
+    load = jnp.asarray(np.asarray(trajectory.friction_loads)[frame])
     return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)
 
 
