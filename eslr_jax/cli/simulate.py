@@ -372,7 +372,13 @@ def _measure(
     return {
         "simulator": method.simulator,
         "model": method.model,
-        **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
+        **trajectory_report(
+            trajectory,
+            scene,
+            parts=(stored.face_parts, stored.part_names),
+            poses=poses,
+            outfit=stored.outfit,
+        ),
         **wear_report(trajectory.positions, scene.garment, skinned, poses),
         "choice": None if method.choice is None else dataclasses.asdict(method.choice),
         "tolerance": method.tolerance,
