@@ -135,8 +135,8 @@ def find_tip_contacts(
     """
     count = body.shape[0]
     capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count))
-    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    points = _Points(body, next_body, jnp.ones(count, bool), jnp.full(count, area), blocks)
+    areas = jnp.full(count, garment.mean_vertex_area)
+    points = _Points(body, next_body, jnp.ones(count, bool), areas, blocks)
     return _find_pairs(points, _Cloth(position, predicted, garment, has_points=False), TIP_RADIUS, capacity)
 
 
