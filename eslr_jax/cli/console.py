@@ -87,11 +87,11 @@ def _garment_table(garments: dict[str, dict[str, Any]]) -> Table:
     """Return stretch, penetration and, where they are counted, intersections of the garments of an outfit."""
     formats: dict[str, tuple[str, Callable[[Any], str]]] = {
         "num_vertices": ("vertices", str),
-        "p99_principal_stretch": ("stretch, 99 %", "{:.3f}".format),
+        "p99_principal_stretch": ("stretch", "{:.3f}".format),
         "max_principal_stretch": ("at most", "{:.3f}".format),
-        "penetration_max_mm": ("penetration [mm]", "{:.2f}".format),
-        "penetrating_share": ("of vertices", "{:.2%}".format),
-        "intersections_cloth": ("pairs of cloth", str),
+        "penetration_max_mm": ("inside [mm]", "{:.2f}".format),
+        "penetrating_share": ("share", "{:.2%}".format),
+        "intersections_cloth": ("pairs", str),
         "intersections_body": ("with the body", str),
     }
     measured = next(iter(garments.values()))
