@@ -179,7 +179,8 @@ def own_garment(_: int) -> np.ndarray:
         file.write_text(obj_text("shirt", scanned, tshirt.faces))
         fitted = fit_garment(read_garment_source(file), body, FitOptions())
     lying = scanned / 100
-    lying += [-0.9, 0.1, 0.1] - lying.mean(axis=0)
+    floor = np.asarray(body.rest_positions)[:, 1].min()
+    lying += [-0.75, floor, 0.2] - np.array([lying[:, 0].mean(), lying[:, 1].min(), lying[:, 2].mean()])
     pictures = [worn(fitted, body, lying, size=(360, 330)), worn(fitted, body, size=(360, 330))]
     return side_by_side(pictures, ("before", "fitted"))
 
