@@ -11,6 +11,7 @@ import dataclasses
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.tree_util import Partial
@@ -71,6 +72,11 @@ class Garment:
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
     coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
+
+    @property
+    def mean_vertex_area(self) -> Float[Array, ""]:
+        """Area of cloth that a vertex stands for in the mean [m^2]."""
+        return jnp.sum(self.vertex_areas) / jnp.sum(self.vertex_mask, dtype=self.vertex_areas.dtype)
 
 
 @struct.dataclass

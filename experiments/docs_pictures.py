@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
@@ -25,7 +26,10 @@ from PIL import Image
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.fields import run_field
+from eslr_jax.evaluation.fields import Field, run_field
+from eslr_jax.evaluation.foreign import foreign_trajectory
+from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
+from eslr_jax.evaluation.score import EVERY
 from eslr_jax.fabric import garment_material
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
@@ -36,6 +40,7 @@ from eslr_jax.io.mesh_sequence import obj_text
 from eslr_jax.io.palette import outfit_colors
 from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
+from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.simulate import simulate
 
@@ -100,7 +105,7 @@ def shoot(
     frames: int,
     *,
     fabric: tuple[str, ...] = (),
-    vertices: Literal["1k", "4k"] = "1k",
+    vertices: Literal["1k", "4k", "10k"] = "1k",
     **options: Any,
 ) -> Shot:
     """Simulate garments on a walk, as `eslr simulate` does."""
@@ -173,9 +178,11 @@ def own_garment(_: int) -> np.ndarray:
         scanned = 100 * np.stack([tshirt.rest_positions[:, k] for k in (0, 2, 1)], axis=1) * [1, -1, 1]
         file.write_text(obj_text("shirt", scanned, tshirt.faces))
         fitted = fit_garment(read_garment_source(file), body, FitOptions())
-    before = scanned / 100 + [0.0, 0.0, 0.7]
-    pictures = [worn(fitted, body, before), worn(fitted, body)]
-    return side_by_side(pictures, ("the file, as 1 unit = 1 cm", "fitted"))
+    lying = scanned / 100
+    floor = np.asarray(body.rest_positions)[:, 1].min()
+    lying += [-0.75, floor, 0.2] - np.array([lying[:, 0].mean(), lying[:, 1].min(), lying[:, 2].mean()])
+    pictures = [worn(fitted, body, lying, size=(360, 330)), worn(fitted, body, size=(360, 330))]
+    return side_by_side(pictures, ("before", "fitted"))
 
 
 def own_body(_: int) -> np.ndarray:
@@ -221,35 +228,54 @@ def _push(pressure: Any, position: Any, problem: Any) -> Any:
 def report(frames: int) -> np.ndarray:
     """Stretch of a long-sleeved shirt, and its distance from the body."""
     shot = shoot(("longsleeve",), frames)
-    with tempfile.TemporaryDirectory() as folder:
-        track = ClothTrack(
-            shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads
-        )
-        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
-        run = read_run(Path(folder))
-        pictures = []
-        for name in ("stretch", "distance"):
-            field = run_field(run, name)
-            colors = color_scale(field.values, field.low, field.high)
-            picture = figures(shot, [frames - 1], colors)[0]
-            label = f"{name} [{field.unit}]" if field.unit else name
-            pictures.append(add_color_bar(picture, field.low, field.high, label))
+    pictures = []
+    for name in ("stretch", "distance"):
+        field = field_of(shot, name)
+        label = f"{name} [{field.unit}]" if field.unit else name
+        pictures.append(add_color_bar(colored(shot, field, field.high), field.low, field.high, label))
     return np.concatenate(pictures, axis=1)
 
 
-def limits(_: int) -> np.ndarray:
-    """A T-shirt in all bundled resolutions: a face can't fold."""
-    sizes: tuple[Literal["1k", "4k", "10k"], ...] = ("1k", "4k", "10k")
-    garments = [load_garment_file("tshirt", vertices=size) for size in sizes]
-    edges = [
-        stored.rest_positions[stored.faces[:, 0]] - stored.rest_positions[stored.faces[:, 1]]
-        for stored in garments
-    ]
-    labels = [
-        f"{size}: edges of {100 * np.median(np.linalg.norm(edge, axis=1)):.1f} cm"
-        for size, edge in zip(sizes, edges, strict=True)
-    ]
-    return side_by_side([worn(stored, load_body(), zoom=1.6) for stored in garments], labels)
+def score(frames: int) -> np.ndarray:
+    """What a T-shirt leaves above its optimum: carried by the joints, and simulated."""
+    shot = shoot(("tshirt",), frames)
+    carried = jax.jit(skin_garment)(shot.scene.garment, shot.poses.joint_transforms)
+    shots = (dataclasses.replace(shot, trajectory=foreign_trajectory(carried, shot.scene)), shot)
+    fields = [field_of(each, "gap") for each in shots]
+    shares = []
+    for each in shots:
+        ends = trajectory_gap(each.trajectory, each.scene, every=EVERY)
+        shares.append(gap_medians(ends, ends.reached)["gap_relative_median"])
+    pictures = [colored(each, field, fields[0].high) for each, field in zip(shots, fields, strict=True)]
+    names = ("carried by the joints", "simulated")
+    labels = [f"{name}: {100 * share:.2g} %" for name, share in zip(names, shares, strict=True)]
+    return add_color_bar(side_by_side(pictures, labels), 0.0, fields[0].high, f"gap [{fields[0].unit}]")
+
+
+def field_of(shot: Shot, name: str) -> Field:
+    """Return a field of a scene, as `eslr render --color` shows it."""
+    track = ClothTrack(shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads)
+    said = {"integrator": "bdf2", "skin_contacts": True}
+    with tempfile.TemporaryDirectory() as folder:
+        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report=said)
+        return run_field(read_run(Path(folder)), name)
+
+
+def colored(shot: Shot, field: Field, high: float) -> np.ndarray:
+    """Render the last frame of a scene in the colours of a field, yellow from a value on."""
+    return figures(shot, [len(field.values) - 1], color_scale(field.values, field.low, high))[0]
+
+
+def limits(frames: int) -> np.ndarray:
+    """A dress in all bundled resolutions: cloth folds between faces."""
+    pictures, labels = [], []
+    for size in ("1k", "4k", "10k"):
+        shot = shoot(("dress",), frames, vertices=size)
+        ends = shot.stored.rest_positions[shot.stored.faces[:, :2]]
+        length = np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+        pictures.append(figures(shot, [frames - 1])[0])
+        labels.append(f"{size}: edges of {100 * length:.1f} cm")
+    return side_by_side(pictures, labels)
 
 
 def play(frames: int) -> np.ndarray | None:
@@ -297,6 +323,7 @@ PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
     "fabrics": fabrics,
     "extend": extend,
     "report": report,
+    "score": score,
     "limits": limits,
     "play": play,
 }

@@ -9,6 +9,8 @@ import pytest
 import trimesh
 from garment_files import scanned_tshirt
 
+from eslr_jax.errors import ConfigError
+
 
 def eslr(*arguments, cwd=None):
     command = [sys.executable, "-m", "eslr_jax.cli", *map(str, arguments)]
@@ -42,6 +44,15 @@ def test_simulate_writes_everything(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {
         "trajectory.npz", "garment.npz", "animation.glb", "sheet.png", "report.json",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["simulate", "play", "score"])
+def test_garments_may_be_given_again(command):
+    from eslr_jax.cli import _refuse_repetition
+
+    _refuse_repetition([command, "--garment", "pants", "--garment", "tshirt"])
+    with pytest.raises(ConfigError, match="--motion is given twice"):
+        _refuse_repetition([command, "--motion", "turn", "--motion=jump"])
 
 
 def test_assets_lists_every_kind():

@@ -49,6 +49,32 @@ def test_a_run_its_glb_and_its_npz_score_as_the_run_s_report_says(folder):
 
 
 @pytest.mark.slow
+def test_an_outfit_is_scored_together_and_by_garment(tmp_path):
+    worn = ("--garment", "pants", "--garment", "tshirt")
+    options = ("--simulator", "physics", "--iterations", 30, "--frames", 4, "--no-pictures", "--settle", 0)
+    done = eslr("simulate", *worn, *options, "--out", tmp_path / "run", "--integrator", "euler")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    glb = tmp_path / "run" / "animation.glb"
+    refused(eslr("score", glb), "pants, tshirt", "--garment for every garment")
+    score = scored(glb, "--run", tmp_path / "run")
+    assert list(score["garments"]) == ["pants", "tshirt"]
+    for name, row in report["garments"].items():
+        for key, value in row.items():
+            assert score["garments"][name][key] == pytest.approx(value, rel=5e-3, abs=2e-2), (name, key)
+    for key in ("max_principal_stretch", "penetration_max_mm"):
+        assert max(row[key] for row in score["garments"].values()) == score[key]
+    assert score["num_vertices"] == sum(row["num_vertices"] for row in score["garments"].values())
+    if score["intersections_cloth"] is not None:
+        ours = sum(row["intersections_cloth"] for row in score["garments"].values())
+        assert score["intersections_cloth"] <= ours <= 2 * score["intersections_cloth"]
+    assert score["gap_relative_median"] < 0.1
+    named = eslr("score", glb, *worn)
+    assert named.returncode == 0, named.stderr
+    assert [line.split()[0] for line in named.stdout.splitlines()[-2:]] == ["pants", "tshirt"]
+
+
+@pytest.mark.slow
 def test_somebody_else_s_trajectory_is_scored_in_a_named_scene_and_shown_as_a_table(folder, carried, tshirt):
     np.savez(folder / "carried.npz", positions=carried, faces=np.asarray(tshirt.faces))
     done = eslr("score", folder / "carried.npz", "--motion", "cmu_016_32")

@@ -1,13 +1,13 @@
-"""Neutral shorts and a top that a body wears in pictures, where no simulated cloth covers it (host).
+"""What is drawn of garments and a body, which wears neutral shorts and a top beneath them (host).
 
-They are the body's own surface in another colour, cut along smooth hems: skin-tight, and no part of any scene.
+Shorts and top are the body's own surface in another colour, cut along smooth hems: skin-tight, and no part of
+any scene.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sparse
@@ -15,8 +15,11 @@ from jaxtyping import Float, Int
 
 from eslr_jax.body.joints import find_named_parts
 from eslr_jax.geometry.skinning import smooth
+from eslr_jax.io.garment import split_outfit
+from eslr_jax.io.palette import BODY_COLORS, Color, garment_color
 
-SKIN, TOP, SHORTS = 0, 1, 2
+_SKIN, _TOP, _SHORTS = 0, 1, 2
+_NAMES = ("skin", "top", "shorts")
 _LEG = 0.42  # share of the thigh that the shorts cover
 _STRAP = 0.8  # of the distance from the middle to a shoulder joint: where the top ends
 _ARMHOLE = 0.75  # of that distance beneath the shoulder joints: how low the armholes reach
@@ -54,24 +57,39 @@ class Skinned(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class Layer:
-    """A part of a body's surface that has one colour."""
+class Piece(NamedTuple):
+    """A mesh of one colour, a part of a body or of an outfit."""
 
-    kind: int  # SKIN, TOP or SHORTS
+    name: str
     faces: Int[np.ndarray, "faces 3"]  # of its own vertices
-    weights: sparse.csr_array  # [own_vertices, body_vertices]: its vertices from those of the body
+    weights: sparse.csr_array | slice  # its vertices from those of the whole
+    color: Color
 
-    def place(self, positions: Float[np.ndarray, "body_vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """Return where its vertices are [m], given those of the body [m]."""
-        return np.asarray(self.weights @ np.asarray(positions, np.float32), np.float32)
+    def place(self, positions: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "own_vertices 3"]:
+        """Return where its vertices are [m], given those of the whole [m]."""
+        positions = np.asarray(positions, np.float32)
+        return positions[self.weights] if isinstance(self.weights, slice) else self.weights @ positions
 
 
-def body_layers(
+def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) -> list[Piece]:
+    """Return the garments of an outfit.
+
+    Args:
+        faces: Triangles of all of them.
+        outfit: Their numbers of vertices, by name and in order.
+    """
+    faces = np.asarray(faces)
+    return [
+        Piece(name, faces[is_own] - rows.start, rows, garment_color(number))
+        for number, (name, rows, is_own) in enumerate(split_outfit(faces, outfit))
+    ]
+
+
+def body_pieces(
     rest_positions: Float[np.ndarray, "body_vertices 3"],
     faces: Int[np.ndarray, "body_faces 3"],
     rig: Skinned | None,
-) -> list[Layer]:
+) -> list[Piece]:
     """Return skin, top and shorts of a body; all of it is skin if its joints have no common names.
 
     Args:
@@ -83,22 +101,20 @@ def body_layers(
     weights = sparse.eye_array(len(positions), format="csr")
     fields = None if rig is None else _fields(positions, faces, rig)
     if fields is None:
-        return [Layer(SKIN, faces, weights.astype(np.float32))]
+        return [_piece(_SKIN, faces, weights)]
     cloth, waist = fields
     faces, weights = _cut(faces, weights, cloth)
     faces, weights = _cut(faces, weights, weights @ waist)
     is_cloth = (weights @ cloth)[faces].mean(axis=1) > 0
     is_top = (weights @ waist)[faces].mean(axis=1) > 0
-    kinds = np.where(is_cloth, np.where(is_top, TOP, SHORTS), SKIN)
-    return [
-        _layer(kind, faces[kinds == kind], weights) for kind in (SKIN, TOP, SHORTS) if (kinds == kind).any()
-    ]
+    kinds = np.where(is_cloth, np.where(is_top, _TOP, _SHORTS), _SKIN)
+    return [_piece(kind, faces[kinds == kind], weights) for kind in np.unique(kinds)]
 
 
-def _layer(kind: int, faces: np.ndarray, weights: sparse.csr_array) -> Layer:
-    """Return a layer with the vertices of its faces alone."""
+def _piece(kind: int, faces: np.ndarray, weights: sparse.csr_array) -> Piece:
+    """Return a part of the body with the vertices of its faces alone."""
     vertices, own = np.unique(faces, return_inverse=True)
-    return Layer(kind, own.reshape(-1, 3), weights[vertices].astype(np.float32))
+    return Piece(_NAMES[kind], own.reshape(-1, 3), weights[vertices].astype(np.float32), BODY_COLORS[kind])
 
 
 def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.ndarray, np.ndarray] | None:

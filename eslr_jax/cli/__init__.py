@@ -40,7 +40,10 @@ COMMANDS = (
     convert,
 )  # each has registered its own
 
-_REPEATABLE = {"--set": "train", "--garment": "simulate"}  # and the command that collects its values
+_REPEATABLE = {  # and the commands that collect its values
+    "--set": ("train",),
+    "--garment": ("simulate", "play", "score"),
+}
 
 __all__ = ["app", "main"]
 
@@ -75,5 +78,5 @@ def _refuse_repetition(arguments: list[str]) -> None:
     """
     options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
     for option in options:
-        if options.count(option) > 1 and _REPEATABLE.get(option) != arguments[0]:
+        if options.count(option) > 1 and arguments[0] not in _REPEATABLE.get(option, ()):
             raise ConfigError(f"{option} is given twice; give it once")

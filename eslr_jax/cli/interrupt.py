@@ -1,4 +1,4 @@
-"""Ctrl-C: at once where nothing is lost, after the frames in work where they can be kept."""
+"""Ctrl-C at once, where nothing is lost; see `simulation.interrupt` for where something is."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from eslr_jax.cli.console import say
 
@@ -55,30 +55,3 @@ def leave_at_once() -> Iterator[None]:
         signal.set_wakeup_fd(before)
         sender.close()
         watcher.join()
-
-
-class Interruption:
-    """Turns Ctrl-C and SIGTERM into a question, from `begin` on; a second signal acts at once."""
-
-    def __init__(self, message: str):
-        """Remember what to say when the first signal comes."""
-        self._message = message
-        self._before: dict[signal.Signals, Callable | int | None] = {}
-        self.is_wanted = False
-
-    def begin(self) -> None:
-        """Take over the signals."""
-        if not self._before and threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._remember)
-
-    def end(self) -> None:
-        """Give the signals back."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before = {}
-
-    def _remember(self, number: int, frame: object) -> None:
-        self.is_wanted = True
-        self.end()
-        say(self._message)

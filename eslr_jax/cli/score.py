@@ -31,7 +31,7 @@ _SAME_RATE = 0.01  # relative
 def score(
     file: tyro.conf.Positional[str],
     run: Path | None = None,
-    garment: str | None = None,
+    garment: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     motion: str | None = None,
     body: str | None = None,
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] | None = None,
@@ -47,9 +47,11 @@ def score(
     Args:
         file: The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in
             their order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a
-            folder of OBJ or PLY files. Or a run of `eslr simulate`, which tells its own scene.
+            folder of OBJ or PLY files. The meshes of a .glb with several are the garments of an outfit, by name;
+            FILE.glb#NAME is one of them. Or a run of `eslr simulate`, which tells its own scene.
         run: Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
-        garment: Name of a bundled garment, or a mesh file; tshirt if not given. An outfit is told by its run.
+        garment: Name of a bundled garment, or a mesh file; tshirt if not given. Give it again for what is worn
+            over it, as for `eslr simulate`.
         motion: Motion as for `eslr simulate`; cmu_016_32 if not given, from its first frame on.
         body: Body as for `eslr simulate`; anny if not given.
         vertices: Resolution of a bundled garment; 1k if not given.
@@ -59,7 +61,7 @@ def score(
     """
     from eslr_jax.evaluation.report import environment
     from eslr_jax.evaluation.score import score_trajectory
-    from eslr_jax.io.mesh_sequence import read_mesh_sequence
+    from eslr_jax.io.mesh_sequence import read_mesh_sequences
     from eslr_jax.io.run import is_run, read_run
 
     use_compile_cache()
@@ -74,11 +76,17 @@ def score(
         if is_own:
             task = _own_task(read_run(file))
         else:
-            sequence = read_mesh_sequence(file)
-            task = _named_task(sequence, given) if run is None else _run_task(sequence, read_run(run))
+            sequences = read_mesh_sequences(file)
+            task = _named_task(sequences, given) if run is None else _run_task(sequences, read_run(run))
     with stderr.status("scoring"):
+        stored = task.stored
         result = score_trajectory(
-            task.trajectory, task.scene, poses=task.poses, parts=_parts(task.stored), every=every
+            task.trajectory,
+            task.scene,
+            poses=task.poses,
+            parts=(None, ()) if stored is None else (stored.face_parts, stored.part_names),
+            outfit=None if stored is None else stored.outfit,
+            every=every,
         )
     result = {"file": file, **task.label, **result, **environment()}
     if result["intersections_cloth"] is None:
@@ -107,10 +115,10 @@ def _own_task(run: Run) -> _Task:
     return _Task(run_trajectory(run, scene), scene, run_poses(run, scene), run.garment, {"run": run.name})
 
 
-def _run_task(sequence: MeshSequence, run: Run) -> _Task:
+def _run_task(sequences: list[MeshSequence], run: Run) -> _Task:
     """Return a trajectory in the scene of a run, cut to its length."""
     from eslr_jax.body.motion import first_poses
-    from eslr_jax.io.garment import in_vertex_order
+    from eslr_jax.io.garment import in_outfit_order
     from eslr_jax.scene.plan import first_frames
 
     task = _own_task(run)
@@ -118,42 +126,50 @@ def _run_task(sequence: MeshSequence, run: Run) -> _Task:
         raise ConfigError(
             f"{run.name} has no garment.npz, which tells its garment; give a run of `eslr simulate`"
         )
-    positions = in_vertex_order(sequence, run.garment)
+    positions = in_outfit_order(sequences, run.garment)
     count = len(positions)
     if count > task.scene.num_frames:
         raise MotionError(
-            f"{sequence.name} has {count} frames, {run.name} only {task.scene.num_frames}; cut it"
+            f"{sequences[0].name} has {count} frames, {run.name} only {task.scene.num_frames}; cut it"
         )
     scene = first_frames(task.scene, count)
-    _check_sequence(sequence, positions, scene)
+    _check_sequence(sequences[0], positions, scene)
     poses = None if task.poses is None else first_poses(task.poses, count)
     return task._replace(trajectory=positions, scene=scene, poses=poses)
 
 
-def _named_task(sequence: MeshSequence, given: dict[str, Any]) -> _Task:
-    """Return a trajectory in the scene of a garment, a body and a motion."""
+def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
+    """Return a trajectory in the scene of garments, a body and a motion."""
     import inspect
 
     from eslr_jax.assets import load_garment_file, prepare_stored
     from eslr_jax.cli.simulate import simulate
     from eslr_jax.fabric import garment_material
-    from eslr_jax.io.garment import in_vertex_order
+    from eslr_jax.fit.outfit import garment_names, wear_together
+    from eslr_jax.io.garment import in_outfit_order
     from eslr_jax.scene.plan import prepare_scene
 
-    garment = given.get("garment", DEFAULT_GARMENT)
+    if len(sequences) > 1 and "garment" not in given:
+        known = ", ".join(sequence.mesh for sequence in sequences)
+        raise ConfigError(
+            f"{sequences[0].name} is one of the meshes {known}; give --run, or --garment for every garment and "
+            "the innermost first, or score one mesh of the file as FILE#NAME"
+        )
+    files = given.get("garment", (DEFAULT_GARMENT,))
     usual = inspect.signature(simulate).parameters
     values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
-    values.update(given, garment=(garment,), frames=len(sequence.positions))
+    values.update(given, garment=files, frames=len(sequences[0].positions))
     options = Options(**values)
     rig, poses, motion = load_actor(options)
-    stored = load_garment_file(garment, vertices=options.vertices, body=rig)
-    positions = in_vertex_order(sequence, stored)
-    cloth = prepare_stored(stored, name=Path(garment).name)
-    check_skin(garment, cloth, rig)
+    garments = [load_garment_file(file, vertices=options.vertices, body=rig) for file in files]
+    stored, label = wear_together(garments, files), "+".join(files)
+    by_name = dict(zip(garment_names(files), garments, strict=True))
+    positions = in_outfit_order(sequences, stored, by_name)
+    cloth = prepare_stored(stored, name=label)
+    check_skin(label, cloth, rig)
     scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
-    _check_sequence(sequence, positions, scene)
-    label = {"garment": garment, "motion": motion, "body": options.body}
-    return _Task(positions, scene, poses, stored, label)
+    _check_sequence(sequences[0], positions, scene)
+    return _Task(positions, scene, poses, stored, {"garment": label, "motion": motion, "body": options.body})
 
 
 def _check_sequence(sequence: MeshSequence, positions: np.ndarray, scene: Scene) -> None:
@@ -169,11 +185,6 @@ def _check_sequence(sequence: MeshSequence, positions: np.ndarray, scene: Scene)
             f"{sequence.name} begins {away:.3g} m from where the garment is worn; give metres, Y up, "
             "on the body"
         )
-
-
-def _parts(stored: GarmentFile | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return the parts of a garment file, which the worst places are named by."""
-    return (None, ()) if stored is None else (stored.face_parts, stored.part_names)
 
 
 def _figures(result: dict[str, Any]) -> dict[str, str]:

@@ -13,7 +13,7 @@ import tyro
 from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, print_report, progress, say, stderr, use_compile_cache
-from eslr_jax.cli.interrupt import EXIT_CODE, Interruption
+from eslr_jax.cli.interrupt import EXIT_CODE
 from eslr_jax.cli.options import (
     DEFAULT_GARMENT,
     Options,
@@ -328,31 +328,29 @@ def _choose_method(
 def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
     """Simulate with progress; Ctrl-C ends it after the frames in work."""
     from eslr_jax.simulation.budget import keep_budget
+    from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import simulate as run
 
     pace = None
     if method.choice is not None and method.budget_ms is not None:
         pace = keep_budget(method.choice, method.budget_ms)
-    stop = Interruption("stopping after these frames; Ctrl-C again stops at once and loses them")
-    with progress("simulating", scene.num_frames - 1) as advance:
+    words = "stopping after these frames; Ctrl-C again stops at once and loses them"
+    with Interruption(lambda: say(words)) as stop, progress("simulating", scene.num_frames - 1) as advance:
 
         def on_frames(count: int, total: int) -> None:
             advance(count, total)
             stop.begin()  # before the first frames are done there is nothing to keep
 
-        try:
-            return run(
-                method.params,
-                scene,
-                config=method.config,
-                pace=pace,
-                on_frames=on_frames,
-                is_stopping=lambda: stop.is_wanted,
-                done=done,
-                raises=False,
-            )
-        finally:
-            stop.end()
+        return run(
+            method.params,
+            scene,
+            config=method.config,
+            pace=pace,
+            on_frames=on_frames,
+            is_stopping=lambda: stop.is_wanted,
+            done=done,
+            raises=False,
+        )
 
 
 def _measure(
@@ -372,7 +370,13 @@ def _measure(
     return {
         "simulator": method.simulator,
         "model": method.model,
-        **trajectory_report(trajectory, scene, parts=(stored.face_parts, stored.part_names), poses=poses),
+        **trajectory_report(
+            trajectory,
+            scene,
+            parts=(stored.face_parts, stored.part_names),
+            poses=poses,
+            outfit=stored.outfit,
+        ),
         **wear_report(trajectory.positions, scene.garment, skinned, poses),
         "choice": None if method.choice is None else dataclasses.asdict(method.choice),
         "tolerance": method.tolerance,

@@ -134,8 +134,8 @@ def find_tip_contacts(
     """
     count = body.shape[0]
     capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count))
-    area = jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
-    points = _Points(_ends(body, next_body), jnp.ones(count, bool), jnp.full(count, area), blocks)
+    areas = jnp.full(count, garment.mean_vertex_area)
+    points = _Points(_ends(body, next_body), jnp.ones(count, bool), areas, blocks)
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
     return _find_pairs(points, cloth, TIP_RADIUS, capacity)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Garment, Scene, Trajectory
 
 
 class FrameMeasures(NamedTuple):
@@ -47,3 +47,11 @@ def measure_frames(trajectory: Trajectory, scene: Scene) -> FrameMeasures:
 
     body = None if scene.body is None else scene.body.positions[1:]
     return jax.lax.map(measure, (trajectory.positions[:-1], trajectory.positions[1:], body))
+
+
+@jax.jit
+def face_stretches(
+    positions: Float[Array, "frames vertices 3"], garment: Garment
+) -> Float[Array, "frames faces"]:
+    """Return the larger principal stretch of every face in every frame; positions are in m."""
+    return jax.lax.map(lambda position: principal_stretches(position, garment)[0], positions)

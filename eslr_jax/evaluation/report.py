@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from eslr_jax.evaluation.metrics import FrameMeasures, measure_frames
+from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_frames
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.topology import vertex_normals
+from eslr_jax.io.garment import split_outfit
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
@@ -26,7 +28,12 @@ Parts = tuple[np.ndarray | None, tuple[str, ...]]
 
 
 def trajectory_report(
-    trajectory: Trajectory, scene: Scene, *, parts: Parts = (None, ()), poses: BodyMotion | None = None
+    trajectory: Trajectory,
+    scene: Scene,
+    *,
+    parts: Parts = (None, ()),
+    poses: BodyMotion | None = None,
+    outfit: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """Measure a trajectory.
 
@@ -35,11 +42,13 @@ def trajectory_report(
         scene: Its scene.
         parts: Parts of the garment, which the worst places are named by.
         poses: The whole body: what seems to be deep in the part that was searched for contacts is measured again.
+        outfit: Numbers of vertices of garments that are worn together, by name and in order.
 
     Returns:
         Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
         vertices that penetrate; without a body the penetration values are None. `worst_stretch` and
-        `worst_penetration` hold frame, time [s], vertex and part of the largest values.
+        `worst_penetration` hold frame, time [s], vertex and part of the largest values. `garments` holds stretch
+        and penetration of every garment of an outfit by name; None for a single garment.
     """
     measures: FrameMeasures = jax.device_get(measure_frames(trajectory, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
@@ -63,6 +72,7 @@ def trajectory_report(
         "residual_median": float(np.median(trajectory.residuals[1:])),
         "iterations_mean": float(np.mean(trajectory.iterations[1:])),
     }
+    depth = None
     if measures.distances is not None:
         depth = -measures.distances[:, is_real]
         if poses is not None:
@@ -74,7 +84,36 @@ def trajectory_report(
             frame, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
             vertex = int(np.flatnonzero(is_real)[column])
             report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
+        several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
+    report["garments"] = None if several is None else _garments(trajectory, scene, depth, several)
     return report
+
+
+def _garments(
+    trajectory: Trajectory, scene: Scene, depth: np.ndarray | None, outfit: dict[str, int]
+) -> dict[str, dict[str, Any]]:
+    """Return stretch and penetration of the garments of an outfit, as the report has them of the whole.
+
+    Args:
+        trajectory: What to measure.
+        scene: Its scene.
+        depth: Inside the body [m], of real vertices in simulated frames; None without a body.
+        outfit: Numbers of vertices, by name and in order.
+    """
+    stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))
+    is_face = np.asarray(scene.garment.rest_areas) > 0
+    found: dict[str, dict[str, Any]] = {}
+    for name, rows, is_own in split_outfit(np.asarray(scene.garment.faces), outfit):
+        stretch = stretches[:, is_own & is_face]
+        own = None if depth is None else depth[:, rows]
+        found[name] = {
+            "num_vertices": outfit[name],
+            "p99_principal_stretch": float(np.quantile(stretch, 0.99, axis=1, method="lower").max()),
+            "max_principal_stretch": float(stretch.max()),
+            "penetration_max_mm": None if own is None else float(max(own.max(), 0.0) * 1e3),
+            "penetrating_share": None if own is None else float((own > 0).mean()),
+        }
+    return found
 
 
 def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion) -> np.ndarray:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFiniteError
 from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
-from eslr_jax.evaluation.referee import judge
+from eslr_jax.evaluation.metrics import face_stretches
+from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.evaluation.report import Parts, trajectory_report
 from eslr_jax.evaluation.wear import wear_report
-from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.io.garment import split_outfit
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
@@ -36,6 +38,7 @@ def score_trajectory(
     *,
     poses: BodyMotion | None = None,
     parts: Parts = (None, ()),
+    outfit: Mapping[str, int] | None = None,
     every: int = EVERY,
 ) -> dict[str, Any]:
     """Score a trajectory of any simulator.
@@ -46,17 +49,19 @@ def score_trajectory(
         scene: What was simulated, of `prepare_scene`; it has as many frames.
         poses: The whole body, see `trajectory_report`; also how the garment sits is then measured.
         parts: Parts of the garment, see `trajectory_report`.
+        outfit: Garments that are worn together, see `trajectory_report`.
         every: Frames between those whose gap and intersections are measured.
 
     Returns:
         Plain values: those of `trajectory_report` without `iterations_mean`, with `poses` those of `wear_report`,
         and
-        - `stretch_p99`: the principal stretch that 99 % of all faces keep, over all frames;
+        - `pooled_stretch_p99`: the principal stretch that 99 % of the faces of all frames keep;
         - `gap_relative_median`, `gap_relative_max`: the optimality gap in our energy, from the trajectory's own
           states, relative to what a frame has to gain; `gap_median_j`, `gap_mean_j` and `gap_p90_j` in joules;
           `gap_frames`, the number of frames that it was measured in;
         - `intersections_cloth`, `intersections_body`: pairs of triangles that intersect in the last frame, and,
-          ending in `_max`, in the worst of the frames measured. None without the extra `score`.
+          ending in `_max`, in the worst of the frames measured. None without the extra `score`. `garments` has
+          those of the last frame that a garment takes part in.
 
     Raises:
         ConfigError: `every` is less than one.
@@ -67,20 +72,22 @@ def score_trajectory(
     _check(positions, scene, every)
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
-    report = trajectory_report(with_energies(trajectory, scene), scene, parts=parts, poses=poses)
+    report = trajectory_report(
+        with_energies(trajectory, scene), scene, parts=parts, poses=poses, outfit=outfit
+    )
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:
         skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
         report |= wear_report(positions, scene.garment, skinned, poses)
     ends = jax.device_get(trajectory_gap(trajectory, scene, every=every))
     is_face = np.asarray(scene.garment.rest_areas) > 0
-    stretches = np.asarray(_stretches(trajectory.positions[1:], scene))[:, is_face]
+    stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))[:, is_face]
     return report | {
-        "stretch_p99": float(np.quantile(stretches, 0.99)),
+        "pooled_stretch_p99": float(np.quantile(stretches, 0.99)),
         "gap_frames": len(ends.reached),
         **gap_medians(ends, ends.reached),
         "gap_relative_max": float(np.max(ends.share(ends.reached))),
-        **_count_intersections(positions, scene, every),
+        **_count_intersections(positions, scene, every, report["garments"]),
     }
 
 
@@ -101,25 +108,31 @@ def _check(positions: np.ndarray, scene: Scene, every: int) -> None:
         raise NonFiniteError(f"frame {np.argmin(is_finite)} is not finite; cut the trajectory before it")
 
 
-@jax.jit
-def _stretches(positions: Float[Array, "frames vertices 3"], scene: Scene) -> Float[Array, "frames faces"]:
-    """Return the larger principal stretch of every face."""
-    return jax.lax.map(lambda position: principal_stretches(position, scene.garment)[0], positions)
+def _count_intersections(
+    positions: np.ndarray, scene: Scene, every: int, garments: dict[str, dict[str, Any]] | None
+) -> dict[str, int | None]:
+    """Return the pairs of triangles that intersect in the last frame, and in the worst of every so many.
 
-
-def _count_intersections(positions: np.ndarray, scene: Scene, every: int) -> dict[str, int | None]:
-    """Return the pairs of triangles that intersect in the last frame, and in the worst of every so many."""
+    Every entry of `garments` gets the pairs of the last frame that the garment takes part in.
+    """
     faces = np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
     body, body_faces = None, None
     if scene.body is not None:
         body, body_faces = np.asarray(scene.body.positions), np.asarray(scene.body.surface.faces)
     frames = sorted({*range(2, len(positions), every), len(positions) - 1})
     try:
-        verdicts = [
-            judge(positions[frame], faces, None if body is None else body[frame], body_faces)
+        pairs = [
+            intersecting_pairs(positions[frame], faces, None if body is None else body[frame], body_faces)
             for frame in frames
         ]
     except MissingExtraError:
         return dict.fromkeys(_INTERSECTIONS)
-    cloth, with_body = zip(*((verdict.cloth_cloth, verdict.cloth_body) for verdict in verdicts), strict=True)
+    is_body = [(found >= len(faces)).any(axis=1) for found in pairs]
+    with_body = [int(is_its.sum()) for is_its in is_body]
+    cloth = [len(is_its) - count for is_its, count in zip(is_body, with_body, strict=True)]
+    rows = garments or {}
+    for name, _, is_own in split_outfit(faces, {name: row["num_vertices"] for name, row in rows.items()}):
+        takes_part = np.isin(pairs[-1], np.flatnonzero(is_own)).any(axis=1)
+        rows[name]["intersections_cloth"] = int(np.sum(takes_part & ~is_body[-1]))
+        rows[name]["intersections_body"] = int(np.sum(takes_part & is_body[-1]))
     return dict(zip(_INTERSECTIONS, (cloth[-1], max(cloth), with_body[-1], max(with_body)), strict=True))

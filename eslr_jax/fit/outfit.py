@@ -30,9 +30,12 @@ def wear_together(garments: Sequence[GarmentFile], files: Sequence[str]) -> Garm
     Raises:
         MeshError: See `combine_garments`.
     """
-    if len(garments) == 1:
-        return garments[0]
-    return combine_garments(garments, [name.partition("#")[2] or Path(name).stem for name in files])
+    return garments[0] if len(garments) == 1 else combine_garments(garments, garment_names(files))
+
+
+def garment_names(files: Sequence[str]) -> list[str]:
+    """Return what garments are called in an outfit, see `wear_together`."""
+    return [file.partition("#")[2] or Path(file).stem for file in files]
 
 
 def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> GarmentFile:

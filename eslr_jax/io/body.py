@@ -24,6 +24,7 @@ _LAYOUT = {
     "obstacle_faces": ("biu", "faces"),
 }
 _REMEDY = "give a body npz as documented"
+_UPRIGHT = 0.7  # least height over the longest side of a standing body; a T-pose is as wide as it is high
 
 
 def read_body(path: str | Path) -> Body:
@@ -36,7 +37,7 @@ def read_body(path: str | Path) -> Body:
         The body, float32.
 
     Raises:
-        AssetError: The file is missing or damaged, or it lacks an array.
+        AssetError: The file is missing or damaged, lacks an array, or its Y is not up.
     """
     arrays = read_arrays(path, content="body")
     what = f"body file {path}"
@@ -47,6 +48,9 @@ def read_body(path: str | Path) -> Body:
     for key, (kinds, *_) in _LAYOUT.items():
         if not len(arrays[key]) or (kinds == "f" and not np.isfinite(arrays[key]).all()):
             raise AssetError(f"{what}: {key} is empty or not finite; {_REMEDY}")
+    sides = np.ptp(arrays["rest_positions"], axis=0)
+    if sides[1] < _UPRIGHT * sides.max():
+        raise AssetError(f"{what} is {sides[1]:.3g} m high and {sides.max():.3g} m long; turn it so that Y is up")
     parents = arrays["parents"].astype(np.int64)
     if parents[0] != -1 or ((parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
         raise AssetError(f"{what}: parents don't come before their children; {_REMEDY}")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ _SAME_EDGES = (
     0.5  # share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds
 )
 _HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
+_COPY = re.compile(r"\.\d{3}$")  # what Blender appends to a name that is taken
 _LAYOUT = {
     "rest_positions": ("f", "vertices 3"),
     "faces": ("iu", "faces 3"),  # indices are checked when the garment is prepared
@@ -261,6 +264,46 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
         f"{sequence.name} has edges between other vertices than the garment: its vertices have another order, or "
         "it is another garment; keep the order of the garment's file"
     )
+
+
+def in_outfit_order(
+    sequences: Sequence[MeshSequence], outfit: GarmentFile, garments: Mapping[str, GarmentFile] | None = None
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Return the positions of moving garments in the vertex order of what is worn together.
+
+    Args:
+        sequences: One mesh of all that is worn; or several, of which every garment's has its name.
+        outfit: What is worn, an outfit or a single garment.
+        garments: The garments of the outfit as they were before, by name: an order of their own files counts too.
+            By default they are cut out of the outfit.
+
+    Raises:
+        MeshError: A garment has no mesh, or see `in_vertex_order`.
+    """
+    if len(sequences) == 1:
+        return in_vertex_order(sequences[0], outfit)
+    garments = garments or _cut_apart(outfit)
+    meshes = {_COPY.sub("", sequence.mesh): sequence for sequence in sequences}
+    if missing := [name for name in garments if name not in meshes]:
+        raise MeshError(
+            f"{sequences[0].name} is one of the meshes {', '.join(meshes)}, and none is called "
+            f"{' or '.join(missing)}; give every mesh the name of its garment, or score a single one as FILE#NAME"
+        )
+    return np.concatenate([in_vertex_order(meshes[name], worn) for name, worn in garments.items()], axis=1)
+
+
+def _cut_apart(outfit: GarmentFile) -> dict[str, GarmentFile]:
+    """Return the garments of an outfit, without their parts and texture coordinates."""
+    return {
+        name: GarmentFile(
+            outfit.rest_positions[rows],
+            outfit.faces[is_own] - rows.start,
+            outfit.skin_weights[rows],
+            outfit.skin_indices[rows],
+            outfit.is_pinned[rows],
+        )
+        for name, rows, is_own in split_outfit(outfit.faces, outfit.outfit)
+    }
 
 
 def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:

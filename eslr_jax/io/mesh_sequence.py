@@ -31,6 +31,7 @@ class MeshSequence:
     positions: np.ndarray  # [frames, vertices, 3] [m], float64
     faces: np.ndarray  # [faces, 3]
     fps: float
+    mesh: str = ""  # its name in a file that holds several
 
     def __post_init__(self) -> None:
         """Check the arrays.
@@ -65,16 +66,34 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         The mesh in motion; positions as in the files, which must be in metres with Y up.
 
     Raises:
-        AssetError: The path or one of its files can't be read.
+        AssetError: The path or one of its files can't be read, or several meshes move.
         MeshError: The faces change, or the arrays form no mesh.
         MotionError: The frame rate is impossible.
+    """
+    sequences = read_mesh_sequences(path, fps=fps)
+    if len(sequences) != 1:
+        known = ", ".join(sequence.mesh for sequence in sequences)
+        raise AssetError(
+            f"{path}: {len(sequences)} meshes are moved by shapes, not one; it has {known}; name one, as in "
+            f"{Path(path).name.partition('#')[0]}#NAME"
+        )
+    return sequences[0]
+
+
+def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[MeshSequence]:
+    """Read all meshes in motion of a file: one, or those that shapes move in a glTF file, over the same frames.
+
+    Arguments and errors are those of `read_mesh_sequence`.
     """
     file, _, mesh = str(path).partition("#")
     if Path(file).suffix.lower() in GLTF_SUFFIXES:
         return _read_gltf(Path(file), mesh, fps)
     path = Path(path)
-    if path.is_dir():
-        return _read_folder(path, fps or DEFAULT_FPS)
+    return [_read_folder(path, fps or DEFAULT_FPS) if path.is_dir() else _read_archive(path, fps)]
+
+
+def _read_archive(path: Path, fps: float | None) -> MeshSequence:
+    """Read an npz file."""
     keys = (*_POSITION_KEYS, "faces", "fps", "timestep")
     arrays = read_arrays(path, content="mesh sequence", names=keys)
     key = next((key for key in _POSITION_KEYS if key in arrays), None)
@@ -131,8 +150,8 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
     return MeshSequence(folder.name, np.stack(frames), faces, fps)
 
 
-def _read_gltf(path: Path, name: str, fps: float | None) -> MeshSequence:
-    """Read a mesh that morph targets and its nodes move; vertices that were split at seams become one again."""
+def _read_gltf(path: Path, name: str, fps: float | None) -> list[MeshSequence]:
+    """Read the meshes that morph targets and nodes move, all or those of a name."""
     with parsing(path, "mesh sequence") as file:
         document = GltfDocument(file)
         animations = document.items("animations")
@@ -144,28 +163,46 @@ def _read_gltf(path: Path, name: str, fps: float | None) -> MeshSequence:
             if "skin" not in entry  # a body
         }
         chosen = [node for node, known in found.items() if name in ("", known)]
-        if len(chosen) != 1:
+        if not chosen:
             known = ", ".join(found.values()) or "none"
             raise AssetError(
-                f"{path}: {len(chosen)} meshes{name and f' named {name!r}'} are moved by shapes, not one; it has "
-                f"{known}; name one, as in {path.name}#NAME, or export the garment with its shape keys"
+                f"{path}: no mesh{name and f' named {name!r}'} is moved by shapes; it has {known}; export the "
+                "garment with its shape keys"
             )
-        _, _, kind, times, values = shapes[chosen[0]]
-        at, rate = document.sample_times([times], fps)
+        at, rate = document.sample_times([shapes[node][3] for node in chosen], fps)
         moves = [key for entry in animations for key in document.key_frames(entry)]
         moved = {
             (node, path): sample_keys(path, how, keys, at_keys, at)
             for node, path, how, keys, at_keys in moves
         }
-        world = document.world_matrices(moved, len(at))[:, chosen[0]]
-        shapes_at, faces = _read_shapes(document, nodes[chosen[0]]["mesh"])
-        weights = sample_keys("weights", kind, times, values, at)
-        if weights.shape[1] != len(shapes_at) - 1 or len(at) * shapes_at.shape[1] > MAX_POINTS:
-            raise document.fail(f"has {weights.shape[1]} weights for {len(shapes_at) - 1} shapes of a mesh")
-        kept, place = shared_vertices(shapes_at.swapaxes(0, 1))
-        local = shapes_at[0, kept] + np.tensordot(weights, shapes_at[1:, kept], axes=1)
-        positions = np.einsum("fij,fvj->fvi", world[:, :3, :3], local) + world[:, None, :3, 3]
-        return MeshSequence(path.name, positions, place[faces], rate)
+        world = document.world_matrices(moved, len(at))
+        sequences = []
+        for node in chosen:
+            _, _, kind, times, values = shapes[node]
+            weights = sample_keys("weights", kind, times, values, at)
+            positions, faces = _moved_by_shapes(document, nodes[node]["mesh"], weights, world[:, node])
+            label = path.name if len(found) == 1 else f"{path.name}#{found[node]}"
+            sequences.append(MeshSequence(label, positions, faces, rate, found[node]))
+        return sequences
+
+
+def _moved_by_shapes(
+    document: GltfDocument, index: int, weights: np.ndarray, world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [m] and faces of a mesh; vertices that were split at seams become one again.
+
+    Args:
+        document: Its file.
+        index: Its number.
+        weights: Of its shapes, shape [frames, shapes].
+        world: From its own space to the world's, shape [frames, 4, 4].
+    """
+    shapes, faces = _read_shapes(document, index)
+    if weights.shape[1] != len(shapes) - 1 or len(weights) * shapes.shape[1] > MAX_POINTS:
+        raise document.fail(f"has {weights.shape[1]} weights for {len(shapes) - 1} shapes of a mesh")
+    kept, place = shared_vertices(shapes.swapaxes(0, 1))
+    local = shapes[0, kept] + np.tensordot(weights, shapes[1:, kept], axes=1)
+    return np.einsum("fij,fvj->fvi", world[:, :3, :3], local) + world[:, None, :3, 3], place[faces]
 
 
 def _read_shapes(document: GltfDocument, index: int) -> tuple[np.ndarray, np.ndarray]:

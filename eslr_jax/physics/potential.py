@@ -41,7 +41,7 @@ from eslr_jax.physics.friction import friction_energy
 from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.problem import FrameProblem, mean_vertex_area, pin
+from eslr_jax.physics.problem import FrameProblem, pin
 from eslr_jax.physics.repulsion import repulsion_energy
 from eslr_jax.types import Contacts, PotentialTerms
 
@@ -132,7 +132,7 @@ def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array
     if body is not None:
         stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
         if body.skin is not None:
-            area = mean_vertex_area(problem.garment)
+            area = problem.garment.mean_vertex_area
             on_body += skin_energy(position, body.skin, area, stiffness, thickness)
         if body.tips is not None:
             on_body += repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import Vector3, components, scatter_corners
 from eslr_jax.physics.collision import penetration, skin_diagonal
-from eslr_jax.physics.problem import FrameProblem, mean_vertex_area
+from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 
@@ -90,7 +90,7 @@ def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -
         skin, tips = problem.body.skin, problem.body.tips
         stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
         if skin is not None:
-            diagonal += skin_diagonal(position, skin, mean_vertex_area(problem.garment), stiffness, thickness)
+            diagonal += skin_diagonal(position, skin, problem.garment.mean_vertex_area, stiffness, thickness)
         if tips is not None:
             diagonal += repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
     if problem.layers is not None:

@@ -109,13 +109,8 @@ def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> 
         garment: Rest mesh; its mean vertex area gives the spacing.
         thickness: Distance that a smooth sheet would keep [m].
     """
-    squared_edge = 2.0 / jnp.sqrt(3.0) * mean_vertex_area(garment)  # of equilateral triangles, two per vertex
+    squared_edge = 2.0 / jnp.sqrt(3.0) * garment.mean_vertex_area  # of equilateral triangles, two per vertex
     return thickness + squared_edge / (8.0 * _LIMB_RADIUS)
-
-
-def mean_vertex_area(garment: Garment) -> Float[Array, ""]:
-    """Return the area of cloth that a vertex stands for in the mean [m^2]."""
-    return jnp.sum(garment.vertex_areas) / jnp.sum(garment.vertex_mask, dtype=garment.vertex_areas.dtype)
 
 
 def weight_norm(problem: FrameProblem) -> Float[Array, ""]:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.body.clothing import Skinned, body_layers
+from eslr_jax.body.clothing import Piece, Skinned, body_pieces
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
 from eslr_jax.extras import require
-from eslr_jax.io.palette import BODY_COLORS, GARMENT_COLORS
+from eslr_jax.io.palette import GARMENT_COLORS
 from eslr_jax.render.annotate import side_by_side
 from eslr_jax.render.camera import Camera, facing_angles, follow, parse_angle
 from eslr_jax.render.scene import Surface, trace_picture
@@ -88,18 +88,18 @@ def render_frames(
     )
     indices = range(len(garment.positions)) if frame_indices is None else list(frame_indices)
 
-    layers = []
+    pieces: list[Piece] = []
     if body is not None and rest_positions is not None:
-        layers = body_layers(np.asarray(rest_positions), body.faces, rig)
+        pieces = body_pieces(np.asarray(rest_positions), body.faces, rig)
     elif body is not None:
-        layers = body_layers(body.positions[0], body.faces, None)
+        pieces = body_pieces(body.positions[0], body.faces, None)
 
     def trace(index: int, view: Camera) -> np.ndarray:
         surfaces = [Surface("garment", garment.positions[index], garment.faces, colors[index], True)]
-        for layer in layers:
+        for piece in pieces:
             assert body is not None
-            place = layer.place(body.positions[index])
-            surfaces.append(Surface(f"body {layer.kind}", place, layer.faces, BODY_COLORS[layer.kind], False))
+            place = piece.place(body.positions[index])
+            surfaces.append(Surface(f"body {piece.name}", place, piece.faces, piece.color, False))
         return trace_picture(surfaces, view, ground_height=ground_height, size=size, samples=samples)
 
     return (trace(index, cameras[index]) for index in indices)

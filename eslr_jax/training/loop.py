@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import os
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, CheckpointError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
+from eslr_jax.simulation.interrupt import Interruption
 from eslr_jax.training.checkpoint import Checkpoints, has_checkpoint, read_run_config, write_run_config
 from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
@@ -76,13 +75,13 @@ def train(
     began, first = time.perf_counter(), int(state.step)
     spent = core_seconds(out) - time.process_time()
     metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
-    with metrics_file.open("a") as log, contextlib.ExitStack() as stack:
-        is_stopping: Callable[[int], bool] | None = None
+    with metrics_file.open("a") as log, Interruption() as stop:
         for step in range(first, config.steps):
             resolution = step % len(step_functions)
             state, metrics = step_functions[resolution](state, datasets[resolution])
-            if step - first == len(step_functions) - 1:  # all is compiled: now there are steps to lose
-                is_stopping = stack.enter_context(_stop_requested())
+            # Once all is compiled there are steps to lose. jax.distributed has the signals of several processes.
+            if step - first == len(step_functions) - 1 and jax.process_count() == 1:
+                stop.begin()
             window.append(metrics)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
@@ -106,7 +105,7 @@ def train(
                     )
             if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
-            if is_stopping is not None and is_stopping(done):
+            if _is_stopping(stop, done):
                 if done % config.checkpoint_every:
                     checkpoints.save(state)
                 break
@@ -114,6 +113,13 @@ def train(
     if int(state.step) >= config.steps and is_first_process():
         export(state, config, out)
     return state
+
+
+def _is_stopping(stop: Interruption, done: int) -> bool:
+    """Tell whether to stop after a step: several processes after the same one, as jax.distributed agrees on."""
+    if jax.process_count() > 1:
+        return multihost_utils.reached_preemption_sync_point(done)
+    return stop.is_wanted
 
 
 def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
@@ -190,30 +196,3 @@ def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoi
             f"{skipped} updates were not finite by step {int(state.step)}; the last good checkpoint "
             f"is {last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
         )
-
-
-@contextlib.contextmanager
-def _stop_requested() -> Iterator[Callable[[int], bool]]:
-    """Turn SIGTERM and Ctrl-C into a question that the loop asks; a second signal acts at once.
-
-    Several processes must stop after the same iteration; jax.distributed then catches the signal.
-    """
-    if jax.process_count() > 1:
-        yield multihost_utils.reached_preemption_sync_point
-        return
-    received: list[int] = []
-    before = {}
-
-    def remember(number, frame):
-        received.append(number)
-        for which, handler in before.items():
-            signal.signal(which, handler)
-
-    with contextlib.suppress(ValueError):  # not in the main thread: leave signals alone
-        for which in (signal.SIGTERM, signal.SIGINT):
-            before[which] = signal.signal(which, remember)
-    try:
-        yield lambda done: bool(received)
-    finally:
-        for which, handler in before.items():
-            signal.signal(which, handler)

@@ -27,9 +27,11 @@ def plot_curves(folder: Path) -> Path | None:
         return None
     steps = [record["step"] for record in records]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    left.plot(steps, [record["loss"] for record in records], label="loss")
     label = _CONTRACTION if read_run_config(folder).refinement_weights == "contraction" else _LOSS
-    left.set(xlabel="step", ylabel=label, yscale="symlog")
+    losses = [record["loss"] for record in records]
+    spans_decades = not 0 < max(losses) < 10 * min(losses)
+    left.plot(steps, losses)
+    left.set(xlabel="step", ylabel=label, yscale="symlog" if spans_decades else "linear")
     for term in _TERMS:
         right.plot(steps, [max(record[term], 1e-7) for record in records], label=term)
     right.set(xlabel="step", ylabel="energy at the prediction, median [J]", yscale="log")

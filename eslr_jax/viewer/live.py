@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.extras import require
@@ -36,7 +37,6 @@ from eslr_jax.simulation.live import (
     there_and_back,
 )
 from eslr_jax.types import Body, BodyMotion, ClothState
-from eslr_jax.viewer.figures import Piece, body_pieces, garment_pieces
 from eslr_jax.viewer.live_controls import (
     Choice,
     add_controls,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
+from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.evaluation.fields import FIELDS, Field, run_field
 from eslr_jax.extras import require
@@ -19,7 +20,6 @@ from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import Run
 from eslr_jax.render.colors import color_scale
 from eslr_jax.viewer.curves import add_plot, frame_values, show_plot, worst_frame
-from eslr_jax.viewer.figures import Piece, body_pieces, garment_pieces
 
 PLAIN = "fabric"  # colour by nothing
 _SPACING = 1.3  # [m] between runs: arms held out pass each other

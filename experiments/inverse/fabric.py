@@ -120,7 +120,11 @@ def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, s
         x, y, z = measured[index].T
         faces = np.asarray(scene.garment.faces)
         motion.plot_trisurf(x, z, y, triangles=faces, color=shades[index], edgecolor="k", linewidth=0.1)
-    motion.set(xlabel="x [m]", ylabel="z [m]", zlabel="y [m]", title="frames 0, 4, 8 and 12")
+    motion.set(title="frames 0, 4, 8 and 12")
+    for axis, name in zip((motion.xaxis, motion.yaxis, motion.zaxis), "xzy", strict=True):
+        axis.set_label_text(f"{name} [m]")
+        axis.labelpad = 10  # [points], beside the numbers
+        axis.set_major_locator(plt.MaxNLocator(4))
     curve = figure.add_subplot(1, 2, 2)
     for index, (by_gradient, simplex) in enumerate(runs):
         evaluations = cost * np.arange(1, len(by_gradient.losses) + 1)

@@ -58,7 +58,7 @@ def test_a_worse_trajectory_scores_worse(task):
     better, worse = (score_trajectory(own.positions + scale * noise, scene, every=2) for scale in (0.0, 1.0))
     assert better["gap_relative_median"] < 0.02 < worse["gap_relative_median"]
     assert better["gap_median_j"] < worse["gap_median_j"]
-    assert better["stretch_p99"] < worse["stretch_p99"]
+    assert better["pooled_stretch_p99"] < worse["pooled_stretch_p99"]
 
 
 @pytest.mark.slow

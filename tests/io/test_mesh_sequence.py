@@ -11,9 +11,15 @@ from eslr_jax.body.sequence import pose_sequence
 from eslr_jax.body.units import UnitsWarning
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.animated import AnimatedMesh
-from eslr_jax.io.garment import GarmentFile, in_vertex_order
+from eslr_jax.io.garment import GarmentFile, in_outfit_order, in_vertex_order
 from eslr_jax.io.gltf import TOLERANCE, write_animated_glb
-from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, obj_text, read_mesh_sequence
+from eslr_jax.io.mesh_sequence import (
+    MeshSequence,
+    is_mesh_sequence,
+    obj_text,
+    read_mesh_sequence,
+    read_mesh_sequences,
+)
 from eslr_jax.io.skin import Skin
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
@@ -154,8 +160,19 @@ def test_one_of_several_moving_meshes_of_a_glb_is_named(tmp_path):
         read_mesh_sequence(tmp_path / "a.glb")
     assert read_mesh_sequence(f"{tmp_path / 'a.glb'}#skirt").positions.shape == MOVING.shape
     write_shapes(tmp_path / "body.glb")
-    with pytest.raises(AssetError, match="0 meshes are moved by shapes"):
+    with pytest.raises(AssetError, match="no mesh is moved by shapes"):
         read_mesh_sequence(tmp_path / "body.glb")
+
+
+def test_meshes_of_a_glb_are_read_together(tmp_path):
+    write_shapes(tmp_path / "a.glb", "shirt", "skirt", turn=90.0)
+    sequences = read_mesh_sequences(tmp_path / "a.glb")
+    assert [sequence.mesh for sequence in sequences] == ["shirt", "skirt"]
+    for sequence in sequences:
+        alone = read_mesh_sequence(f"{tmp_path / 'a.glb'}#{sequence.mesh}")
+        np.testing.assert_array_equal(sequence.positions, alone.positions)
+    np.savez(tmp_path / "a.npz", positions=MOVING, faces=FACES)
+    assert len(read_mesh_sequences(tmp_path / "a.npz")) == 1
 
 
 def garment_of(order=None):
@@ -173,6 +190,38 @@ def test_positions_come_in_the_order_of_the_garment_whichever_of_its_files_they_
     np.testing.assert_array_equal(in_vertex_order(source, garment_of(order)), MOVING)
     joined = MeshSequence("joined", in_file[:, :-4], back[FACES], 30.0)
     np.testing.assert_array_equal(in_vertex_order(joined, garment_of(order)), MOVING)
+
+
+def outfit_of(low, high):
+    """The capsule twice, one above the other, each with its own order of vertices in its file."""
+    count = len(CAPSULE.vertices)
+    rest, one = np.concatenate([MOVING[0], MOVING[0] + 2.0]), np.ones((2 * count, 1))
+    return GarmentFile(
+        rest,
+        np.concatenate([FACES, FACES + count]),
+        one,
+        0 * one.astype(int),
+        one[:, 0] > 1,
+        metadata={"outfit": {low: count, high: count}},
+    )
+
+
+def test_garments_worn_together_are_found_by_the_names_of_their_meshes():
+    moved = np.concatenate([MOVING, MOVING + 2.0], axis=1)
+    skirt = MeshSequence("a.glb#skirt", MOVING, FACES, 30.0, "skirt")
+    order = np.random.default_rng(0).permutation(len(CAPSULE.vertices))
+    top = MeshSequence("a.glb#top.001", MOVING[:, order] + 2.0, np.argsort(order)[FACES], 30.0, "top.001")
+    files = {"skirt": garment_of(), "top": garment_of(order)}
+    outfit = outfit_of("skirt", "top")
+    np.testing.assert_array_equal(in_outfit_order([top, skirt], outfit, files), moved)
+    straight = MeshSequence("a.glb#top", MOVING + 2.0, FACES, 30.0, "top")
+    np.testing.assert_array_equal(in_outfit_order([straight, skirt], outfit), moved)
+    whole = MeshSequence("a.npz", moved, outfit.faces, 30.0)
+    np.testing.assert_array_equal(in_outfit_order([whole], outfit), moved)
+    with pytest.raises(MeshError, match="meshes top, skirt, and none is called trousers"):
+        in_outfit_order([top, skirt], outfit_of("trousers", "top"))
+    with pytest.raises(MeshError, match="its vertices have another order"):
+        in_outfit_order([top, skirt], outfit)
 
 
 def test_quads_cut_along_the_other_diagonal_are_the_same_mesh():

@@ -31,6 +31,10 @@ BROKEN_BODIES = {
     "a vertex beyond": ({"faces": np.full((24540, 3), 20000)}, "20000"),
     "a cycle": ({"parents": np.full(31, 3)}, "parents"),
     "not finite": ({"joint_rest_positions": np.full((31, 3), np.nan)}, "finite"),
+    "lying": (
+        {"rest_positions": np.linspace(0, 1, 12272)[:, None] * [0.5, 0.3, 1.8]},
+        "turn it so that Y is up",
+    ),
     "faces of floats": ({"faces": np.zeros((24540, 3))}, "faces"),
 }
 

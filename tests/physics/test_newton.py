@@ -104,7 +104,7 @@ def test_vertex_blocks_equal_the_hessian(case64):
 
 def one_pair(case):
     """The first vertex over the last face, and a row that is not used."""
-    vertices, faces = np.array([0, 5]), np.asarray(case.problem.garment.faces)[[-1, 7]]
+    vertices, faces = np.array([0, 5], np.int32), np.asarray(case.problem.garment.faces)[[-1, 7]]
     return FacePairs(
         vertices=vertices,
         corners=faces,

@@ -1,0 +1,44 @@
+"""Ctrl-C after what is in work, where it can be kept (host)."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+
+
+class Interruption:
+    """Turns Ctrl-C and SIGTERM into a question, from `begin` on; a second signal acts at once.
+
+    A context: at its end the signals act as before.
+    """
+
+    def __init__(self, on_wanted: Callable[[], None] = lambda: None):
+        """Remember what to call when the first signal comes."""
+        self._on_wanted = on_wanted
+        self._before: dict[signal.Signals, Callable | int | None] = {}
+        self.is_wanted = False
+
+    def __enter__(self) -> Interruption:
+        """Return itself; nothing is taken over yet."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the signals back."""
+        self._end()
+
+    def begin(self) -> None:
+        """Take over the signals; outside the main thread they are left alone, as Python asks."""
+        if not self._before and threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._remember)
+
+    def _end(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def _remember(self, number: int, frame: object) -> None:
+        self.is_wanted = True
+        self._end()
+        self._on_wanted()
