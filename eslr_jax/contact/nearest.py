@@ -239,7 +239,8 @@ def _go_on(
     distance, length = jnp.sqrt(location.squared_distance), safe_norm(path)
     gone = safe_norm(carry.gone)
     is_end = gone > 0.999 * length
-    is_hit = carry.is_open & is_outside & (gone > 0) & (distance < jnp.where(is_end, CONTACT_RADIUS, _IMPACT))
+    is_close = distance < jnp.where(is_end, CONTACT_RADIUS, _IMPACT)
+    is_hit = carry.is_open & is_outside & (gone > 0) & is_close & ~_is_on_boundary(location, surface)
     is_open = carry.is_open & is_outside & ~is_end & (distance >= _IMPACT)
     share = jnp.minimum((gone + distance - 0.5 * _IMPACT) / jnp.maximum(length, CONTACT_RADIUS), 1.0)
     return carry._replace(
@@ -267,10 +268,7 @@ def _contacts_at(
     side = jnp.sum((position - points) * here, axis=-1)
     is_apart = location.squared_distance > 0  # on the surface the root has no slope
     distance = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, location.squared_distance, 1.0)), 0.0)
-    on_boundary = surface.is_boundary[surface.faces[location.face]]
-    is_on_boundary = (
-        sum(jnp.where(on_boundary[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY
-    )
+    is_on_boundary = _is_on_boundary(location, surface)
     return Contacts(
         points=points,
         next_points=next_points,
@@ -282,6 +280,12 @@ def _contacts_at(
         & ~is_on_boundary,
         faces=location.face,
     )
+
+
+def _is_on_boundary(location: SurfacePoint, surface: BodySurface) -> Bool[Array, " vertices"]:
+    """Return which points lie where the surface ends."""
+    corners = surface.is_boundary[surface.faces[location.face]]
+    return sum(jnp.where(corners[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY  # type: ignore[return-value, operator]
 
 
 def approach(
