@@ -72,6 +72,8 @@ class Garment:
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
     coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
+    # Its lengths are those of `with_rest_positions`: what the host prepared for the shape before is refused.
+    is_recut: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def mean_vertex_area(self) -> Float[Array, ""]:

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
+from known_answers.drape import hang
 from PIL import Image
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
@@ -39,6 +40,7 @@ from eslr_jax.io.garment import read_garment_source
 from eslr_jax.io.mesh_sequence import obj_text
 from eslr_jax.io.palette import outfit_colors
 from eslr_jax.io.run import ClothTrack, read_run, write_run
+from eslr_jax.physics.materials import WOVEN, fabric_names
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
@@ -205,10 +207,15 @@ def outfits(frames: int) -> np.ndarray:
 
 
 def fabrics(frames: int) -> np.ndarray:
-    """One dress of four fabrics."""
-    names = ("silk", "cotton", "sweatshirt", "denim")
-    pictures = [figures(shoot(("dress",), frames, fabric=(name,)), [frames - 1])[0] for name in names]
-    return side_by_side(pictures, names)
+    """A disc of every fabric, hung over a round table as in Cusick's test."""
+    names = (*fabric_names(), *WOVEN)
+    size = {"spacing": 0.03, "frames": frames} if frames == _SMOKE_FRAMES else {}
+    pictures = []
+    for name in names:
+        end, _, faces, _ = hang(name, **size)
+        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(240, 180))
+        pictures.append(next(picture))
+    return side_by_side(pictures, names, columns=4)
 
 
 def extend(frames: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.search import PosedSurface, face_corners, nearest_faces, opposing_faces
 from eslr_jax.contact.triangle import point_triangle
@@ -20,6 +20,8 @@ _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above wh
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
+_IMPACT = 0.02  # [m] before the body, where the path of thrown cloth ends
+_SEARCHES = 8  # along such a path, at most; straight at a wall, two
 
 
 class SurfacePoint(NamedTuple):
@@ -108,6 +110,7 @@ def find_both_sides(
     next_body: Float[Array, "surface_vertices 3"],
     surface: BodySurface,
     blocks: Int[Array, "blocks rows"] | None = None,
+    predicted: Float[Array, "vertices 3"] | None = None,
 ) -> tuple[Contacts, Contacts]:
     """Return the nearest contacts, and those with the part of the body that faces them across the cloth.
 
@@ -115,18 +118,29 @@ def find_both_sides(
     limb sweeps over a vertex and then pushes it out on its far side. Where no part of the body faces a vertex
     from within reach, the opposing contact is not near and names any face.
 
+    Cloth that is thrown, by more than the contact radius in a frame, touches the body where its path meets it.
+
     Args:
         position: Garment vertices at t [m].
         body: Surface vertices at t [m].
         next_body: Surface vertices at t + 1 [m].
         surface: Search tables.
         blocks: Compact groups of vertices, see `nearest_point`.
+        predicted: A guess of the vertices at t + 1 [m], such as the inertial one; without it nothing is thrown.
     """
     step = _surface_step(body, next_body, surface)
-    contacts = _contacts_at(nearest_point(position, body, surface, blocks), position, step, surface)
+    groups = _or_single(blocks, position)
+    if predicted is None:
+        query, location = position, nearest_point(position, body, surface, blocks)
+    else:
+        still = jax.lax.stop_gradient((position, predicted, step))
+        face, gone = _nearest_on_path(*still, surface, groups)
+        query = position + gone
+        location = _point_on(face, query, body, surface)
+    contacts = _contacts_at(location, query, step, surface)
     posed = PosedSurface(body, step.normals, CONTACT_RADIUS + safe_norm(next_body - body))
-    query, facing, posed = jax.lax.stop_gradient((position, contacts.normals, posed))
-    face, is_found = opposing_faces(query, facing, posed, surface, _or_single(blocks, position), _OPPOSED)
+    at, facing, posed = jax.lax.stop_gradient((position, contacts.normals, posed))
+    face, is_found = opposing_faces(at, facing, posed, surface, groups, _OPPOSED)
     opposing = _contacts_at(_point_on(face, position, body, surface), position, step, surface)
     is_facing = jnp.sum(opposing.normals * contacts.normals, axis=-1) < _OPPOSED
     is_outside = opposing.distances > -_TOUCHING
@@ -152,6 +166,91 @@ def _surface_step(
     return _SurfaceStep(body, next_body, *ends)
 
 
+def _nearest_on_path(
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    step: _SurfaceStep,
+    surface: BodySurface,
+    blocks: Int[Array, "blocks rows"],
+) -> tuple[Int[Array, " vertices"], Float[Array, "vertices 3"]]:
+    """Return the nearest face of every vertex, and how far along its path that was looked for [m].
+
+    That is nowhere along it, unless the vertex is thrown: then it is where its path, as the body sees it, first
+    comes close to the body, or ends near it. The nearest point at t says nothing of a body that lies half a
+    metre ahead, nor of a rod on the way. From every place that is searched the vertex may go on by the distance
+    found there, and meets nothing (Hart 1996, Sphere Tracing). The whole surface is searched anew, in the same
+    compiled loop, only in frames with thrown cloth.
+    """
+    moves = step.next_positions - step.positions
+
+    def look(carry: _Path) -> _Path:
+        query = position + carry.gone
+        face = nearest_faces(query, step.positions, surface, blocks)
+        path = predicted - position - moves[surface.faces[face, 0]]
+        is_thrown = carry.is_open & (jnp.sum(path * path, axis=1) > CONTACT_RADIUS**2)
+        first = jnp.where(carry.searches == 0, face, carry.face)
+        carry = carry._replace(searches=carry.searches + 1, face=first, is_open=is_thrown)
+        return jax.lax.cond(
+            jnp.any(is_thrown), lambda: _go_on(carry, face, query, path, step, surface), lambda: carry
+        )
+
+    count = position.shape[0]
+    nowhere, nobody = jnp.zeros_like(position), jnp.zeros(count, bool)
+    start = _Path(jnp.int32(0), jnp.zeros(count, jnp.int32), nowhere, ~nobody, nobody)
+
+    def is_going(carry: _Path) -> Bool[Array, ""]:
+        return (carry.searches < _SEARCHES) & jnp.any(carry.is_open)
+
+    end = jax.lax.while_loop(is_going, look, start)
+    return end.face, jnp.where(end.is_hit[:, None], end.gone, 0.0)
+
+
+class _Path(NamedTuple):
+    """How far vertices were followed."""
+
+    searches: Int[Array, ""]
+    face: Int[Array, " vertices"]  # nearest at t, or where the body is hit
+    gone: Float[Array, "vertices 3"]  # [m]
+    is_open: Bool[Array, " vertices"]  # still on its way
+    is_hit: Bool[Array, " vertices"]
+
+
+def _go_on(
+    carry: _Path,
+    face: Int[Array, " vertices"],
+    query: Float[Array, "vertices 3"],
+    path: Float[Array, "vertices 3"],
+    step: _SurfaceStep,
+    surface: BodySurface,
+) -> _Path:
+    """Return vertices that are still on their way carried on by their distance from the body.
+
+    Args:
+        carry: What is known of them.
+        face: Nearest to where they are.
+        query: Where they are [m].
+        path: Their whole path, as the body sees it [m].
+        step: The body.
+        surface: Search tables.
+    """
+    location = _point_on(face, query, step.positions, surface)
+    points, normals = (interpolate(values, location, surface) for values in (step.positions, step.normals))
+    is_outside = jnp.sum((query - points) * normals, axis=1) > 0
+    distance, length = jnp.sqrt(location.squared_distance), safe_norm(path)
+    gone = safe_norm(carry.gone)
+    is_end = gone > 0.999 * length
+    is_close = distance < jnp.where(is_end, CONTACT_RADIUS, _IMPACT)
+    is_hit = carry.is_open & is_outside & (gone > 0) & is_close & ~_is_on_boundary(location, surface)
+    is_open = carry.is_open & is_outside & ~is_end & (distance >= _IMPACT)
+    share = jnp.minimum((gone + distance - 0.5 * _IMPACT) / jnp.maximum(length, CONTACT_RADIUS), 1.0)
+    return carry._replace(
+        face=jnp.where(is_hit, face, carry.face),
+        gone=jnp.where(is_open[:, None], share[:, None] * path, carry.gone),
+        is_open=is_open,
+        is_hit=carry.is_hit | is_hit,
+    )
+
+
 def _contacts_at(
     location: SurfacePoint,
     position: Float[Array, "vertices 3"],
@@ -169,10 +268,7 @@ def _contacts_at(
     side = jnp.sum((position - points) * here, axis=-1)
     is_apart = location.squared_distance > 0  # on the surface the root has no slope
     distance = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, location.squared_distance, 1.0)), 0.0)
-    on_boundary = surface.is_boundary[surface.faces[location.face]]
-    is_on_boundary = (
-        sum(jnp.where(on_boundary[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY
-    )
+    is_on_boundary = _is_on_boundary(location, surface)
     return Contacts(
         points=points,
         next_points=next_points,
@@ -184,6 +280,12 @@ def _contacts_at(
         & ~is_on_boundary,
         faces=location.face,
     )
+
+
+def _is_on_boundary(location: SurfacePoint, surface: BodySurface) -> Bool[Array, " vertices"]:
+    """Return which points lie where the surface ends."""
+    corners = surface.is_boundary[surface.faces[location.face]]
+    return sum(jnp.where(corners[:, k], location.barycentric[k], 0.0) for k in range(3)) > _ON_BOUNDARY  # type: ignore[return-value, operator]
 
 
 def approach(

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3, arctan2, cross3, dot3, gather_corners, gather_values, in_memory, sub3
 from eslr_jax.types import Garment, Material, Plate
 
@@ -154,7 +155,16 @@ def hinge_energies(
 
 
 def angle_energy(angle: Float[Array, " hinges"], garment: Garment, material: Material) -> Float[Array, ""]:
-    """Return the bending energy [J] by the angles of the hinges [rad]."""
+    """Return the bending energy [J] by the angles of the hinges [rad].
+
+    Raises:
+        ConfigError: The material has a plate, and the garment is not of the shape that it was made for.
+    """
+    if material.plate is not None and garment.is_recut:
+        raise ConfigError(
+            "bending in N m does not follow a rest shape of with_rest_positions; give bending_stiffness instead, "
+            "or prepare_garment with the new shape and describe the fabric for that"
+        )
     if material.plate is not None:
         moments = plate_curvatures(angle, material.plate)
         return 0.5 * sum((jnp.sum(moment * moment) for moment in moments), jnp.zeros((), angle.dtype))

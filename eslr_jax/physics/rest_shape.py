@@ -14,7 +14,9 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
     """Return a garment whose lengths, areas and angles are measured on other rest positions.
 
     `prepare_garment` computes the same on the host, in float64. This one is for gradients with respect to the
-    shape that a garment is cut to; topology, skinning and embedding stay.
+    shape that a garment is cut to; topology, skinning and embedding stay. Warp and weft stay where they are in
+    every face. Bending in N m does not follow: a `Plate` holds the shape that it was prepared for, and energies
+    of the new garment refuse it with a ConfigError. Describe bending by `bending_stiffness`.
 
     Args:
         garment: A prepared garment.
@@ -34,6 +36,7 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
         hinge_rest_areas=jnp.where(garment.hinge_rest_areas > 0, hinge_areas, 0.0),
         hinge_rest_angles=dihedral_angles(rest_positions, garment)[0],
         vertex_areas=scatter_corners(thirds, garment.face_incidence),
+        is_recut=True,
     )
 
 

@@ -131,7 +131,7 @@ def _body_contact(
     """Return the contact of a frame with the scene's body."""
     garment, constants = problem.garment, problem.constants
     nearest, opposing = find_both_sides(
-        problem.position, step.start, step.end, body.surface, garment.vertex_blocks
+        problem.position, step.start, step.end, body.surface, garment.vertex_blocks, problem.inertial_guess
     )
     skin = tips = None
     if body.has_skin:

@@ -57,24 +57,37 @@ def _settle(scene: Any, config: SimConfig) -> tuple[jax.Array, jax.Array]:
     return trajectory.positions[-1], trajectory.velocities[-1]
 
 
-def drape(fabric: str, *, spacing: float = 0.01, frames: int = 121) -> Drape:
+def hang(
+    fabric: str, *, spacing: float = 0.01, frames: int = 121
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Lay a disc of a fabric over the table and let go of its rim.
 
     Args:
         fabric: Name, as for `eslr simulate --fabric`.
         spacing: Edges of the mesh [m].
         frames: Frames in which it settles.
+
+    Returns:
+        Where it comes to rest [m], where it lay flat [m], its faces, and the speed of the last frame, rms [mm/s].
     """
     positions, faces = disc(spacing)
     garment = make_cloth((positions, faces), {}, is_pinned=np.hypot(*positions[:, [0, 2]].T) <= TABLE)
     described = describe_fabric(fabric)
     warp = warp_directions(garment, direction=(0.0, 0.0, 1.0))
-    material = on_threads(described.sheet, garment, warp, [(np.ones(len(warp), bool), described)])
+    material = described.sheet
+    if described.weave is not None:
+        material = on_threads(material, garment, warp, [(np.ones(len(warp), bool), described)])
     start = positions.copy()
     start[:, 1] += 1e-3 * np.random.default_rng(0).standard_normal(len(start))  # else it stays round
     start[np.asarray(garment.is_pinned)] = positions[np.asarray(garment.is_pinned)]
     scene = make_scene(garment, start, frames, timestep=_SETTLING, material=material)
     end, velocity = (np.asarray(part) for part in _settle(scene, SimConfig(iterations=_ITERATIONS)))
+    return end, positions, faces, 1e3 * float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
+
+
+def drape(fabric: str, *, spacing: float = 0.01, frames: int = 121) -> Drape:
+    """Measure how a fabric hangs; the arguments are those of `hang`."""
+    end, positions, faces, speed = hang(fabric, spacing=spacing, frames=frames)
     shadow = _shadow(end, faces)
     rim = np.pi * (DISC**2 - TABLE**2)
     coefficient = (shadow.sum() * _PIXEL**2 - np.pi * TABLE**2) / rim
@@ -82,7 +95,6 @@ def drape(fabric: str, *, spacing: float = 0.01, frames: int = 121) -> Drape:
     order = np.argsort(np.arctan2(positions[is_rim, 2], positions[is_rim, 0]))
     reach = np.hypot(*end[is_rim][order][:, [0, 2]].T)
     waves = np.abs(np.fft.rfft(reach - reach.mean()))
-    speed = 1e3 * float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
     return Drape(fabric, float(coefficient), int(np.argmax(waves)), speed, shadow)
 
 

@@ -9,6 +9,7 @@ from draped_ball import drifting_ball, square
 from known_answers.sheets import irregular
 from test_newton import assemble, dense_hessian
 
+from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import Described, describe_fabric, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
@@ -19,6 +20,7 @@ from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.physics.newton import minimize_newton, potential_float64, to_float64
 from eslr_jax.physics.potential import evaluate, potential
 from eslr_jax.physics.preconditioner import stiffness
+from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.physics.tangent import apply, tangent
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
@@ -154,3 +156,17 @@ def test_a_sheet_without_threads_compiles_none(woven_problem):
     assert len(jax.tree.leaves(COTTON)) == 5
     assert gathers(plain) == (6, 6)
     assert gathers(woven_problem) == (7, 7)
+
+
+def test_bending_in_newton_metres_refuses_another_rest_shape(sheet):
+    """Its rows are those of the shape that it was prepared for: a gradient by the shape would be wrong."""
+    material = fabric_on(sheet, Weave(rigidity=(2e-6, 2e-6)))
+
+    def energy(rest):
+        return bending_energy(deformed(sheet, np.eye(3)), with_rest_positions(sheet, rest), material)
+
+    with pytest.raises(ConfigError, match="does not follow a rest shape"):
+        jax.eval_shape(jax.grad(energy), sheet.rest_positions)
+    isotropic = material.replace(plate=None)
+    recut = with_rest_positions(sheet, jnp.asarray(sheet.rest_positions))
+    assert jax.eval_shape(lambda: bending_energy(recut.rest_positions, recut, isotropic)).shape == ()

@@ -1,0 +1,221 @@
+"""Count where skin comes through cloth, and measure what the timestep costs.
+
+    python experiments/time_and_skin.py [--smoke] [--out DIR] [--part skin time] [--vertices 1k] [--garment ...]
+
+Skin: garments on the six test clips as `eslr simulate --simulator physics --tolerance 1%` has them, by BDF2
+and by implicit Euler. In every fifth frame the referee of the hard cases counts pairs of intersecting
+triangles of cloth and body, and of cloth and cloth. Frames in which the body intersects itself within 5 cm of
+the cloth are told apart: there two limbs pinch it.
+
+Time: T-shirt and dress on three clips against BDF2 at 1/960 s, by both integrators with one to eight steps a
+frame. All begin with the same settled cloth. The cost is processor time, which other jobs do not change much.
+
+Rows of time_and_skin.json stay until they are measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.body.motion import pose_body
+from eslr_jax.body.timing import with_settling
+from eslr_jax.cli.console import use_compile_cache
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.referee import intersecting_pairs, judge
+from eslr_jax.evaluation.report import environment
+from eslr_jax.geometry.closest import nearest_places
+from eslr_jax.geometry.topology import vertex_normals
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import Integrator, start_integrator
+from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.simulation.simulate import simulate
+from eslr_jax.types import Scene
+
+RESULTS = Path(__file__).parent / "results"
+PARTS = ("skin", "time")
+GARMENTS = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
+INTEGRATORS: tuple[Integrator, ...] = ("bdf2", "euler")
+FPS, FRAMES, SETTLE = 30.0, 60, 15
+EVERY = 5  # frames between those that are judged
+PINCH = 0.05  # [m] from the cloth, within which the body may not intersect itself
+DEFAULT = SimConfig(iterations=100, tolerance=0.01)  # of the command line
+TIMED = ("tshirt", "dress")
+SECOND = 31  # frames
+STEPS: dict[Integrator, tuple[int, ...]] = {"euler": (1, 2, 4, 8), "bdf2": (1, 2, 4)}  # a frame
+FINEST = 32  # 1/960 s
+FINE = SimConfig(iterations=100, tolerance=1e-3)
+
+
+def make_scenes(garments: list[Any], motions: list[Any]) -> list[Scene]:
+    """Return every garment on every motion: scenes of one shape, which share a program, garment by garment."""
+    count = len(motions)
+    cloths = [garment for garment in garments for _ in range(count)]
+    options = SceneOptions(has_skin=True)
+    return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths), options=options)
+
+
+def begun(scene: Scene, integrator: Integrator) -> Scene:
+    """Return a scene that is stepped by an integrator."""
+    return scene.replace(initial_state=start_integrator(scene.initial_state, integrator))
+
+
+def measure_skin(garments: Sequence[str], vertices: Any, clips: Sequence[str], frames: int) -> Iterator[dict]:
+    """Yield a row for every garment, clip and integrator."""
+    body = load_body()
+    motions = [
+        with_settling(pose_body(body, load_motion(clip), fps=FPS, num_frames=frames), SETTLE)
+        for clip in clips
+    ]
+    scenes = make_scenes([load_garment(name, vertices=vertices) for name in garments], motions)
+    pinched = [_own_crossings(scene, frames) for scene in scenes[: len(clips)]]
+    for number, scene in enumerate(scenes):
+        garment, clip = divmod(number, len(clips))
+        for integrator in INTEGRATORS:
+            run = simulate(None, begun(scene, integrator), config=DEFAULT)
+            judged = [
+                judge_frame(scene, np.asarray(run.trajectory.positions[frame], np.float64), frame, crossings)
+                for frame, crossings in pinched[clip].items()
+            ]
+            yield {
+                "garment": garments[garment], "vertices": vertices, "clip": clips[clip],
+                "integrator": integrator,
+                **{name: [frame[name] for frame in judged] for name in judged[0]},
+            }  # fmt: skip
+
+
+def _own_crossings(scene: Scene, frames: int) -> dict[int, np.ndarray]:
+    """Return where the body intersects itself, centres of faces [m], by the frames that are judged."""
+    found = {}
+    for frame in range(SETTLE, SETTLE + frames, EVERY):
+        body, faces = _body(scene, frame)
+        found[frame] = body[faces[np.unique(intersecting_pairs(body, faces))]].mean(axis=1)
+    return found
+
+
+def _body(scene: Scene, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the body's vertices in a frame [m], and its faces, as far as garments reach it."""
+    assert scene.body is not None
+    return np.asarray(scene.body.positions[frame], np.float64), np.asarray(scene.body.surface.faces)
+
+
+def judge_frame(scene: Scene, positions: np.ndarray, frame: int, crossings: np.ndarray) -> dict[str, Any]:
+    """Return the pairs of a frame, its depth for 99.9 % of vertices [mm], and whether the body pinches it.
+
+    Args:
+        scene: Of the frame.
+        positions: Of the cloth [m].
+        frame: Its number.
+        crossings: Where the body intersects itself [m].
+    """
+    cloth, (body, faces) = scene.garment, _body(scene, frame)
+    own = np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]
+    verdict = judge(positions, own, body, faces)
+    real = positions[np.asarray(cloth.vertex_mask)]
+    place = nearest_places(real, body, faces, vertex_normals(body, faces))
+    depth = -np.einsum("px,px->p", place.offsets, place.normals)
+    nearest = cKDTree(real).query(crossings)[0] if len(crossings) else np.array([np.inf])
+    return {
+        "cloth_body": verdict.cloth_body,
+        "cloth_cloth": verdict.cloth_cloth,
+        "is_pinched": bool(nearest.min() < PINCH),
+        "depth_mm": round(1e3 * max(float(np.quantile(depth, 0.999)), 0.0), 3),
+    }
+
+
+def measure_time(
+    garments: Sequence[str], vertices: Any, clips: Sequence[str], is_smoke: bool
+) -> Iterator[dict]:
+    """Yield a row for every garment, clip, integrator and number of steps a frame."""
+    frames, finest = (4, 2) if is_smoke else (SECOND, FINEST)
+    counts: dict[Integrator, tuple[int, ...]] = {"euler": (1,), "bdf2": (1,)} if is_smoke else STEPS
+    cloths, body = [load_garment(name, vertices=vertices) for name in garments], load_body()
+
+    def posed(steps: int) -> list[Scene]:
+        length = (frames - 1) * steps + 1
+        motions = [pose_body(body, load_motion(clip), fps=FPS * steps, num_frames=length) for clip in clips]
+        return make_scenes(cloths, motions)
+
+    usual = [pose_body(body, load_motion(clip), fps=FPS, num_frames=frames) for clip in clips]
+    settling = make_scenes(cloths, [with_settling(poses, SETTLE) for poses in usual])
+    starts = [simulate(None, scene, config=FINE).trajectory.positions[SETTLE] for scene in settling]
+
+    def run(integrator: Integrator, steps: int) -> Iterator[tuple[np.ndarray, float]]:
+        for scene, start in zip(posed(steps), starts, strict=True):
+            ready = begun(scene, integrator)
+            ready = ready.replace(initial_state=ready.initial_state.replace(position=start))
+            began = time.process_time()
+            done = simulate(None, ready, config=FINE)
+            took = time.process_time() - began - done.timing.compile_s
+            yield np.asarray(done.trajectory.positions, np.float64)[::steps], 1e3 * took / (frames - 1)
+
+    references = [positions for positions, _ in run("bdf2", finest)]
+    for integrator, numbers in counts.items():
+        for steps in numbers:
+            for number, (positions, cost) in enumerate(run(integrator, steps)):
+                is_real = np.asarray(settling[number].garment.vertex_mask)
+                distance = 1e3 * np.linalg.norm(positions - references[number], axis=-1)[1:, is_real]
+                garment, clip = divmod(number, len(clips))
+                yield {
+                    "garment": garments[garment], "vertices": vertices, "clip": clips[clip],
+                    "integrator": integrator, "steps": steps,
+                    "rms_mm": float(np.sqrt(np.mean(distance**2))),
+                    "first_third_rms_mm": float(np.sqrt(np.mean(distance[: frames // 3] ** 2))),
+                    "median_mm": float(np.median(distance)),
+                    "cpu_ms": cost,
+                }  # fmt: skip
+
+
+def keep(path: Path, part: str, row: dict[str, Any]) -> None:
+    """Put a row in the place of the one that was measured before."""
+    names = ("garment", "vertices", "clip", "integrator", "steps")
+
+    def key(one: dict[str, Any]) -> tuple:
+        return tuple(one.get(name) for name in names)
+
+    result = json.loads(path.read_text()) if path.exists() else {}
+    others = [one for one in result.get(part, []) if key(one) != key(row)]
+    result = {**result, part: [*others, row], **environment()}
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--garment", nargs="*", choices=GARMENTS)
+    parser.add_argument("--vertices", default="1k")
+    arguments = parser.parse_args()
+
+    use_compile_cache()
+    clips, is_smoke = list(load_splits()["motions"]["test"]), arguments.smoke
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "time_and_skin.json"
+    for part in arguments.part:
+        garments = list(arguments.garment or (GARMENTS if part == "skin" else TIMED))[
+            : 1 if is_smoke else None
+        ]
+        if part == "skin":
+            frames, some = (6, clips[:1]) if is_smoke else (FRAMES, clips)
+            rows = measure_skin(garments, arguments.vertices, some, frames)
+        else:
+            rows = measure_time(garments, arguments.vertices, clips[: 1 if is_smoke else 3], is_smoke)
+        for row in rows:
+            keep(path, part, row)
+            print(part, row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Thrown cloth, which goes farther in a frame than contacts see: it ends in front of what it is thrown at."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard_cases.build import capsule, icosphere, join_meshes, make_cloth, make_scene, plane, sheet
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides
+from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.simulation.rollout import rollout_scene
+
+SPEED = 13.0  # [m/s], 43 cm in a frame
+BALL, LIMB = 0.15, 0.05  # radii [m]
+PLACES = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])  # of plane, ball and limb [m]
+find = jax.jit(find_both_sides)
+
+
+@pytest.fixture(scope="module")
+def obstacles():
+    bodies = (plane(1.0, 9, 0.0), icosphere(2, BALL), capsule(LIMB, 0.6, around=16, rings=8))
+    return join_meshes(*((mesh[0] + place, mesh[1]) for mesh, place in zip(bodies, PLACES, strict=True)))
+
+
+def thrown_sheets(obstacles, *, above):
+    """Three sheets over plane, ball and limb, on their way down."""
+    mesh = sheet(9, 9, (0.24, 0.24))
+    sheets = join_meshes(*((mesh[0] + place + [0, above, 0], mesh[1]) for place in PLACES))
+    garment = make_cloth(sheets, {}, allow_components=True)
+    scene = make_scene(garment, sheets[0], 9, body=obstacles)
+    velocity = jnp.broadcast_to(jnp.array([0.0, -SPEED, 0.0]), scene.initial_state.velocity.shape)
+    return scene.replace(initial_state=scene.initial_state.replace(velocity=velocity))
+
+
+def test_sheets_thrown_at_a_plane_a_ball_and_a_limb_end_in_front_of_them(obstacles):
+    for above in (0.35, 0.52):  # each within one frame of the plane, and of the ball
+        scene = thrown_sheets(obstacles, above=above)
+        positions = np.asarray(rollout_scene(None, scene, SimConfig(iterations=60)).positions)
+        on_plane, on_ball, on_limb = np.split(positions - np.repeat(PLACES, 81, axis=0), 3, axis=1)
+        assert on_plane[..., 1].min() > -2e-3, above
+        assert np.linalg.norm(on_ball, axis=-1).min() > BALL - 5e-3, above
+        assert np.linalg.norm(on_limb[..., 1:], axis=-1).min() > LIMB - 5e-3, above
+        middle = 40
+        assert on_ball[1:4, middle, 1].min() > 0, above
+        assert on_limb[1:4, middle, 1].min() > 0, above
+
+
+def surface_of(mesh):
+    surface = prepare_surface(*mesh)
+    return jnp.asarray(mesh[0], jnp.float32)[surface.vertex_ids], surface
+
+
+def test_cloth_that_is_not_thrown_has_the_contacts_it_had(obstacles):
+    body, surface = surface_of(obstacles)
+    random = np.random.default_rng(0)
+    position = jnp.asarray(random.uniform([-0.5, -0.2, -0.4], [4.5, 0.4, 0.4], (300, 3)), jnp.float32)
+    way = random.standard_normal((300, 3))
+    way *= 0.99 * CONTACT_RADIUS / np.linalg.norm(way, axis=1, keepdims=True)
+    drift = jnp.array([[0.3, 0.0, 0.0]])  # what moves with the body is not thrown
+    moving = find(
+        position, body, body + drift, surface, None, position + drift + jnp.asarray(way, jnp.float32)
+    )
+    still = find(position, body, body + drift, surface)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), still, moving)
+    assert int(np.sum(still[0].faces != moving[0].faces)) == 0
+
+
+def test_a_rod_on_the_way_is_met_and_one_beside_it_is_not():
+    """A vertex that is near nothing at t, and behind the rod at t + 1."""
+    rod = capsule(0.01, 0.6, around=8, rings=30)
+    body, surface = surface_of(rod)
+    start = jnp.array([[0.0, 0.25, 0.0], [0.0, 0.25, 0.05], [0.0, 0.02, 0.25]])
+    end = start - jnp.array([[0.0, 0.45, 0.0], [0.0, 0.45, 0.0], [0.0, 0.0, 0.45]])
+    contacts, _ = find(start, body, body, surface, None, end)
+    np.testing.assert_array_equal(contacts.is_near, [True, False, True])
+    np.testing.assert_allclose(contacts.normals[0], [0.0, 1.0, 0.0], atol=0.1)
+    assert float(contacts.normals[2, 1]) > 0.5  # over the rod, not at its side
+
+
+def test_gradients_through_thrown_contacts_are_finite(obstacles):
+    scene = thrown_sheets(obstacles, above=0.35)
+    body, surface = scene.body.positions[0], scene.body.surface
+
+    @jax.jit
+    @jax.grad
+    def slope(ways):
+        position, moved = ways
+        contacts, _ = find_both_sides(position, body, body, surface, None, position + moved)
+        return jnp.sum(
+            jnp.where(contacts.is_near[:, None], contacts.next_points + contacts.next_normals, 0.0)
+        )
+
+    start = scene.initial_state
+    by_position, by_way = slope((start.position, start.velocity * scene.timestep))
+    assert bool(jnp.all(jnp.isfinite(by_position)))
+    assert float(jnp.abs(by_position).max()) > 0
+    assert bool(jnp.all(by_way == 0))
