@@ -336,7 +336,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
             )
             for poses in (still, with_settling(walk, SETTLE))
         ]
-        at_rest = jax.device_get(measure_frames(runs[0].trajectory, runs[0].scene))
+        at_rest = jax.device_get(measure_frames(runs[0].trajectory.positions, runs[0].scene))
         trajectory, scene = last_frames(runs[1].trajectory, runs[1].scene, frames)
         moving = trajectory_report(trajectory, scene, poses=walk)
         positions = np.asarray(trajectory.positions)[:, is_real]

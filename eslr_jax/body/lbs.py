@@ -68,10 +68,18 @@ def joint_transforms(
     """
     turned = jax.vmap(rotation_matrix)(rotations)
     posed = jnp.broadcast_to(translation, joint_rest_positions.shape)
-    for joints, above in _generations(parents):
+
+    def hang(level: Int[Array, ""], chain: tuple[Array, Array]) -> tuple[Array, Array]:
+        turned, posed = chain
+        joints, above = generations[level]
         bones = joint_rest_positions[joints] - joint_rest_positions[above]
-        posed = posed.at[joints].set(posed[above] + _apply(turned[above], bones))
-        turned = turned.at[joints].set(_product(turned[above], turned[joints]))
+        posed = posed.at[joints].set(posed[above] + _apply(turned[above], bones), mode="drop")
+        return turned.at[joints].set(_product(turned[above], turned[joints]), mode="drop"), posed
+
+    # A loop, not a row of copies: a skeleton of twenty generations would be a second of compilation.
+    generations = jnp.asarray(_generations(parents))
+    if generations.size:  # else there is a root alone
+        turned, posed = jax.lax.fori_loop(0, len(generations), hang, (turned, posed))
     offsets = posed - _apply(turned, joint_rest_positions)
     return jnp.concatenate([turned, offsets[:, :, None]], axis=2)
 
@@ -138,14 +146,19 @@ def bend(
     return _product(flat, turned.reshape((-1, 1))).reshape((-1, 3))
 
 
-def _generations(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the joints of each depth below the root, and their parents."""
+def _generations(parents: tuple[int, ...]) -> Int[np.ndarray, "generations 2 width"]:
+    """Return the joints of each depth below the root, and their parents; rows are filled up with no joint."""
     depths: list[int] = []
     for parent in parents:
         depths.append(0 if parent < 0 else depths[parent] + 1)
     depth, parent = np.array(depths), np.array(parents)
     members = [np.flatnonzero(depth == level) for level in range(1, depth.max() + 1)]
-    return [(joints, parent[joints]) for joints in members]
+    width = max((len(joints) for joints in members), default=0)
+    rows = np.zeros((len(members), 2, width), np.int32)
+    rows[:, 0] = len(parents)
+    for row, joints in zip(rows, members, strict=True):
+        row[:, : len(joints)] = joints, parent[joints]
+    return rows
 
 
 def _product(left: Array, right: Array) -> Array:

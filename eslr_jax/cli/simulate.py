@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -186,7 +187,13 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.io.run import ClothTrack, write_run
     from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-    from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
+    from eslr_jax.simulation.simulate import (
+        Simulation,
+        begin_compiling,
+        good_frames,
+        last_frames,
+        raise_for_status,
+    )
 
     request = _read_request(options)
     names = options.garment or (DEFAULT_GARMENT,)
@@ -219,12 +226,16 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             air=blowing(options.wind, options.gust),
             damping=options.damping,
         )
-        scene = prepare_scene(cloth, settling, material=material, options=modelled)
+        begin = partial(
+            begin_compiling, method.params, config=method.config, is_paced=method.budget_ms is not None
+        )
+        scene = prepare_scene(cloth, settling, material=material, options=modelled, on_shapes=begin)
         if scene.body is not None:
             check_speed(poses, MAX_APPROACH, vertices=np.asarray(scene.body.surface.vertex_ids))
         if done is not None:
             check_same_scene(done, scene, out)
             scene = scene.replace(self_contact=capacity)
+        _begin_measuring(scene, poses.positions.shape[0])
     out = ensure_output_dir(out)
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
     if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
@@ -351,6 +362,17 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
             done=done,
             raises=False,
         )
+
+
+def _begin_measuring(scene: Scene, num_frames: int) -> None:
+    """Compile the measures of a trajectory of so many frames while its rollout is compiled in a thread."""
+    import numpy as np
+
+    from eslr_jax.evaluation.metrics import measure_frames
+    from eslr_jax.scene.plan import first_frames
+
+    start = np.asarray(scene.initial_state.position)
+    measure_frames(np.broadcast_to(start, (num_frames, *start.shape)), first_frames(scene, num_frames))
 
 
 def _measure(

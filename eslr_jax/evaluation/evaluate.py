@@ -180,7 +180,7 @@ def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> 
 
 def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     """Return plain measures of a trajectory on a scene with a body."""
-    measures = jax.device_get(measure_frames(trajectory, scene))
+    measures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.types import Garment, Scene, Trajectory
+from eslr_jax.types import Garment, Scene
 
 
 class FrameMeasures(NamedTuple):
@@ -23,11 +23,11 @@ class FrameMeasures(NamedTuple):
 
 
 @jax.jit
-def measure_frames(trajectory: Trajectory, scene: Scene) -> FrameMeasures:
+def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -> FrameMeasures:
     """Measure every simulated frame of a trajectory.
 
     Args:
-        trajectory: What to measure.
+        positions: Where its vertices are [m]; frame 0 is the start.
         scene: Its scene.
     """
     garment = scene.garment
@@ -46,7 +46,7 @@ def measure_frames(trajectory: Trajectory, scene: Scene) -> FrameMeasures:
         return FrameMeasures(stretch[count - 1], stretch[(99 * (count - 1)) // 100], distances, speed)
 
     body = None if scene.body is None else scene.body.positions[1:]
-    return jax.lax.map(measure, (trajectory.positions[:-1], trajectory.positions[1:], body))
+    return jax.lax.map(measure, (positions[:-1], positions[1:], body))
 
 
 @jax.jit

@@ -50,7 +50,7 @@ def trajectory_report(
         `worst_penetration` hold frame, time [s], vertex and part of the largest values. `garments` holds stretch
         and penetration of every garment of an outfit by name; None for a single garment.
     """
-    measures: FrameMeasures = jax.device_get(measure_frames(trajectory, scene))
+    measures: FrameMeasures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}

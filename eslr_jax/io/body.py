@@ -50,7 +50,9 @@ def read_body(path: str | Path) -> Body:
             raise AssetError(f"{what}: {key} is empty or not finite; {_REMEDY}")
     sides = np.ptp(arrays["rest_positions"], axis=0)
     if sides[1] < _UPRIGHT * sides.max():
-        raise AssetError(f"{what} is {sides[1]:.3g} m high and {sides.max():.3g} m long; turn it so that Y is up")
+        raise AssetError(
+            f"{what} is {sides[1]:.3g} m high and {sides.max():.3g} m long; turn it so that Y is up"
+        )
     parents = arrays["parents"].astype(np.int64)
     if parents[0] != -1 or ((parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
         raise AssetError(f"{what}: parents don't come before their children; {_REMEDY}")

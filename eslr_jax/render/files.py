@@ -26,7 +26,7 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
     """
     pillow = require("PIL.Image")
     with atomic_write(path) as temporary:
-        pillow.fromarray(_checked(image, path)).save(temporary, format="PNG", optimize=True)
+        pillow.fromarray(_checked(image, path)).save(temporary, format="PNG")
 
 
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:

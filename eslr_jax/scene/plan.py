@@ -123,6 +123,7 @@ def prepare_scene(
     constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
     surface: BodySurface | None = None,
+    on_shapes: Callable[[Scene], None] = lambda shapes: None,
 ) -> Scene:
     """Return the scene of a garment on a moving body, without what it does not need.
 
@@ -135,12 +136,15 @@ def prepare_scene(
         constants: Physical constants; by default those for the fabric, see `physics.materials.constants_for`.
         options: What to leave out or add.
         surface: Body faces to search, see `plan_scene`.
+        on_shapes: Called with the shapes of the scene's arrays before they are made; a rollout of them can be
+            compiled meanwhile, see `simulation.simulate.begin_compiling`.
 
     Raises:
         MotionError: The motion has fewer than two frames.
     """
     constants = constants or constants_for(material)
     plan = plan_scene(garment, poses, constants=constants, options=options, surface=surface)
+    on_shapes(_build.eval_shape(garment, poses, material, plan))
     return _build(garment, poses, material, plan)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -108,10 +109,9 @@ def _in_chunks(
     params: Any, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
 ) -> tuple[Trajectory, Timing]:
     """Simulate a scene a few frames at a time, and time compilation apart."""
-    total = scene.num_frames - 1
-    chunk = min(_CHUNK, total)
+    total, chunk = scene.num_frames - 1, _chunk_of(scene)
     inputs = frame_inputs(jax.device_get(scene))  # cut on the host, where it compiles nothing
-    constant = jax.tree.map(jnp.asarray, without_tracks(scene).replace(num_frames=chunk + 1))
+    constant = jax.tree.map(jnp.asarray, _without_frames(scene))
 
     def part(first: int) -> FrameInput:
         # The last chunk repeats its last frame; what it simulates beyond the end is dropped.
@@ -196,19 +196,59 @@ def _scan(
     return scan_frames(make_stepper(params, config, iterations), scene, state, inputs)
 
 
+def begin_compiling(params: Any, scene: Scene, config: SimConfig, *, is_paced: bool = False) -> None:
+    """Trace what `simulate` runs, and compile it in a thread; `simulate` waits for it.
+
+    Args:
+        params: Weights of the network; None without one.
+        scene: The scene, or its shapes, of `jax.eval_shape`.
+        config: As for `simulate`.
+        is_paced: Whether `simulate` will get a pace.
+    """
+
+    def first_chunk(params: Any, scene: Scene) -> tuple:
+        inputs = jax.tree.map(lambda leaf: leaf[: _chunk_of(scene)], frame_inputs(scene))
+        bound = jnp.int32(0) if is_paced else None
+        return params, _without_frames(scene), scene.initial_state, inputs, bound
+
+    _compile(config, *_signature(jax.eval_shape(first_chunk, params, scene)))
+
+
+def _chunk_of(scene: Scene) -> int:
+    """Return the number of frames that a call of the compiled scan simulates."""
+    return min(_CHUNK, scene.num_frames - 1)
+
+
+def _without_frames(scene: Scene) -> Scene:
+    """Return what all chunks of a scene share."""
+    return without_tracks(scene).replace(num_frames=_chunk_of(scene) + 1)
+
+
 def _compiled(config: SimConfig, arguments: tuple) -> tuple[Callable, float]:
-    """Return the compiled chunk for arguments of these shapes, and the seconds that compiling took."""
-    leaves, structure = jax.tree.flatten(arguments)
+    """Return the compiled chunk for arguments of these shapes, and the seconds that it was waited for."""
     began = time.perf_counter()
-    program = _compile(config, structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+    program = _compile(config, *_signature(arguments)).result()
     return program, time.perf_counter() - began
 
 
+def _signature(arguments: tuple) -> tuple[Any, tuple]:
+    """Return the structure of arguments, and shapes and types of their arrays."""
+    leaves, structure = jax.tree.flatten(arguments)
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+
+
 @lru_cache(maxsize=32)
-def _compile(config: SimConfig, structure: Any, shapes: tuple) -> Callable:
-    """Compile a chunk once for every configuration and every set of shapes."""
+def _compile(config: SimConfig, structure: Any, shapes: tuple) -> Future[Callable]:
+    """Begin to compile a chunk, once for every configuration and every set of shapes.
+
+    It is traced here, where JAX's settings of this thread hold.
+    """
     described = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
-    return jax.jit(partial(_scan, config=config)).lower(*jax.tree.unflatten(structure, described)).compile()
+    lowered = jax.jit(partial(_scan, config=config)).lower(*jax.tree.unflatten(structure, described))
+    return _compiler.submit(lowered.compile)
+
+
+_compiler = ThreadPoolExecutor(1)
 
 
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:

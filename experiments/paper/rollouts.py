@@ -238,7 +238,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
         trajectory.positions, scene, origin=origin, parameters=HoodParameters(), criterion="postcvpr"
     )
     terms = {name: float(np.mean(getattr(metrics.terms, name))) for name in TERMS}
-    frames = measure_frames(trajectory, scene)
+    frames = measure_frames(trajectory.positions, scene)
     depth = -np.asarray(frames.distances)
     return {
         **terms,
