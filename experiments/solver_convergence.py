@@ -5,7 +5,7 @@
     python experiments/solver_convergence.py cost
     python experiments/solver_convergence.py --smoke --out DIR
 
-Frames are taken from a solved rollout. Each is solved by L-BFGS with 5 to 200 iterations and three
+Frames are taken from a solved rollout. Each is solved by L-BFGS with 5 to 200 iterations and four
 preconditioners, and by projected Newton from two starts: the solver's initial guess, and the cloth at rest where
 it was, brought near a minimum by L-BFGS. The relative gap is (E - E*) / (E_0 - E*) in float64, where E_0 is the
 potential of the pushed-out inertial guess and E* the lowest potential that any method found.
@@ -39,7 +39,13 @@ from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.newton import minimize_newton, potential_float64
 from eslr_jax.physics.potential import evaluate, potential
-from eslr_jax.physics.preconditioner import Stiffness, hessian_diagonal, solve_stiffness, stiffness
+from eslr_jax.physics.preconditioner import (
+    Stiffness,
+    hessian_diagonal,
+    solve_stiffness,
+    stiffness,
+    stretched_stiffness,
+)
 from eslr_jax.physics.problem import FrameProblem, push_out, pushed_out_guess
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
@@ -79,7 +85,12 @@ def diagonal(problem: FrameProblem, position: Positions) -> Stiffness:
     return without_springs(problem, hessian_diagonal(problem, position))
 
 
-PRECONDITIONERS = {"plain": mean_diagonal, "diagonal": diagonal, "springs": stiffness}
+PRECONDITIONERS = {
+    "plain": mean_diagonal,
+    "diagonal": diagonal,
+    "springs": stiffness,
+    "stretched": stretched_stiffness,  # the solver's
+}
 
 
 @partial(jax.jit, static_argnames="preconditioner")
@@ -124,7 +135,7 @@ def measure_frame(problem: FrameProblem, newton_iterations: int) -> dict[str, An
     began = time.process_time()
     first = newton(np.asarray(start, np.float64))
     seconds = time.process_time() - began
-    near = lbfgs(push_out(problem, problem.position), problem, SECOND_START_ITERATIONS, "springs")
+    near = lbfgs(push_out(problem, problem.position), problem, SECOND_START_ITERATIONS, "stretched")
     second = newton(np.asarray(near, np.float64))
     return {
         "guess": energy(pushed_out_guess(problem)),

@@ -18,6 +18,9 @@ from eslr_jax.types import Garment, Material
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/solver_convergence.py)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms
+# Of a vertex's springs in its diagonal, times their sum: alike along all axes, they are stiffer across the cloth
+# than it is. Fitted to the gap after 10 and 20 iterations, see experiments/README.md.
+_DOMINANCE = 1.43
 
 
 @struct.dataclass
@@ -121,6 +124,33 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
         neighbors=garment.neighbors,
         springs=jnp.where(garment.neighbor_mask, springs, 0.0),
     )
+
+
+def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
+    """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
+
+    A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. Networks take
+    `stiffness`, which they were trained with.
+
+    Args:
+        problem: The frame's problem.
+        position: Where springs, contact and friction are linearised [m], shape [vertices, 3].
+    """
+    matrix = stiffness(problem, position)
+    squared, rest = (
+        _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.rest_positions)
+    )
+    is_spring = matrix.springs > 0
+    springs = matrix.springs * jnp.where(is_spring, squared, 0.0) / jnp.where(is_spring, rest, 1.0)
+    added = jnp.sum(_DOMINANCE * springs - matrix.springs, axis=1)
+    return matrix.replace(springs=springs, diagonal=matrix.diagonal + added)
+
+
+def _squared_lengths(
+    points: Float[Array, "vertices 3"], neighbors: Int[Array, "vertices degree"]
+) -> Float[Array, "vertices degree"]:
+    """Return the squared distances of vertices from their neighbours [m^2]."""
+    return sum((part[neighbors] - part[:, None]) ** 2 for part in points.T)  # type: ignore[return-value]
 
 
 def solve_stiffness(matrix: Stiffness, force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:

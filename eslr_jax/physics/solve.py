@@ -25,7 +25,7 @@ from eslr_jax.physics.guess import InitialGuess
 from eslr_jax.physics.lbfgs import Minimum, Stop, minimize
 from eslr_jax.physics.minres import LinearSolution, solve_symmetric
 from eslr_jax.physics.potential import Point, evaluate, potential
-from eslr_jax.physics.preconditioner import stiffness
+from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.problem import FrameProblem
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
@@ -91,7 +91,7 @@ def _solve(
     return minimize(
         lambda position: potential(position, problem),
         start.point,
-        stiffness(problem, start.point.position),
+        stretched_stiffness(problem, start.point.position),
         Stop(iterations, tolerance, start.inertial_energy),
         memory=memory,
         previous=start.previous,
