@@ -255,7 +255,7 @@ def score(frames: int) -> np.ndarray:
         shares.append(gap_medians(ends, ends.reached)["gap_relative_median"])
     pictures = [colored(each, field, fields[0].high) for each, field in zip(shots, fields, strict=True)]
     names = ("carried by the joints", "simulated")
-    labels = [f"{name}: {100 * share:.2g} %" for name, share in zip(names, shares, strict=True)]
+    labels = [f"{name}: {100 * share:.3g} %" for name, share in zip(names, shares, strict=True)]
     return add_color_bar(side_by_side(pictures, labels), 0.0, fields[0].high, f"gap [{fields[0].unit}]")
 
 

@@ -150,6 +150,7 @@ def page(player):
         pytest.skip("no Chromium on this machine")
     with launch() as page:
         page.set_viewport_size({"width": 700, "height": 500})  # small: WebGL is drawn in software
+        page.set_default_timeout(240_000)  # [ms]; a click waits until two pictures in a row are alike
         page.errors = []
         page.on(
             "console", lambda message: page.errors.append(message.text) if message.type == "error" else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +17,13 @@ from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, without_tracks
+from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
 
 TOLERANCE = 1e-2  # relative gap at which a frame ends
 MOST_ITERATIONS = 100
+_CONFIG = SimConfig(iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
 _HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
 
 
@@ -74,9 +77,27 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     options = SceneOptions(
         has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), energies=(Partial(_pull, no_hand()),)
     )
-    scene = prepare_scene(garment, poses, material=material, options=options)
+    scene = prepare_scene(
+        garment, poses, material=material, options=options, on_shapes=partial(_begin_compiling, material)
+    )
+    return _staged(scene, material)
+
+
+def _begin_compiling(material: Material, scene: Scene) -> None:
+    """Begin to compile the step of a scene, of which the shapes are known."""
+
+    def first_step(scene: Scene) -> tuple:
+        stage = _staged(scene, material)
+        frame = jax.tree.map(lambda leaf: leaf[0], stage.inputs)
+        return stage.constant, scene.initial_state, frame, jnp.int32(0)
+
+    begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+
+
+def _staged(scene: Scene, material: Material) -> Stage:
+    """Return the stage of a scene."""
     if scene.self_contact is not None:  # nobody enlarges its buffers here
-        scene = scene.replace(self_contact=default_capacity(garment.vertex_mask.shape[0]))
+        scene = scene.replace(self_contact=default_capacity(scene.garment.vertex_mask.shape[0]))
     inputs = frame_inputs(scene)
     back = (
         inputs
@@ -92,7 +113,7 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
 
 def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
-    air = Air(jnp.asarray(wind, jnp.float32))
+    air = jax.tree.map(jnp.asarray, Air(jnp.asarray(wind, jnp.float32)))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
     constants = jax.tree.map(jnp.asarray, constants_for(material))
     energies = (Partial(_pull, hand),)
@@ -113,12 +134,14 @@ def advance(stage: Stage, state: ClothState, frames: tuple[int, int], iterations
     inputs = stage.inputs if then > now else stage.back
     row = min(now, then)
     frame = jax.tree.map(lambda leaf: leaf[row], inputs)
-    return _step(stage.constant, state, frame, jnp.int32(iterations))
+    arguments = (stage.constant, state, frame, jnp.int32(iterations))
+    return find_program(_step, _CONFIG, arguments)(*arguments)
 
 
-@jax.jit
-def _step(scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""]) -> Step:
-    stepper = make_stepper(None, SimConfig(iterations=MOST_ITERATIONS, tolerance=TOLERANCE), iterations)
+def _step(
+    scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""], *, config: SimConfig
+) -> Step:
+    stepper = make_stepper(None, config, iterations)
     return Step(*stepper(frame_problem(scene, state, frame), state))
 
 

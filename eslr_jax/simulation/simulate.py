@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +17,7 @@ from eslr_jax.errors import CapacityError, EslrError, MotionError, NonFiniteErro
 from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
 from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
+from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
@@ -125,8 +124,9 @@ def _in_chunks(
     for first in range(begin, total, chunk):
         bound = None if loop.pace is None else jnp.int32(iterations)  # all numbers share a program
         arguments = (params, constant, state, part(first), bound)
-        program, took = _compiled(config, arguments)
-        compile_s += took
+        began = time.perf_counter()
+        program = find_program(_scan, config, arguments)
+        compile_s += time.perf_counter() - began
         began = time.perf_counter()
         end, frames = jax.block_until_ready(program(*arguments))
         took = time.perf_counter() - began
@@ -211,7 +211,7 @@ def begin_compiling(params: Any, scene: Scene, config: SimConfig, *, is_paced: b
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound
 
-    _compile(config, *_signature(jax.eval_shape(first_chunk, params, scene)))
+    begin_program(_scan, config, jax.eval_shape(first_chunk, params, scene))
 
 
 def _chunk_of(scene: Scene) -> int:
@@ -222,33 +222,6 @@ def _chunk_of(scene: Scene) -> int:
 def _without_frames(scene: Scene) -> Scene:
     """Return what all chunks of a scene share."""
     return without_tracks(scene).replace(num_frames=_chunk_of(scene) + 1)
-
-
-def _compiled(config: SimConfig, arguments: tuple) -> tuple[Callable, float]:
-    """Return the compiled chunk for arguments of these shapes, and the seconds that it was waited for."""
-    began = time.perf_counter()
-    program = _compile(config, *_signature(arguments)).result()
-    return program, time.perf_counter() - began
-
-
-def _signature(arguments: tuple) -> tuple[Any, tuple]:
-    """Return the structure of arguments, and shapes and types of their arrays."""
-    leaves, structure = jax.tree.flatten(arguments)
-    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-
-
-@lru_cache(maxsize=32)
-def _compile(config: SimConfig, structure: Any, shapes: tuple) -> Future[Callable]:
-    """Begin to compile a chunk, once for every configuration and every set of shapes.
-
-    It is traced here, where JAX's settings of this thread hold.
-    """
-    described = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
-    lowered = jax.jit(partial(_scan, config=config)).lower(*jax.tree.unflatten(structure, described))
-    return _compiler.submit(lowered.compile)
-
-
-_compiler = ThreadPoolExecutor(1)
 
 
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:

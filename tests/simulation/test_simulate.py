@@ -15,7 +15,7 @@ from eslr_jax.io.unfinished import read_unfinished, write_unfinished
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-from eslr_jax.simulation import simulate as door
+from eslr_jax.simulation.program import _compile
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import (
     begin_compiling,
@@ -99,13 +99,13 @@ def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
 @pytest.mark.parametrize("is_paced", [False, True])
 def test_a_program_that_is_compiled_early_is_the_one_that_runs(scene, is_paced):
     simulate(None, scene, config=SOLVER, pace=(lambda count, ms: count) if is_paced else None)
-    programs = door._compile.cache_info().misses
+    programs = _compile.cache_info().misses
     prepare_scene(
         square(),
         drifting_ball(14),
         on_shapes=lambda shapes: begin_compiling(None, shapes, SOLVER, is_paced=is_paced),
     )
-    assert door._compile.cache_info().misses == programs
+    assert _compile.cache_info().misses == programs
 
 
 def test_a_pace_sets_the_iterations_of_the_next_chunk(scene):
