@@ -84,7 +84,7 @@ def trajectory_report(
             frame, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
             vertex = int(np.flatnonzero(is_real)[column])
             report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
-        several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
+    several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
     report["garments"] = None if several is None else _garments(trajectory, scene, depth, several)
     return report
 
