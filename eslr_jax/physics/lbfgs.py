@@ -32,8 +32,8 @@ class Stop(NamedTuple):
     iterations: int | Int[Array, ""]  # upper bound
     # Share of what was gained since `reference`, below which the gap shall fall. Half the Newton decrement,
     # g . H^-1 g / 2 with the recursion's own H^-1, leaves out soft directions, more of them near the minimum.
-    # Where it is a share d of the gain, the gap is a share of at most sqrt(2 d) in 99 % of the frames, also behind
-    # a network; without one sqrt(d) would do.
+    # Where it is a share d of the gain, the gap is a share of at most sqrt(2 d) in 99 % of the frames, also
+    # behind a network; without one sqrt(d) would do.
     tolerance: Float[Array, ""] | float = 0.0
     reference: Float[Array, ""] | float = 0.0  # energy [J] from which the gain counts
 
