@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from eslr_jax.config import SimConfig
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Contacts
 
 
@@ -107,3 +109,28 @@ def test_the_error_falls_on_a_frame_that_is_seen_again_and_again(space, moved):
             0,
         )
     assert np.mean(losses[-5:]) < 0.7 * losses[0]
+
+
+@pytest.mark.slow
+def test_an_untrained_network_steps_the_cloth_and_comes_back_from_its_file(small_scene, tmp_path):
+    space = mat_space.prepare_space(small_scene.garment)
+    faces, count = jnp.ones((1, 34)), len(space.garment.faces)
+    scales = [mat.Seen(0 * faces, jnp.zeros(6)), mat.Seen(faces, jnp.ones(6))]
+    scales += [mat.Change(0 * faces[:, :9], jnp.zeros(3)), mat.Change(0.1 * faces[:, :9], 0.01 * jnp.ones(3))]
+    seen = mat.Seen(jnp.zeros((count, 34)), jnp.zeros(6))
+    params = mat.Transformer().init(jax.random.key(0), seen, space.geodesic, jnp.ones(count))
+    network = mat.Network(params, *scales)
+    mat.write_network(network, tmp_path / "mat_sleeve.npz", {})
+    again, _ = mat.read_network(tmp_path / "mat_sleeve.npz")
+    config = SimConfig(model=mat.Mat(), iterations=0)
+    still, random, read = (
+        np.asarray(rollout_scene(net.replace(space=space), small_scene, config).positions)
+        for net in (mat.untrained(network), network, again)
+    )
+    is_real = np.asarray(space.garment.vertex_mask)
+    assert np.isfinite(random).all()
+    np.testing.assert_array_equal(random, read)
+    assert np.abs(random - still).max() > 0.01
+    # Heads of zeros leave the cloth where it is but for the body, which pushes it.
+    pushed = np.abs(np.diff(still[:, is_real], axis=0)).max()
+    assert 1e-4 < pushed < 0.03
