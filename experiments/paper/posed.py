@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -31,15 +30,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from archive import read_archive, write_archive
 from flax import struct
-from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
 from eslr_jax.config import ModelConfig, TrainConfig
 from eslr_jax.graph.features import DENSITY_SCALE, material_inputs
-from eslr_jax.io.npz import read_arrays, write_arrays
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import potential_terms
 from eslr_jax.scene.build import initial_state
@@ -54,6 +52,7 @@ _BATCH = 16  # windows
 _RATE = 1e-3  # GAPS and PBNS
 _UNIT = 0.1  # [J], of the loss
 _OFFSET = 0.01  # [m], of a displacement per unit of output
+_INPUTS = ("mean", "deviation", "joints")  # of a network, beside its weights
 _FEWEST = 0.05  # a joint counts that carries a vertex by at least this weight
 
 
@@ -88,6 +87,13 @@ class PosedNetwork:
     deviation: Float[Array, " features"]
     joints: Int[Array, " joints"]  # whose rotations are read
     system: str = struct.field(pytree_node=False)
+
+
+def carried_joints(garment: Garment, num_joints: int) -> Int[Array, " joints"]:
+    """Return the joints that carry some of the garment."""
+    carried = np.zeros(num_joints)
+    np.maximum.at(carried, np.asarray(garment.skin_indices).ravel(), np.asarray(garment.skin_weights).ravel())
+    return jnp.asarray(np.flatnonzero(carried >= _FEWEST))
 
 
 def pose_features(
@@ -168,9 +174,7 @@ def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwo
     """Train a network for a garment on the bundled training clips; return it and its losses [0.1 J]."""
     garment = load_garment(name)
     data = build_training_data([garment], load_body(), [load_motion(clip) for clip in split_clips("train")])
-    carried = np.zeros(data.joint_transforms.shape[1])
-    np.maximum.at(carried, np.asarray(garment.skin_indices).ravel(), np.asarray(garment.skin_weights).ravel())
-    joints = jnp.asarray(np.flatnonzero(carried >= _FEWEST))
+    joints = carried_joints(garment, data.joint_transforms.shape[1])
     seen = pose_features(data.joint_transforms, joints, is_static=system == "pbns")
     is_inside = data.frames_left[:-1] > 0  # the joined clips jump where one ends
     seen = seen[1:][np.asarray(is_inside)]
@@ -250,22 +254,15 @@ def _train_step(params, moments, network, data: TrainingData, frames, key, *, mo
 
 def write_network(network: PosedNetwork, path: Path, training: dict[str, Any]) -> None:
     """Write a network as an npz archive, and how it was trained beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(network.params).items()}
-    inputs = {name: np.asarray(getattr(network, name)) for name in ("mean", "deviation", "joints")}
-    write_arrays(path, {**leaves, **inputs}, is_compressed=True)
-    path.with_suffix(".json").write_text(
-        json.dumps({"system": network.system, "training": training}, indent=1)
-    )
+    inputs = {name: getattr(network, name) for name in _INPUTS}
+    write_archive(path, {**network.params, **inputs}, {"system": network.system, "training": training})
 
 
 def read_network(path: Path) -> tuple[PosedNetwork, dict[str, Any]]:
     """Return a network that `write_network` wrote, and its training record."""
-    record = json.loads(path.with_suffix(".json").read_text())
-    arrays = {name: jnp.asarray(value) for name, value in read_arrays(path, content="network").items()}
-    inputs = {name: arrays.pop(name) for name in ("mean", "deviation", "joints")}
-    params = unflatten_dict({tuple(name.split("/")): value for name, value in arrays.items()})
-    return PosedNetwork(params, **inputs, system=record["system"]), record["training"]
+    arrays, record = read_archive(path)
+    inputs = {name: arrays.pop(name) for name in _INPUTS}
+    return PosedNetwork(arrays, **inputs, system=record["system"]), record["training"]
 
 
 def main() -> None:

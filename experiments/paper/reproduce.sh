@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # Train the paper's networks and make its tables from them.
 #
-#   experiments/paper/reproduce.sh [full|small] [OUT]
+#   experiments/paper/reproduce.sh [full|small|tshirt] [OUT]
 #
 # full: the paper's sizes at 4k vertices, by HOOD's recipe; needs a GPU with the extra `cuda`, and days.
 # small: five layers at 1k vertices, two seeds; some four hours of one CPU core.
+# tshirt: the systems that are made for one garment, PBNS to MAT; less than an hour of one CPU core.
 # Run it again to go on where it stopped. STEPS=2 shortens every training, to see that all works.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -21,8 +22,28 @@ train() { # name, recipe, changes
   fi
 }
 
+one_garment() { # script, system, arguments
+  local script="$1" system="$2"
+  shift 2
+  rows+=("$system=$system@$out/tshirt")
+  [[ -f $out/tshirt/${system}_tshirt.npz ]] && return
+  [[ $script == posed ]] && set -- "$system" tshirt "$@" || set -- tshirt "$@"
+  python "experiments/paper/$script.py" "$@" --out "$out/tshirt" ${STEPS:+--smoke}
+}
+
 rows=()
-if [[ $size == full ]]; then
+if [[ $size == tshirt ]]; then
+  rows=(skinned=skinned)
+  one_garment posed pbns --steps 800
+  one_garment posed snug --steps 500
+  one_garment posed snug-m --steps 500
+  one_garment ssch ssch --steps 1200 250
+  one_garment mat mat --steps 1000
+  rows+=("mat, untrained=mat@$out/tshirt~untrained" optimum=optimum)
+  python experiments/paper/tables.py --tables native_garments --garments tshirt --models "${rows[@]}" \
+    --out "$out/tables_tshirt" ${STEPS:+--smoke}
+  exit
+elif [[ $size == full ]]; then
   for model in mgn-15 mgn-48 hood lsdmp-15 gsa-15 eslr-10 eslr-15; do
     train "$model" full-size "model=$model"
     rows+=("$model=$out/$model/model.npz")

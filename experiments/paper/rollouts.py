@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,29 +10,29 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import jax
+import mat
 import numpy as np
 import posed
+import ssch
 from hood_metrics import hood_metrics
+from mat_space import prepare_space
+from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
 
-from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.assets.load import model_record
-from eslr_jax.body.motion import pose_body
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
-from eslr_jax.evaluation.evaluate import back_and_forth, distance_mm
+from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
 from eslr_jax.physics.hood import HoodParameters
-from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import skin_garment
-from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import BodyMotion, Scene, Trajectory
+from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
 OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
@@ -42,7 +41,6 @@ CONTROLS_OF_WEIGHTS = CONTROLS[:2]  # the others are of the geodesic embedding
 EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which networks were trained
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
-_OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.05 % of the initial gap
 _GAP_FRAMES = 10  # of every rollout, from whose states the gap is measured
 
 
@@ -63,7 +61,9 @@ class System(NamedTuple):
     garment_options: dict[str, Any]  # of `load_garment`
     control: Control | None
     cost: Mapping[str, float]  # parameters, and core-hours of the training where they are known
-    replay: Callable[[Worn], Any] | None = None  # gives all positions of what does not see the cloth
+    weights_on: Callable[[Worn], Any] | None = (
+        None  # of what is made for one scene: all positions of a replay
+    )
 
 
 def read_system(name: str) -> System:
@@ -73,15 +73,15 @@ def read_system(name: str) -> System:
         name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
             NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
             CHANGE is a control of `evaluation.controls` or another mode of the geodesic embedding.
-            `SKINNED`, the garment carried by the joints, is the control of SYSTEM@FOLDER: one of `posed.SYSTEMS`
-            with the networks that `posed` trained there.
+            SYSTEM@FOLDER is one of `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there.
+            Their control is `SKINNED`, the garment carried by the joints; mat's is "mat@FOLDER~untrained".
     """
     if name == SKINNED:
         return _replayed(lambda worn: skin_garment(worn.scene.garment, worn.poses.joint_transforms), {})
     if "@" in name:
-        return _read_posed(*name.split("@", 1))
+        return _read_trained(*name.split("@", 1))
     if name in (OPTIMUM, GUESS):
-        iterations = _OPTIMUM_ITERATIONS if name == OPTIMUM else 0
+        iterations = OPTIMUM_ITERATIONS if name == OPTIMUM else 0
         return System(*simulator_of(SOLVER, iterations), ModelConfig().garment_options, None, {})
     network, _, change = name.partition("~")
     network, _, iterations = network.partition("+")
@@ -100,36 +100,45 @@ def read_system(name: str) -> System:
     return System(params, config, options, control, cost if hours is None else {**cost, "core_hours": hours})
 
 
-def _read_posed(kind: str, folder: str) -> System:
-    """Return a system that sees the motion alone; its training cost is that of all its garments' networks."""
-    found = [posed.read_network(path) for path in sorted(Path(folder).glob(f"{kind}_*.npz"))]
+def _read_trained(kind: str, folder: str) -> System:
+    """Return a system with one network a garment; its training cost is that of all of them."""
+    folder, _, change = folder.partition("~")
+    if change not in ("", "untrained") or (change and kind != "mat"):
+        raise SystemExit(f"{kind}@{folder}~{change}: only mat has a change, and only untrained")
+    reader: Any = {"ssch": ssch, "mat": mat}.get(kind, posed)
+    found = [reader.read_network(path) for path in sorted(Path(folder).glob(f"{kind}_*.npz"))]
     if not found:
-        raise SystemExit(f"{kind}@{folder}: {folder} holds no {kind}_GARMENT.npz; train it with posed.py")
+        raise SystemExit(f"{kind}@{folder}: {folder} holds no {kind}_GARMENT.npz; train it first")
     cost = {
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(found[0][0].params)),
         "core_hours": sum(training["core_hours"] for _, training in found),
     }
+    simulated = sum(training.get("truth_core_hours", 0.0) for _, training in found)
+    if simulated:
+        cost["truth_core_hours"] = simulated
 
-    def positions(worn: Worn) -> Any:
-        network, _ = posed.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")
-        return posed.displace(network, worn.scene.garment, worn.poses.joint_transforms)
+    def network_of(worn: Worn) -> Any:
+        return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
-    return _replayed(positions, cost)
+    if kind != "mat":
+        return _replayed(
+            lambda worn: reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms),
+            cost,
+        )
+
+    def stepper_of(worn: Worn) -> Any:
+        network = network_of(worn)
+        network = mat.untrained(network) if change else network
+        return network.replace(space=prepare_space(worn.scene.garment))
+
+    config = SimConfig(model=mat.Mat(), iterations=0)
+    return System(None, config, ModelConfig().garment_options, None, {} if change else cost, stepper_of)
 
 
 def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
     """Return the system whose positions are known beforehand."""
     config = SimConfig(model=posed.Replay(), iterations=0)
     return System(None, config, ModelConfig().garment_options, None, cost, positions)
-
-
-class Setting(NamedTuple):
-    """What the rows of a table share."""
-
-    garments: tuple[str, ...]  # names of bundled garments
-    clips: tuple[str, ...]  # names of bundled clips, played back and forth
-    frames: int  # of every rollout
-    vertices: str
 
 
 class Reference(NamedTuple):
@@ -139,44 +148,16 @@ class Reference(NamedTuple):
     gap: OptimalityGap  # from some of its states
 
 
-class Worn(NamedTuple):
-    """A garment on a clip."""
-
-    garment: str
-    scene: Scene
-    poses: BodyMotion
-
-    def root_height(self) -> float:
-        """Return the height of the root joint in the first frame [m]."""
-        rest = np.append(np.asarray(load_body().joint_rest_positions[0]), 1.0)
-        return float((self.poses.joint_transforms[0, 0] @ rest)[1])
-
-
 def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Any]]:
     """Yield every garment on every clip with the system's weights; all share a compiled rollout."""
-    for worn in _prepare(tuple(system.garment_options.items()), setting):
+    for worn in wear(tuple(system.garment_options.items()), setting):
         params = system.params
         if system.control is not None:
             changed = control_garment(system.control, worn.scene.garment)
             worn = worn._replace(scene=worn.scene.replace(garment=changed))
-        if system.replay is not None:
-            params = system.replay(worn)
+        if system.weights_on is not None:
+            params = system.weights_on(worn)
         yield worn, params
-
-
-@functools.lru_cache(maxsize=1)
-def _prepare(garment_options: tuple[tuple[str, Any], ...], setting: Setting) -> list[Worn]:
-    """Return what `scenes_of` yields; most systems ask for the same."""
-    body = load_body()
-    motions = [
-        pose_body(body, back_and_forth(load_motion(clip), setting.frames), num_frames=setting.frames)
-        for clip in setting.clips
-    ]
-    names = [name for name in setting.garments for _ in motions]
-    worn = [load_garment(name, vertices=setting.vertices, **dict(garment_options)) for name in names]  # type: ignore[arg-type]
-    poses = motions * len(setting.garments)
-    scenes = prepare_scenes(worn, poses, [COTTON] * len(worn))
-    return [Worn(*row) for row in zip(names, scenes, poses, strict=True)]
 
 
 def find_references(setting: Setting) -> list[Reference]:

@@ -175,7 +175,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     Memory is what XLA allocates for the call, weights included.
     """
     read = {label: read_system(name) for label, (name, *_) in rows.items()}
-    systems = {label: system for label, system in read.items() if system.replay is None}
+    systems = {label: system for label, system in read.items() if system.weights_on is None}
     full_size = FULL_SIZE if vertices != "1k" else ()
     for name in FULL_SIZE[-1:] if is_smoke else full_size:
         params, config = init_model(MODELS[name]), MODELS[name]

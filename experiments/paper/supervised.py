@@ -1,0 +1,103 @@
+"""What the supervised systems share: ground truth, the solver's rollouts on the training clips, and the loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
+
+from eslr_jax.assets import split_clips
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.simulation.rollout import rollout_scene
+
+_FRAMES = 100  # of a clip, as in the tables
+_RATE = 1e-3  # of Adam, falling to zero along a cosine
+
+
+class Truth(NamedTuple):
+    """Near-optimal rollouts of a garment."""
+
+    worn: list[Worn]  # the garment on every clip
+    positions: Float[np.ndarray, "clips frames vertices 3"]  # [m]
+    core_hours: float  # that the rollouts took
+
+
+def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
+    """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`.
+
+    Args:
+        garment: Name of a bundled garment.
+        folder: Where the rollouts are kept.
+        is_smoke: A few frames of one clip.
+
+    Raises:
+        ValueError: The folder holds rollouts of other clips or lengths, or a rollout is not finite.
+    """
+    clips, frames = tuple(split_clips("train")), _FRAMES
+    if is_smoke:
+        clips, frames = clips[:1], 5
+    setting = Setting((garment,), clips, frames, "1k")
+    worn = wear(tuple(ModelConfig().garment_options.items()), setting)
+    path = folder / f"truth_{garment}.npz"
+    if not path.exists():
+        began = time.process_time()
+        config = SimConfig(iterations=OPTIMUM_ITERATIONS)
+        found = []
+        for row in worn:
+            found.append(np.asarray(rollout_scene(None, row.scene, config).positions))
+            print(f"truth {len(found)} of {len(clips)} {time.process_time() - began:.0f} s", flush=True)
+        if not np.isfinite(found).all():
+            raise ValueError("a rollout is not finite")
+        hours = (time.process_time() - began) / 3600
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays = {"positions": np.stack(found), "clips": np.array(clips), "core_hours": np.array(hours)}
+        write_arrays(path, arrays)
+    kept = read_arrays(path, content="ground truth")
+    if tuple(kept["clips"]) != clips or kept["positions"].shape[1] != frames:
+        raise ValueError(f"{path} holds rollouts of other clips or lengths; remove it")
+    return Truth(worn, kept["positions"], float(kept["core_hours"]))
+
+
+def fit(
+    loss: Callable[[Any, Any, Array], Array],
+    params: Any,
+    batches: Callable[[int], Any],
+    steps: int,
+    seed: int,
+) -> tuple[Any, list[float]]:
+    """Return weights after `steps` of Adam, and their losses.
+
+    Args:
+        loss: Function of the weights, a batch and a key; compiled here.
+        params: Where to begin.
+        batches: Function of a step's number to a batch.
+        steps: Number of steps.
+        seed: Of the keys.
+    """
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(_RATE, steps))
+    )
+
+    @jax.jit
+    def step(params, moments, batch, key):
+        value, slope = jax.value_and_grad(loss)(params, batch, key)
+        updates, moments = optimizer.update(slope, moments, params)
+        return optax.apply_updates(params, updates), moments, value
+
+    moments, losses, keys = optimizer.init(params), [], jax.random.split(jax.random.key(seed), steps)
+    began = time.process_time()
+    for k in range(steps):
+        params, moments, value = step(params, moments, batches(k), keys[k])
+        losses.append(float(value))
+        if k % 50 == 0:
+            spent = time.process_time() - began
+            print(f"step {k} loss {np.mean(losses[-50:]):.4f} {spent:.0f} s", flush=True)
+    return params, losses
