@@ -72,7 +72,7 @@ def hood_metrics(
         depth = criterion_depths(position, problem, criterion)
         is_real = garment.vertex_mask
         count = jnp.sum(is_real).astype(position.dtype)
-        inside = jnp.sum(is_real & (depth > 0)) / count
+        inside = jnp.sum(is_real & (depth > 0), dtype=depth.dtype) / count
         return HoodMetrics(terms, inside, masked_sum(safe_norm(gradient), is_real) / count)
 
     def triples(moving: Array) -> tuple[Array, Array, Array]:
