@@ -65,9 +65,7 @@ def test_cloth_that_is_not_thrown_has_the_contacts_it_had(obstacles):
     for one, other in zip(still, moving, strict=True):
         near = np.asarray(one.is_near)
         np.testing.assert_array_equal(near, other.is_near)
-        assert (
-            np.mean(np.asarray(one.faces)[near] == np.asarray(other.faces)[near]) > 0.98
-        )  # rounding breaks ties
+        assert np.sum((np.asarray(one.faces) != np.asarray(other.faces))[near]) < 5  # rounding decides ties
         for name in ("points", "next_points", "normals", "next_normals", "distances"):
             np.testing.assert_allclose(
                 np.asarray(getattr(one, name))[near], np.asarray(getattr(other, name))[near], atol=1e-5
