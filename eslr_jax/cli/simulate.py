@@ -366,13 +366,14 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
 
 def _begin_measuring(scene: Scene, num_frames: int) -> None:
     """Compile the measures of a trajectory of so many frames while its rollout is compiled in a thread."""
-    import numpy as np
+    import jax
 
     from eslr_jax.evaluation.metrics import measure_frames
     from eslr_jax.scene.plan import first_frames
 
-    start = np.asarray(scene.initial_state.position)
-    measure_frames(np.broadcast_to(start, (num_frames, *start.shape)), first_frames(scene, num_frames))
+    start = scene.initial_state.position
+    positions = jax.ShapeDtypeStruct((num_frames, *start.shape), start.dtype)
+    measure_frames.lower(positions, first_frames(scene, num_frames)).compile()
 
 
 def _measure(

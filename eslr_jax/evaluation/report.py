@@ -15,12 +15,10 @@ from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_f
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.garment import split_outfit
-from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _DEEP = 1e-3  # [m] inside the body, from which a depth is measured again
 _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
-_stretches = jax.jit(principal_stretches)
 
 
 Parts = tuple[np.ndarray | None, tuple[str, ...]]
@@ -62,7 +60,7 @@ def trajectory_report(
         "total": sum(terms.values()),
         "max_principal_stretch": float(measures.max_stretch.max()),
         "p99_principal_stretch": float(measures.p99_stretch.max()),
-        "start_principal_stretch": float(np.max(_stretches(trajectory.positions[0], scene.garment)[0])),
+        "start_principal_stretch": float(np.max(face_stretches(trajectory.positions[:1], scene.garment))),
         "worst_stretch": _worst_stretch(trajectory, scene, int(np.argmax(measures.max_stretch)) + 1, parts),
         "penetration_p999_mm": None,
         "penetration_max_mm": None,
@@ -139,7 +137,7 @@ def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion)
 
 def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:
     """Return where a frame is stretched most."""
-    stretch = np.asarray(_stretches(trajectory.positions[frame], scene.garment)[0])
+    stretch = np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
     return _place(frame, int(np.asarray(scene.garment.faces)[stretch.argmax(), 0]), scene, parts)
 
 

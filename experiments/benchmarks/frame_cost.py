@@ -30,7 +30,7 @@ from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.physics.guess import initial_guess
-from eslr_jax.physics.preconditioner import stiffness
+from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.solve import solve, start_from_guess
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.budget import device_name
@@ -70,7 +70,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
     def before(scene, state, step):
         problem = frame_problem(scene, state, step)
         start = start_from_guess(problem, initial_guess(problem))
-        return start, stiffness(problem, start.point.position)
+        return start, stretched_stiffness(problem, start.point.position)
 
     @jax.jit
     def whole(scene, state, step):
@@ -83,7 +83,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
         "both contacts": (jax.jit(find_both_sides), body),
         "frame problem": (jax.jit(frame_problem), (scene, state, step)),
         "guess": (jax.jit(initial_guess), (problem,)),
-        "preconditioner": (jax.jit(stiffness), (problem, start.point.position)),
+        "preconditioner": (jax.jit(stretched_stiffness), (problem, start.point.position)),
         "all before the first iteration": (before, (scene, state, step)),
         "few": (minimise, (problem, start, FEW)),
         "many": (minimise, (problem, start, MANY)),
