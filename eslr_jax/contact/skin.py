@@ -1,4 +1,4 @@
-"""Skin under the faces of the cloth: where the body's own vertices would show between those of the cloth."""
+"""Skin under the cloth: where the body would show between the cloth's vertices, through faces and folds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.contact.edges import Cloth, Skin, leave_body_faces, leave_cloth_faces
 from eslr_jax.contact.nearest import CLEARANCE, find_contacts
 from eslr_jax.contact.search import face_corners, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
@@ -22,11 +23,11 @@ _UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belon
 
 @struct.dataclass
 class SkinContacts:
-    """Body vertices close under a face of the cloth at t, and where the body carries them."""
+    """Places of the body close under the cloth at t: vertices under faces, and edges under edges."""
 
-    corners: Int[Array, "rows 3"]  # vertices of the face
-    weights: Float[Array, "rows 3"]  # barycentric, of the place nearest to the body vertex at t
-    next_points: Float[Array, "rows 3"]  # body vertices at t + 1 [m]
+    corners: Int[Array, "rows 3"]  # vertices of the cloth's face; an edge has its second one twice
+    weights: Float[Array, "rows 3"]  # barycentric, of the place over the body's at t
+    next_points: Float[Array, "rows 3"]  # places of the body at t + 1 [m]
     next_normals: Float[Array, "rows 3"]  # of the body there
     is_near: Bool[Array, " rows"]
 
@@ -38,10 +39,11 @@ def find_skin_contacts(
     surface: BodySurface,
     garment: Garment,
 ) -> SkinContacts:
-    """Return the body vertices that the cloth's faces are about to cut.
+    """Return the places of the body that the cloth's faces and edges are about to cut.
 
-    Vertices of the cloth keep off the body, but between them a face may cut a knee. The rows are those body
-    vertices that are least far below the cloth, at most half of them: there is no buffer that could run over.
+    Vertices of the cloth keep off the body, but between them a face may cut a knee, and a fold an edge of the
+    body. The rows are the vertices of the body that are least far below the cloth, at most half of them, and as
+    many crossings of edges: there is no buffer that could run over.
 
     Args:
         cloth: Cloth vertices at t [m], and a guess of them at t + 1, such as the inertial one.
@@ -50,32 +52,54 @@ def find_skin_contacts(
         surface: Faces of the body.
         garment: Rest mesh.
     """
-    position, predicted = cloth
-    body, next_body = bodies
-    vertex = _nearest_vertices(position, body, nearest, surface)
-    vertex = _descend(vertex, position, body, garment)
-    corners, weights, squared = _nearest_places(vertex, position, body, garment)
-    normals = vertex_normals(body, surface.faces, surface.face_incidence)
-    next_normals = vertex_normals(next_body, surface.faces, surface.face_incidence)
-
-    both = jnp.concatenate([position, predicted], axis=1)[corners.T]
-    here, ahead = jnp.split(sum(weights[:, k, None] * both[k] for k in range(3)), 2, axis=1)
-    over = jnp.sum((here - body) * normals, axis=-1)
-    next_over = jnp.sum((ahead - next_body) * next_normals, axis=-1)
-    is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
-    clearance = jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
-    nearness, rows = jax.lax.top_k(-clearance, min(position.shape[0], clearance.shape[0] // 2))
+    moving, skin = Cloth(*cloth), Skin(*bodies, *(_normals(body, surface) for body in bodies))
+    corners, weights, clearance = _places_over_vertices(moving, skin, nearest, surface, garment)
+    count = min(garment.rest_positions.shape[0], clearance.shape[0] // 2)
+    covered, rows = jax.lax.top_k(-clearance, count)
+    corners, weights = corners[rows], weights[rows]
+    crossings = jax.tree.map(
+        lambda *parts: jnp.concatenate(parts),
+        leave_body_faces(moving, skin, nearest, surface, garment),
+        leave_cloth_faces(moving, skin, rows, corners, surface),
+    )
+    crossed, edges = jax.lax.top_k(-crossings.clearance, count)
+    ends = crossings.ends[edges]
     return SkinContacts(
-        corners=corners[rows],
-        weights=weights[rows],
-        next_points=next_body[rows],
-        next_normals=next_normals[rows],
-        is_near=-nearness < _OVER,
+        corners=jnp.concatenate([corners, ends[:, (0, 1, 1)]]),
+        weights=jnp.concatenate([weights, jnp.pad(crossings.weights[edges], ((0, 0), (0, 1)))]),
+        next_points=jnp.concatenate([skin.next[rows], crossings.next_points[edges]]),
+        next_normals=jnp.concatenate([skin.next_normals[rows], crossings.next_normals[edges]]),
+        is_near=jnp.concatenate([covered, crossed]) > -_OVER,
     )
 
 
+def _normals(body: Float[Array, "vertices 3"], surface: BodySurface) -> Float[Array, "vertices 3"]:
+    """Return the body's unit normals at its vertices."""
+    return vertex_normals(body, surface.faces, surface.face_incidence)
+
+
+def _places_over_vertices(
+    cloth: Cloth, skin: Skin, nearest: Contacts, surface: BodySurface, garment: Garment
+) -> tuple[
+    Int[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"], Float[Array, " surface_vertices"]
+]:
+    """Return the place of the cloth over every body vertex: corners, weights, and its height at t or t + 1 [m].
+
+    The height is the lower one; it is infinite where the cloth is far, or beside the vertex.
+    """
+    vertex = _nearest_vertices(cloth.now, skin.now, nearest, surface)
+    vertex = _descend(vertex, cloth.now, skin.now, garment)
+    corners, weights, squared = _nearest_places(vertex, cloth.now, skin.now, garment)
+    both = jnp.concatenate(cloth, axis=1)[corners.T]
+    here, ahead = jnp.split(sum(weights[:, k, None] * both[k] for k in range(3)), 2, axis=1)
+    over = jnp.sum((here - skin.now) * skin.normals, axis=-1)
+    next_over = jnp.sum((ahead - skin.next) * skin.next_normals, axis=-1)
+    is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
+    return corners, weights, jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
+
+
 def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts) -> Float[Array, " rows"]:
-    """Return how high the places of the cloth are over the body vertices at t + 1 [m]."""
+    """Return how high the places of the cloth are over those of the body at t + 1 [m]."""
     corners = take3(components(position), skin.corners.T)
     place = tuple(sum(skin.weights[:, k] * axis[k] for k in range(3)) for axis in corners)
     return dot3(sub3(place, components(skin.next_points)), components(skin.next_normals))  # type: ignore[arg-type]

@@ -1,0 +1,65 @@
+"""Edges of the cloth over edges of the body: found where no vertex of either touches the other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.contact.skin import find_skin_contacts, skin_heights
+from eslr_jax.geometry.prepare import prepare_garment
+from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.physics.collision import skin_energy
+
+HALF = 0.03  # [m] of the ridge and of the valley
+ROOF = np.array([[-HALF, 0, 0], [HALF, 0, 0], [0, -0.03, HALF], [0, -0.03, -HALF]])  # a ridge along x
+ROOF_FACES = np.array([[0, 2, 1], [0, 1, 3]])
+VALLEY_FACES = np.array([[0, 1, 2], [0, 3, 1]])
+
+
+def valley(height):
+    """Return cloth whose fold along z points down, so far over the middle of the ridge [m]."""
+    return np.array(
+        [[0, height, -HALF], [0, height, HALF], [0.04, height + 0.04, 0], [-0.04, height + 0.04, 0]]
+    )
+
+
+def rows_of(height, next_height=None):
+    roof = jnp.asarray(ROOF, jnp.float32)
+    surface = prepare_surface(ROOF, ROOF_FACES)
+    garment = prepare_garment(
+        valley(height), VALLEY_FACES, skin_weights=np.ones((4, 1)), skin_indices=np.zeros((4, 1), int)
+    )
+    here = jnp.asarray(valley(height), jnp.float32)
+    ahead = here if next_height is None else jnp.asarray(valley(next_height), jnp.float32)
+    nearest = find_contacts(here, roof, roof, surface)
+    return find_skin_contacts((here, ahead), (roof, roof), nearest, surface, garment), here
+
+
+def fold_rows(skin):
+    """Return which rows are of the fold, which joins vertices 0 and 1."""
+    corners = np.sort(np.asarray(skin.corners), axis=1)
+    return (
+        np.asarray(skin.is_near) & (corners[:, 0] == 0) & (np.asarray(skin.corners)[:, 1:] <= 1).all(axis=1)
+    )
+
+
+@pytest.mark.parametrize("height", [0.004, 0.001, -0.001])
+def test_a_fold_crosses_a_ridge_between_vertices(height):
+    skin, here = rows_of(height)
+    is_fold = fold_rows(skin)
+    assert is_fold.any()
+    heights = np.asarray(skin_heights(here, skin))[is_fold]
+    np.testing.assert_allclose(heights, height, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(skin.next_points)[is_fold], 0.0, atol=1e-6)
+
+
+def test_a_fold_in_the_ridge_is_pushed_out():
+    skin, here = rows_of(-0.001)
+    force = -jax.grad(lambda x: skin_energy(x, skin, jnp.asarray(1e-4), 3.5e7, 2e-3))(here)
+    assert np.all(np.asarray(force)[:2, 1] > 0)
+
+
+def test_cloth_beside_the_ridge_crosses_nothing():
+    skin, _ = rows_of(0.05)
+    assert not fold_rows(skin).any()
