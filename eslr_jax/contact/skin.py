@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.edges import Cloth, Skin, leave_body_faces, leave_cloth_faces
+from eslr_jax.contact.edges import Cloth, Skin, find_crossings
 from eslr_jax.contact.nearest import CLEARANCE, find_contacts
 from eslr_jax.contact.search import face_corners, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
@@ -42,8 +44,8 @@ def find_skin_contacts(
     """Return the places of the body that the cloth's faces and edges are about to cut.
 
     Vertices of the cloth keep off the body, but between them a face may cut a knee, and a fold an edge of the
-    body. The rows are the vertices of the body that are least far below the cloth, at most half of them, and as
-    many crossings of edges: there is no buffer that could run over.
+    body. The rows are the places that are least far below the cloth, three vertices of the body to a crossing of
+    edges: there is no buffer that could run over.
 
     Args:
         cloth: Cloth vertices at t [m], and a guess of them at t + 1, such as the inertial one.
@@ -52,34 +54,30 @@ def find_skin_contacts(
         surface: Faces of the body.
         garment: Rest mesh.
     """
-    moving, skin = Cloth(*cloth), Skin(*bodies, *(_normals(body, surface) for body in bodies))
-    corners, weights, clearance = _places_over_vertices(moving, skin, nearest, surface, garment)
-    count = min(garment.rest_positions.shape[0], clearance.shape[0] // 2)
+    moving = Cloth(*cloth)
+    normals = [vertex_normals(body, surface.faces, surface.face_incidence) for body in bodies]
+    corners, weights, clearance = _places_over_vertices(moving, bodies, normals, nearest, surface, garment)
+    count = 3 * min(cloth[0].shape[0], clearance.shape[0] // 2) // 4
     covered, rows = jax.lax.top_k(-clearance, count)
     corners, weights = corners[rows], weights[rows]
-    crossings = jax.tree.map(
-        lambda *parts: jnp.concatenate(parts),
-        leave_body_faces(moving, skin, nearest, surface, garment),
-        leave_cloth_faces(moving, skin, rows, corners, surface),
-    )
-    crossed, edges = jax.lax.top_k(-crossings.clearance, count)
-    ends = crossings.ends[edges]
+    skin = Skin(*bodies, *normals, clearance[:, None])
+    crossings = find_crossings(moving, skin, rows, corners, surface, -(-count // 3))
     return SkinContacts(
-        corners=jnp.concatenate([corners, ends[:, (0, 1, 1)]]),
-        weights=jnp.concatenate([weights, jnp.pad(crossings.weights[edges], ((0, 0), (0, 1)))]),
-        next_points=jnp.concatenate([skin.next[rows], crossings.next_points[edges]]),
-        next_normals=jnp.concatenate([skin.next_normals[rows], crossings.next_normals[edges]]),
-        is_near=jnp.concatenate([covered, crossed]) > -_OVER,
+        corners=jnp.concatenate([corners, crossings.ends[:, (0, 1, 1)]]),
+        weights=jnp.concatenate([weights, jnp.pad(crossings.weights, ((0, 0), (0, 1)))]),
+        next_points=jnp.concatenate([skin.next[rows], crossings.next_points]),
+        next_normals=jnp.concatenate([skin.next_normals[rows], crossings.next_normals]),
+        is_near=jnp.concatenate([-covered, crossings.clearance]) < _OVER,
     )
-
-
-def _normals(body: Float[Array, "vertices 3"], surface: BodySurface) -> Float[Array, "vertices 3"]:
-    """Return the body's unit normals at its vertices."""
-    return vertex_normals(body, surface.faces, surface.face_incidence)
 
 
 def _places_over_vertices(
-    cloth: Cloth, skin: Skin, nearest: Contacts, surface: BodySurface, garment: Garment
+    cloth: Cloth,
+    bodies: tuple[Float[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"]],
+    normals: Sequence[Float[Array, "surface_vertices 3"]],
+    nearest: Contacts,
+    surface: BodySurface,
+    garment: Garment,
 ) -> tuple[
     Int[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"], Float[Array, " surface_vertices"]
 ]:
@@ -87,13 +85,14 @@ def _places_over_vertices(
 
     The height is the lower one; it is infinite where the cloth is far, or beside the vertex.
     """
-    vertex = _nearest_vertices(cloth.now, skin.now, nearest, surface)
-    vertex = _descend(vertex, cloth.now, skin.now, garment)
-    corners, weights, squared = _nearest_places(vertex, cloth.now, skin.now, garment)
+    body, next_body = bodies
+    vertex = _nearest_vertices(cloth.now, body, nearest, surface)
+    vertex = _descend(vertex, cloth.now, body, garment)
+    corners, weights, squared = _nearest_places(vertex, cloth.now, body, garment)
     both = jnp.concatenate(cloth, axis=1)[corners.T]
     here, ahead = jnp.split(sum(weights[:, k, None] * both[k] for k in range(3)), 2, axis=1)
-    over = jnp.sum((here - skin.now) * skin.normals, axis=-1)
-    next_over = jnp.sum((ahead - skin.next) * skin.next_normals, axis=-1)
+    over = jnp.sum((here - body) * normals[0], axis=-1)
+    next_over = jnp.sum((ahead - next_body) * normals[1], axis=-1)
     is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
     return corners, weights, jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
 

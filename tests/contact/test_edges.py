@@ -20,7 +20,7 @@ VALLEY_FACES = np.array([[0, 1, 2], [0, 3, 1]])
 def valley(height):
     """Return cloth whose fold along z points down, so far over the middle of the ridge [m]."""
     return np.array(
-        [[0, height, -HALF], [0, height, HALF], [0.04, height + 0.04, 0], [-0.04, height + 0.04, 0]]
+        [[0, height, -HALF], [0, height, HALF], [0.04, height + 0.01, 0], [-0.04, height + 0.01, 0]]
     )
 
 
