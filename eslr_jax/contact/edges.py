@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.numerics import dot3, safe_normalize
+from eslr_jax.numerics import dot3, safe_normalize, sub3
 from eslr_jax.types import BodySurface
 
 _BESIDE = 0.005  # [m] of the line between both edges that may be across the body's normal
@@ -72,19 +72,22 @@ def find_crossings(
     # The corner that follows a vertex in each of its faces: around an inner vertex, every neighbour once.
     other = flat[(slots + num_faces) % flat.size]
     sides = jnp.stack([corners, jnp.roll(corners, -1, axis=1)], axis=2)  # [starts, 3, 2]
-    shape = (vertices.size, slots.shape[1], 3)
 
-    def cross(start: Array, slot: Array, side: Array) -> tuple[_Crossing, Int[Array, "rows 2"]]:
-        ends = sides[start, side]
-        first, second = _gathered(cloth, ends[:, 0]), _gathered(cloth, ends[:, 1])
-        here, there = _gathered(skin, vertices[start]), _gathered(skin, other[start, slot])
-        return _cross((first, second), (here, there)), ends
+    def cross(first: Array, second: Array, here: Array, there: Array) -> _Crossing:
+        return _cross(
+            [_gathered(cloth, end) for end in (first, second)],
+            [_gathered(skin, end) for end in (here, there)],
+        )
 
-    everything = jnp.unravel_index(jnp.arange(np.prod(shape)), shape)
-    clearance = cross(*everything)[0].clearance.reshape(shape)
+    # Every end is read once, and meets the others by broadcasting: [starts, degree, 3].
+    clearance = cross(
+        sides[:, None, :, 0], sides[:, None, :, 1], vertices[:, None, None], other[:, :, None]
+    ).clearance
     clearance = jnp.where((slots < flat.size)[:, :, None], clearance, jnp.inf)
     _, lowest = jax.lax.top_k(-clearance.ravel(), count)
-    found, ends = cross(*jnp.unravel_index(lowest, shape))
+    start, slot, side = jnp.unravel_index(lowest, clearance.shape)
+    ends = sides[start, side]
+    found = cross(ends[:, 0], ends[:, 1], vertices[start], other[start, slot])
     return Crossings(
         ends=ends,
         weights=jnp.stack([1.0 - found.share, found.share], axis=1),
@@ -95,28 +98,25 @@ def find_crossings(
 
 
 def _gathered(
-    parts: tuple[Float[Array, "vertices _"], ...], rows: Int[Array, " rows"]
-) -> Float[Array, "columns rows"]:
+    parts: tuple[Float[Array, "vertices _"], ...], vertices: Int[Array, ...]
+) -> Float[Array, "columns ..."]:
     """Return rows of several arrays, columns first: one read for all of them."""
-    return jnp.concatenate(parts, axis=1)[rows].T
+    return jnp.moveaxis(jnp.concatenate(parts, axis=1)[vertices], -1, 0)
 
 
 class _Crossing(NamedTuple):
     """How an edge of the cloth lies over one of the body."""
 
-    clearance: Float[Array, " rows"]  # [m], infinite where they do not cross
-    share: Float[Array, " rows"]  # of the second end of the cloth's edge
-    next_point: Float[Array, "3 rows"]  # on the body's at t + 1 [m]
-    next_normal: Float[Array, "3 rows"]
+    clearance: Float[Array, ...]  # [m], infinite where they do not cross
+    share: Float[Array, ...]  # of the second end of the cloth's edge
+    next_point: Float[Array, "3 ..."]  # on the body's at t + 1 [m]
+    next_normal: Float[Array, "3 ..."]
 
 
-def _cross(
-    cloth: tuple[Float[Array, "6 rows"], Float[Array, "6 rows"]],
-    body: tuple[Float[Array, "13 rows"], Float[Array, "13 rows"]],
-) -> _Crossing:
-    """Return how edges of the cloth lie over edges of the body, both by their ends."""
-    first, second = (rows.reshape(2, 3, -1) for rows in cloth)
-    start, end = (rows[:12].reshape(4, 3, -1) for rows in body)
+def _cross(cloth: Sequence[Float[Array, "6 ..."]], body: Sequence[Float[Array, "13 ..."]]) -> _Crossing:
+    """Return how edges of the cloth lie over edges of the body, both by their two ends, which may broadcast."""
+    first, second = (end.reshape(2, 3, *end.shape[1:]) for end in cloth)
+    start, end = (end[:12].reshape(4, 3, *end.shape[1:]) for end in body)
     side, along, offset = (tuple(x) for x in (end[0] - start[0], second[0] - first[0], start[0] - first[0]))
     a, b, c = dot3(side, side), dot3(side, along), dot3(along, along)  # type: ignore[arg-type]
     d, e = dot3(side, offset), dot3(along, offset)  # type: ignore[arg-type]
@@ -128,9 +128,10 @@ def _cross(
         is_crossing = is_crossing & (share > 0.0) & (share < 1.0)
     here, ahead, normal, next_normal = start + at_body[None, None] * (end - start)
     normal, next_normal = safe_normalize(normal, axis=0), safe_normalize(next_normal, axis=0)
-    gap, next_gap = first + at_cloth[None, None] * (second - first) - jnp.stack([here, ahead])
-    over, next_over = jnp.sum(gap * normal, axis=0), jnp.sum(next_gap * next_normal, axis=0)
-    is_over = (jnp.sum(gap * gap, axis=0) - over * over < _BESIDE**2) & (over > -_UNDER)
+    place, next_place = first + at_cloth[None, None] * (second - first)
+    gap, next_gap = (sub3(tuple(x), tuple(y)) for x, y in ((place, here), (next_place, ahead)))  # type: ignore[arg-type]
+    over, next_over = dot3(gap, tuple(normal)), dot3(next_gap, tuple(next_normal))  # type: ignore[arg-type]
+    is_over = (dot3(gap, gap) - over * over < _BESIDE**2) & (over > -_UNDER)
     lower = jnp.minimum(over, next_over)
     # Where the cloth is higher than over an end of the body's edge, that end keeps it off.
     is_lowest = lower < jnp.minimum(body[0][12], body[1][12])
