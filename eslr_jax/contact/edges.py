@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from eslr_jax.contact.search import following_vertices
 from eslr_jax.numerics import dot3, safe_normalize, sub3
 from eslr_jax.types import BodySurface
 
-_BESIDE = 0.005  # [m] of the line between both edges that may be across the body's normal
-_UNDER = 0.02  # [m] that an edge may already be in the body; deeper ones belong to another limb
+_BESIDE = 0.005  # [m] that the cloth may be beside a place of the body instead of over it
+_UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
 _LEAST_SINE = 0.1  # of the angle between two edges, below which they are parallel and cross nowhere
 
 
@@ -31,9 +32,7 @@ class Skin(NamedTuple):
     next: Float[Array, "surface_vertices 3"]  # at t + 1 [m]
     normals: Float[Array, "surface_vertices 3"]
     next_normals: Float[Array, "surface_vertices 3"]
-    clearance: Float[
-        Array, "surface_vertices 1"
-    ]  # the cloth's lower height, at t or t + 1 [m]; infinite: far
+    clearance: Float[Array, "surface_vertices 1"]  # of the cloth over them, see `clearance_over`
 
 
 class Crossings(NamedTuple):
@@ -43,7 +42,21 @@ class Crossings(NamedTuple):
     weights: Float[Array, "rows 2"]  # of both
     next_points: Float[Array, "rows 3"]  # on the body's edge at t + 1 [m]
     next_normals: Float[Array, "rows 3"]  # of the body there
-    clearance: Float[Array, " rows"]  # the cloth's lower height, at t or t + 1 [m]; infinite: no crossing
+    clearance: Float[Array, " rows"]  # of the cloth over the body's, see `clearance_over`
+
+
+def clearance_over(
+    squared: Float[Array, "*shape"], over: Float[Array, "*shape"], next_over: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Return how high cloth is over places of the body at t or t + 1, the lower one [m]; infinite beside them.
+
+    Args:
+        squared: Distance from the place at t, squared [m^2].
+        over: Height along the body's normal at t [m].
+        next_over: At t + 1.
+    """
+    is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER)
+    return jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
 
 
 def find_crossings(
@@ -68,9 +81,7 @@ def find_crossings(
         count: Rows to return, those with the least clearance.
     """
     slots = surface.face_incidence[vertices]  # [starts, degree]
-    num_faces, flat = surface.faces.shape[0], surface.faces.T.ravel()
-    # The corner that follows a vertex in each of its faces: around an inner vertex, every neighbour once.
-    other = flat[(slots + num_faces) % flat.size]
+    other = following_vertices(slots, surface.faces)
     sides = jnp.stack([corners, jnp.roll(corners, -1, axis=1)], axis=2)  # [starts, 3, 2]
 
     def cross(first: Array, second: Array, here: Array, there: Array) -> _Crossing:
@@ -83,7 +94,7 @@ def find_crossings(
     clearance = cross(
         sides[:, None, :, 0], sides[:, None, :, 1], vertices[:, None, None], other[:, :, None]
     ).clearance
-    clearance = jnp.where((slots < flat.size)[:, :, None], clearance, jnp.inf)
+    clearance = jnp.where((slots < surface.faces.size)[:, :, None], clearance, jnp.inf)
     _, lowest = jax.lax.top_k(-clearance.ravel(), count)
     start, slot, side = jnp.unravel_index(lowest, clearance.shape)
     ends = sides[start, side]
@@ -131,9 +142,7 @@ def _cross(cloth: Sequence[Float[Array, "6 ..."]], body: Sequence[Float[Array, "
     place, next_place = first + at_cloth[None, None] * (second - first)
     gap, next_gap = (sub3(tuple(x), tuple(y)) for x, y in ((place, here), (next_place, ahead)))  # type: ignore[arg-type]
     over, next_over = dot3(gap, tuple(normal)), dot3(next_gap, tuple(next_normal))  # type: ignore[arg-type]
-    is_over = (dot3(gap, gap) - over * over < _BESIDE**2) & (over > -_UNDER)
-    lower = jnp.minimum(over, next_over)
+    clearance = clearance_over(dot3(gap, gap), over, next_over)
     # Where the cloth is higher than over an end of the body's edge, that end keeps it off.
-    is_lowest = lower < jnp.minimum(body[0][12], body[1][12])
-    clearance = jnp.where(is_crossing & is_over & is_lowest, lower, jnp.inf)
-    return _Crossing(clearance, at_cloth, ahead, next_normal)
+    is_lowest = clearance < jnp.minimum(body[0][12], body[1][12])
+    return _Crossing(jnp.where(is_crossing & is_lowest, clearance, jnp.inf), at_cloth, ahead, next_normal)

@@ -333,6 +333,17 @@ def nearest_face_around(
     return _chosen(faces, best)
 
 
+def following_vertices(slots: Int[Array, "*shape"], faces: Int[Array, "faces 3"]) -> Int[Array, "*shape"]:
+    """Return the vertex that follows one in each of its faces: around an inner vertex, every neighbour once.
+
+    Args:
+        slots: Rows of `face_incidence`, see `numerics.gather_corners`; what pads them gets some vertex.
+        faces: Of the mesh.
+    """
+    flat = faces.T.ravel()
+    return flat[(slots + faces.shape[0]) % flat.size]
+
+
 def nearest_candidates(
     points: Vector3, candidates: Int[Array, "candidates rows"], places: Vector3
 ) -> Int[Array, " rows"]:

@@ -9,18 +9,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.edges import Cloth, Skin, find_crossings
+from eslr_jax.contact.edges import Cloth, Skin, clearance_over, find_crossings
 from eslr_jax.contact.nearest import CLEARANCE, find_contacts
-from eslr_jax.contact.search import face_corners, nearest_candidates, nearest_face_around
+from eslr_jax.contact.search import face_corners, following_vertices, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _LIFTS = 8  # of skinned cloth off the skin
 _ROUNDS = 4  # of neighbours; at 1k vertices the cloth's are two to three of the body's edges apart
-_BESIDE = 0.005  # [m] that the cloth may be beside a body vertex instead of over it
 _OVER = 0.02  # [m] over a body vertex, at the end of the frame, beyond which the cloth does not matter to it
-_UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
 
 
 @struct.dataclass
@@ -93,8 +91,8 @@ def _places_over_vertices(
     here, ahead = jnp.split(sum(weights[:, k, None] * both[k] for k in range(3)), 2, axis=1)
     over = jnp.sum((here - body) * normals[0], axis=-1)
     next_over = jnp.sum((ahead - next_body) * normals[1], axis=-1)
-    is_over = (squared - over * over < _BESIDE**2) & (over > -_UNDER) & ~surface.is_boundary
-    return corners, weights, jnp.where(is_over, jnp.minimum(over, next_over), jnp.inf)
+    clearance = clearance_over(squared, over, next_over)
+    return corners, weights, jnp.where(surface.is_boundary, jnp.inf, clearance)
 
 
 def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts) -> Float[Array, " rows"]:
@@ -148,11 +146,9 @@ def _nearest_vertices(
     A cloth vertex begins at the corners of the body face that it is nearest to; body vertices then take over
     what is nearest of their neighbours', a few times.
     """
-    num_faces, cloth, here = surface.faces.shape[0], components(position), components(body)
-    flat = surface.faces.T.ravel()
-    is_neighbor = surface.face_incidence < flat.size
-    # The corner that follows a vertex in each of its faces: around an inner vertex, every neighbour once.
-    neighbors = flat[jnp.where(is_neighbor, (surface.face_incidence + num_faces) % flat.size, 0)]
+    cloth, here = components(position), components(body)
+    is_neighbor = surface.face_incidence < surface.faces.size
+    neighbors = following_vertices(surface.face_incidence, surface.faces)
     own = jnp.arange(body.shape[0], dtype=jnp.int32)[:, None]
     around = jnp.concatenate([own, jnp.where(is_neighbor, neighbors, own)], axis=1).T
     nobody = position.shape[0]
