@@ -160,6 +160,7 @@ class BodySurface:
     face_incidence: Int[Array, "surface_vertices degree"]  # see numerics.gather_corners
     patch_vertices: Int[Array, "patches members"]  # compact groups of all vertices; the last may repeat one
     is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
+    vertex_areas: Float[Array, " surface_vertices"]  # a third of the incident areas at rest [m^2]
 
 
 @struct.dataclass

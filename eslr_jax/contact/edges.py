@@ -43,6 +43,7 @@ class Crossings(NamedTuple):
     next_points: Float[Array, "rows 3"]  # on the body's edge at t + 1 [m]
     next_normals: Float[Array, "rows 3"]  # of the body there
     clearance: Float[Array, " rows"]  # of the cloth over the body's, see `clearance_over`
+    areas: Float[Array, " rows"]  # of the body, mean of the ends of its edge [m^2]
 
 
 def clearance_over(
@@ -98,13 +99,15 @@ def find_crossings(
     _, lowest = jax.lax.top_k(-clearance.ravel(), count)
     start, slot, side = jnp.unravel_index(lowest, clearance.shape)
     ends = sides[start, side]
-    found = cross(ends[:, 0], ends[:, 1], vertices[start], other[start, slot])
+    here, there = vertices[start], other[start, slot]
+    found = cross(ends[:, 0], ends[:, 1], here, there)
     return Crossings(
         ends=ends,
         weights=jnp.stack([1.0 - found.share, found.share], axis=1),
         next_points=found.next_point.T,
         next_normals=found.next_normal.T,
         clearance=clearance.ravel()[lowest],
+        areas=0.5 * (surface.vertex_areas[here] + surface.vertex_areas[there]),
     )
 
 

@@ -30,6 +30,7 @@ class SkinContacts:
     next_points: Float[Array, "rows 3"]  # places of the body at t + 1 [m]
     next_normals: Float[Array, "rows 3"]  # of the body there
     is_near: Bool[Array, " rows"]
+    areas: Float[Array, " rows"]  # that they stand for [m^2]
 
 
 def find_skin_contacts(
@@ -60,12 +61,15 @@ def find_skin_contacts(
     corners, weights = corners[rows], weights[rows]
     skin = Skin(*bodies, *normals, clearance[:, None])
     crossings = find_crossings(moving, skin, rows, corners, surface, -(-count // 3))
+    areas = jnp.concatenate([surface.vertex_areas[rows], crossings.areas])
     return SkinContacts(
         corners=jnp.concatenate([corners, crossings.ends[:, (0, 1, 1)]]),
         weights=jnp.concatenate([weights, jnp.pad(crossings.weights, ((0, 0), (0, 1)))]),
         next_points=jnp.concatenate([skin.next[rows], crossings.next_points]),
         next_normals=jnp.concatenate([skin.next_normals[rows], crossings.next_normals]),
         is_near=jnp.concatenate([-covered, crossings.clearance]) < _OVER,
+        # What a vertex of the cloth carries, or more where the body's mesh is the coarser one.
+        areas=jnp.maximum(areas, garment.mean_vertex_area),
     )
 
 

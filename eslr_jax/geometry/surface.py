@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.geometry.groups import compact_groups
-from eslr_jax.geometry.topology import incidence_table
+from eslr_jax.geometry.topology import face_areas, incidence_table, vertex_areas
 from eslr_jax.types import BodySurface
 
 _PATCH_SIZE = 16  # vertices in a patch; more make the first level cheaper and the second dearer
@@ -32,4 +32,7 @@ def prepare_surface(
         face_incidence=jnp.asarray(incidence_table(faces, len(positions)), jnp.int32),
         patch_vertices=jnp.asarray(compact_groups(positions, _PATCH_SIZE), jnp.int32),
         is_boundary=jnp.asarray(np.isin(vertex_ids, [] if boundary is None else boundary)),
+        vertex_areas=jnp.asarray(
+            vertex_areas(face_areas(positions, faces), faces, len(positions)), jnp.float32
+        ),
     )

@@ -53,34 +53,31 @@ def skin_depths(
 def skin_energy(
     position: Float[Array, "vertices 3"] | Vector3,
     skin: SkinContacts,
-    area: Float[Array, ""],
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Return stiffness a sum_p max(thickness - d_p, 0)^3 [J] over body vertices p under faces of the cloth.
+    """Return stiffness sum_p a_p max(thickness - d_p, 0)^3 [J] over places p of the body under the cloth.
 
     Args:
         position: Vertex positions at t + 1 [m].
-        skin: Body vertices and the places of the cloth over them.
-        area: Area that every one stands for [m^2].
+        skin: Places of the body, the places of the cloth over them, and the areas a_p.
         stiffness: [J/m^5].
         thickness: Distance kept from the body [m].
 
     Source: the barrier is `collision_energy`'s.
     """
     depth = skin_depths(position, skin, thickness)
-    return stiffness * area * jnp.sum(depth * depth * depth)
+    return stiffness * jnp.sum(skin.areas * depth * depth * depth)
 
 
 def skin_diagonal(
     position: Float[Array, "vertices 3"],
     skin: SkinContacts,
-    area: Float[Array, ""],
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,
 ) -> Float[Array, " vertices"]:
     """Return an estimate of `skin_energy`'s curvature per vertex [N/m], a third of that along the normal."""
-    curvature = 2.0 * stiffness * area * skin_depths(position, skin, thickness)
+    curvature = 2.0 * stiffness * skin.areas * skin_depths(position, skin, thickness)
     values = skin.weights**2 * curvature[:, None]
     return segment_sum(values.T.ravel(), skin.corners.T.ravel(), position.shape[0])
 

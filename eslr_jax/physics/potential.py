@@ -132,8 +132,7 @@ def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array
     if body is not None:
         stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
         if body.skin is not None:
-            area = problem.garment.mean_vertex_area
-            on_body += skin_energy(position, body.skin, area, stiffness, thickness)
+            on_body += skin_energy(position, body.skin, stiffness, thickness)
         if body.tips is not None:
             on_body += repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)
     if layers is not None:

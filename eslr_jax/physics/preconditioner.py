@@ -93,7 +93,7 @@ def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -
         skin, tips = problem.body.skin, problem.body.tips
         stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
         if skin is not None:
-            diagonal += skin_diagonal(position, skin, problem.garment.mean_vertex_area, stiffness, thickness)
+            diagonal += skin_diagonal(position, skin, stiffness, thickness)
         if tips is not None:
             diagonal += repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
     if problem.layers is not None:

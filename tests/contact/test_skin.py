@@ -10,11 +10,12 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, lift_off_skin, skin_heights
 from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.collision import skin_diagonal, skin_energy
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 
-STIFFNESS, THICKNESS, AREA = 3.5e7, 2e-3, 1e-4  # [J/m^5], [m], [m^2]
+STIFFNESS, THICKNESS = 3.5e7, 2e-3  # [J/m^5], [m]
 
 
 def scene_of(*, has_skin, num_frames):
@@ -79,7 +80,7 @@ def test_energy_pushes_the_faces_off_and_needs_no_other_force(contacts):
     assert float(jnp.min(jnp.where(skin.is_near, skin_heights(pressed, skin), 1.0))) < THICKNESS
 
     def energy(x):
-        return skin_energy(x, skin, jnp.asarray(AREA), STIFFNESS, THICKNESS)
+        return skin_energy(x, skin, STIFFNESS, THICKNESS)
 
     gradient = jax.grad(energy)(pressed)
     direction = gradient / jnp.linalg.norm(gradient)
@@ -87,6 +88,29 @@ def test_energy_pushes_the_faces_off_and_needs_no_other_force(contacts):
     difference = (energy(pressed + step * direction) - energy(pressed - step * direction)) / (2 * step)
     assert float(difference) == pytest.approx(float(jnp.vdot(gradient, direction)), rel=0.02)
     assert float(jnp.sum(gradient[:, 1])) < 0  # the force, its opposite, lifts
-    diagonal = skin_diagonal(pressed, skin, jnp.asarray(AREA), STIFFNESS, THICKNESS)
+    diagonal = skin_diagonal(pressed, skin, STIFFNESS, THICKNESS)
     assert float(jnp.max(diagonal)) > 0
     assert bool(jnp.all(diagonal >= 0))
+
+
+def test_a_place_stands_for_the_coarser_of_both_meshes(contacts):
+    """A body vertex carries what its own area does, or what the cloth's does where that is larger."""
+    scene, position, body, skin = contacts
+    cloth = float(scene.garment.mean_vertex_area)
+    assert float(jnp.max(scene.body.surface.vertex_areas)) < cloth
+    np.testing.assert_allclose(skin.areas, cloth, rtol=1e-6)
+    surface = scene.body.surface.replace(vertex_areas=scene.body.surface.vertex_areas + 2.0 * cloth)
+    nearest = find_contacts(position, body, body, surface)
+    coarse = find_skin_contacts((position,) * 2, (body,) * 2, nearest, surface, scene.garment)
+    assert float(jnp.min(coarse.areas)) >= 2.0 * cloth
+    pressed = position - jnp.array([[0.0, 0.003, 0.0]])
+    heavier, own = (float(skin_energy(pressed, rows, STIFFNESS, THICKNESS)) for rows in (coarse, skin))
+    assert heavier > 2.0 * own > 0
+
+
+def test_vertex_areas_of_a_body_sum_to_its_surface():
+    positions, faces = ball(24, 32)
+    corners = positions[faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.linalg.norm(crosses, axis=1).sum() / 2
+    assert float(jnp.sum(prepare_surface(positions, faces).vertex_areas)) == pytest.approx(total, rel=1e-5)
