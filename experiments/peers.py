@@ -66,6 +66,7 @@ SETTINGS = (
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
 BLENDER = ((5, 2), (15, 2), (45, 2))  # steps per frame, rounds of collision per step
 OURS = ((1, 10), (1, 20), (1, 50), (1, 100), (5, 50))  # substeps, iterations of L-BFGS
+OUR_SKIN = ((1, 20), (1, 50))  # with faces of the cloth kept off the skin, as `eslr simulate` does
 SCORE = {  # measure of `score_trajectory` -> column
     "pooled_stretch_p99": "pooled_stretch_p99",
     "penetration_p999_mm": "penetration_p999_mm",
@@ -111,7 +112,7 @@ def split_frames(scene: Scene, substeps: int) -> Scene:
     )
 
 
-def our_method(scene: Scene, substeps: int, iterations: int) -> Method:
+def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours") -> Method:
     """Return our solver on a scene."""
     fine = split_frames(scene, substeps)
     inputs, constant = frame_inputs(fine), without_tracks(fine).replace(num_frames=substeps + 1)
@@ -125,7 +126,7 @@ def our_method(scene: Scene, substeps: int, iterations: int) -> Method:
         rows = slice(frame * substeps, (frame + 1) * substeps)
         return advance(constant, state, jax.tree.map(lambda leaf: leaf[rows], inputs))
 
-    return Method("ours", substeps, iterations, run)
+    return Method(name, substeps, iterations, run)
 
 
 def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
@@ -213,12 +214,17 @@ def describe_rollout(positions: np.ndarray, scene: Scene, every: int) -> dict[st
 def measure_scene(
     scene: Scene,
     efforts: tuple[tuple[int, int], ...],
+    covering: tuple[tuple[int, int], ...],
     settings: tuple[Setting, ...],
     blender: tuple[tuple[int, int], ...],
     every: int,
 ) -> list[dict[str, Any]]:
-    """Return a row of plain values per method: ours by efforts, Newton's by settings, Blender's by efforts."""
-    methods = [our_method(scene, *effort) for effort in efforts] + newton_methods(scene, settings)
+    """Return a row of plain values per method and effort: ours, with skin contacts, Newton's, Blender's."""
+    methods = [our_method(scene, *effort) for effort in efforts]
+    if scene.body is not None:
+        covered = scene.replace(body=scene.body.replace(has_skin=True))
+        methods += [our_method(covered, *effort, "ours, skin covered") for effort in covering]
+    methods += newton_methods(scene, settings)
     truth = rollout_scene(None, scene, SimConfig())
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
     gap, initial = teach(methods, scene, truth, every)
@@ -347,10 +353,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
     arguments = parser.parse_args()
-    efforts, settings, blender = OURS, SETTINGS, BLENDER
+    efforts, covering, settings, blender = OURS, OUR_SKIN, SETTINGS, BLENDER
     if arguments.smoke:
         arguments.scenes, arguments.frames = ["tshirt_1k"], 8
-        efforts, settings, blender = OURS[-1:], SMOKE_SETTINGS, BLENDER[:1]
+        efforts, covering, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
         "clip": CLIP,
@@ -367,7 +373,8 @@ def main() -> None:
     if path.exists():
         result["scenes"] = json.loads(path.read_text())["scenes"]
     for name in arguments.scenes:
-        rows = measure_scene(make_scene(name, arguments.frames), efforts, settings, blender, EVERY)
+        scene = make_scene(name, arguments.frames)
+        rows = measure_scene(scene, efforts, covering, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
         with atomic_write(path) as temporary:  # after every scene: they take minutes

@@ -1,10 +1,10 @@
 """The paper's two figures: how the networks' cloth looks, and where it stores stretch energy.
 
-    python experiments/paper/qualitative.py [--smoke]
+    python experiments/paper/qualitative.py [--models NAME ...] [--garments NAME ...] [--smoke]
 
 Free rollouts on an unseen clip, the same frame of each. Our optimum takes the place of the paper's reference,
-ARCSim. Writes qualitative.png (cloth), stretch_energy.png (energy per area on cloth, one scale for all),
-stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
+ARCSim. A name is one of `rollouts.read_system`. Writes qualitative.png (cloth), stretch_energy.png (energy per
+area on cloth, one scale for all), stretch_energy_distribution.png (all faces and frames) and stretch_energy.json.
 """
 
 from __future__ import annotations
@@ -15,16 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rollouts import OPTIMUM, arguments, read_system, write
+from rollouts import OPTIMUM, arguments, read_system, scenes_of, write
+from worn import Setting, Worn
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.evaluate import back_and_forth
+from eslr_jax.assets import load_body, load_splits
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
-from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
@@ -88,30 +86,30 @@ def main() -> None:
     """Simulate, render and write."""
     parser = arguments(__doc__)
     parser.add_argument("--frames", type=int, default=90, help="of every rollout")
+    parser.add_argument("--models", nargs="+", default=list(MODELS), help="columns, the optimum added")
+    parser.add_argument("--garments", nargs="+", default=list(GARMENTS), help="rows")
     chosen = parser.parse_args()
     clip = load_splits()["motions"]["test"][0]
-    models, garments = MODELS, GARMENTS
     if chosen.smoke:
-        models, garments, chosen.frames = models[-1:], garments[:1], 5
+        chosen.models, chosen.garments, chosen.frames = [OPTIMUM], chosen.garments[:1], 5
+    models, garments = list(dict.fromkeys([*chosen.models, OPTIMUM])), chosen.garments
+    setting = Setting(tuple(garments), (clip,), chosen.frames, chosen.vertices)
     body = load_body()
-    poses = pose_body(body, back_and_forth(load_motion(clip), chosen.frames), num_frames=chosen.frames)
-    results: dict[tuple[str, str], tuple[Any, Scene, np.ndarray]] = {}
+    results: dict[tuple[str, str], tuple[Any, Worn, np.ndarray]] = {}
     for name in models:
         system = read_system(name)
-        for garment in garments:
-            scene = prepare_scene(
-                load_garment(garment, vertices=chosen.vertices, **system.garment_options), poses
-            )
-            positions = rollout_scene(system.params, scene, system.config).positions
-            results[name, garment] = np.asarray(positions), scene, np.asarray(face_energies(positions, scene))
-            print(name, garment, flush=True)
+        for worn, params in scenes_of(system, setting):
+            positions = rollout_scene(params, worn.scene, system.config).positions
+            energies = face_energies(positions, worn.scene)
+            results[name, worn.garment] = np.asarray(positions), worn, np.asarray(energies)
+            print(name, worn.garment, flush=True)
 
     plain, colored = [], []
     for garment in garments:
         reference = results[OPTIMUM, garment][2][-1]
         limit = float(np.quantile(reference[reference > 0], _FULL_SCALE))
         for name in models:
-            positions, scene, energies = results[name, garment]
+            positions, (_, scene, poses), energies = results[name, garment]
             is_face = np.asarray(scene.garment.rest_areas) > 0
             mesh = (
                 np.asarray(poses.positions)[-1],
@@ -119,11 +117,13 @@ def main() -> None:
                 positions[-1],
                 np.asarray(scene.garment.faces)[is_face],
             )
-            view = {"camera": _CAMERA, "size": _SIZE}
+            view = {
+                "camera": _CAMERA, "size": _SIZE, "rest_positions": np.asarray(body.rest_positions), "rig": body
+            }  # fmt: skip
             colors = color_scale(at_vertices(energies[-1], scene), 0.0, limit)
             plain.append(render_frame(*mesh, **view))
             colored.append(render_frame(*mesh, **view, vertex_colors=colors))
-    labels = list(models) * len(garments)
+    labels = [name.partition("@")[0] for name in models] * len(garments)
     chosen.out.mkdir(parents=True, exist_ok=True)
     for pictures, file in ((plain, "qualitative.png"), (colored, "stretch_energy.png")):
         write_png(chosen.out / file, side_by_side(pictures, labels, columns=len(models)))
@@ -132,7 +132,7 @@ def main() -> None:
         name: np.concatenate(
             [
                 results[name, garment][2][1:][
-                    :, np.asarray(results[name, garment][1].garment.rest_areas) > 0
+                    :, np.asarray(results[name, garment][1].scene.garment.rest_areas) > 0
                 ].ravel()
                 for garment in garments
             ]
