@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eslr_jax.contact.edges import clearance_over
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, skin_heights
 from eslr_jax.geometry.prepare import prepare_garment
@@ -62,3 +63,11 @@ def test_a_fold_in_the_ridge_is_pushed_out():
 def test_a_fold_high_over_the_ridge_is_not_near():
     skin, _ = rows_of(0.05)
     assert not fold_rows(skin).any()
+
+
+@pytest.mark.parametrize(("beside", "is_over"), [(0.0, True), (0.008, True), (0.012, False)])
+def test_cloth_counts_as_over_a_place_up_to_a_centimetre_beside_it(beside, is_over):
+    """Folds lie beside the vertices that they are about to cut: half of this left trousers with pairs."""
+    over = jnp.float32(0.004)
+    clearance = clearance_over(over**2 + beside**2, over, over - 0.003)
+    assert float(clearance) == pytest.approx(0.001 if is_over else np.inf)
