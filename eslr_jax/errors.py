@@ -52,7 +52,7 @@ class Status(enum.IntFlag):
     def describe(self) -> str:
         """One line per set bit, with what to do about it."""
         texts = {
-            Status.NON_FINITE: "positions became NaN or infinite; use the solver, more iterations, "
+            Status.NON_FINITE: "positions or forces became NaN or infinite; use the solver, more iterations, "
             "or a smaller timestep",
             Status.SELF_CONTACT_OVERFLOW: "more self-contact than its buffers hold; "
             "prepare the scene with a larger PairCapacity",

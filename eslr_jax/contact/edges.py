@@ -13,7 +13,7 @@ from eslr_jax.contact.search import following_vertices
 from eslr_jax.numerics import dot3, safe_normalize, sub3
 from eslr_jax.types import BodySurface
 
-_BESIDE = 0.01  # [m] that the cloth may be beside a place of the body instead of over it; 5 mm leave folds unseen
+_BESIDE = 0.01  # [m] beside a place of the body, up to which cloth is over it; time_and_skin.py chose it
 _UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
 _LEAST_SINE = 0.1  # of the angle between two edges, below which they are parallel and cross nowhere
 

@@ -107,9 +107,9 @@ def find_start(
     return Start(point, guess.inertial_energy, prediction.previous), _finiteness(prediction.position)
 
 
-def _finiteness(position: Float[Array, "vertices 3"]) -> Int[Array, ""]:
-    """Return the status bits of positions [m], shape [vertices, 3]."""
-    return jnp.where(jnp.all(jnp.isfinite(position)), int(Status.OK), int(Status.NON_FINITE))
+def _finiteness(values: Float[Array, ...]) -> Int[Array, ""]:
+    """Return the status bits of numbers of any shape."""
+    return jnp.where(jnp.all(jnp.isfinite(values)), int(Status.OK), int(Status.NON_FINITE))
 
 
 def next_state(
@@ -128,7 +128,9 @@ def next_state(
         status: Bits that the frame has raised so far.
         residual: Force norm over weight that the frame ended with.
     """
-    status = state.status | status | problem_status(problem) | _finiteness(position)
+    # A gradient that is not finite stops the solver where it began, at positions that are.
+    status = state.status | status | problem_status(problem)
+    status = status | _finiteness(position) | _finiteness(jnp.asarray(residual))
     frame = state.frame + 1
     origin = problem.position if problem.bdf2 is None else problem.bdf2.origin
     return ClothState(

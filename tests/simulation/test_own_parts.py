@@ -9,7 +9,7 @@ from flax import linen as nn
 from jax.tree_util import Partial
 
 from eslr_jax import SceneOptions, SimConfig, plan_scene, prepare_scene, rollout, simulate
-from eslr_jax.errors import ConfigError
+from eslr_jax.errors import ConfigError, NonFiniteError
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.simulation.frame import first_problem
@@ -53,6 +53,18 @@ def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiate
     own = trajectory_report(trajectory, scene)["terms"]["own"]
     area = float(garment.vertex_areas.sum())
     assert own == pytest.approx(-5.0 * area * 5.0 * known[-1] / 3, rel=1e-3)
+
+
+def test_an_own_energy_without_a_finite_gradient_is_refused():
+    """The solver would stay at its guess, at positions that are finite."""
+
+    def root(position, problem):
+        return jnp.sqrt(jnp.sum(jnp.maximum(0.0 * position, 0.0)))
+
+    options = SceneOptions(energies=(root,), has_body=False)
+    scene = prepare_scene(square(), drifting_ball(3, speed=0.0), options=options)
+    with pytest.raises(NonFiniteError, match="forces"):
+        simulate(None, scene, config=SimConfig(iterations=5))
 
 
 def test_an_own_network_goes_through_both_doors():
