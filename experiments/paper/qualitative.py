@@ -104,6 +104,7 @@ def main() -> None:
             results[name, worn.garment] = np.asarray(positions), worn, np.asarray(energies)
             print(name, worn.garment, flush=True)
 
+    view = {"camera": _CAMERA, "size": _SIZE, "rest_positions": np.asarray(body.rest_positions), "rig": body}
     plain, colored = [], []
     for garment in garments:
         reference = results[OPTIMUM, garment][2][-1]
@@ -117,9 +118,6 @@ def main() -> None:
                 positions[-1],
                 np.asarray(scene.garment.faces)[is_face],
             )
-            view = {
-                "camera": _CAMERA, "size": _SIZE, "rest_positions": np.asarray(body.rest_positions), "rig": body
-            }  # fmt: skip
             colors = color_scale(at_vertices(energies[-1], scene), 0.0, limit)
             plain.append(render_frame(*mesh, **view))
             colored.append(render_frame(*mesh, **view, vertex_colors=colors))

@@ -67,7 +67,7 @@ def test_a_fold_high_over_the_ridge_is_not_near():
 
 @pytest.mark.parametrize(("beside", "is_over"), [(0.0, True), (0.008, True), (0.012, False)])
 def test_cloth_counts_as_over_a_place_up_to_a_centimetre_beside_it(beside, is_over):
-    """Folds lie beside the vertices that they are about to cut: half of this left trousers with pairs."""
+    """Folds lie beside the vertices that they are about to cut."""
     over = jnp.float32(0.004)
     clearance = clearance_over(over**2 + beside**2, over, over - 0.003)
     assert float(clearance) == pytest.approx(0.001 if is_over else np.inf)
