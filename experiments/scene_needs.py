@@ -32,7 +32,7 @@ from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import Scene
+from eslr_jax.types import Air, Scene
 
 RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"
@@ -120,6 +120,18 @@ def main() -> None:
             "without": prepare_scene(shirt, poses, options=SceneOptions(has_body=False)),
         },
         "T-shirt: self-contact against none": lambda: {"with": with_layers(scene), "without": scene},
+        "T-shirt: skin contacts against none": lambda: {
+            "with": prepare_scene(shirt, poses, options=SceneOptions(has_skin=True)),
+            "without": scene,
+        },
+        "T-shirt: BDF2 against implicit Euler": lambda: {
+            "bdf2": prepare_scene(shirt, poses, options=SceneOptions(integrator="bdf2")),
+            "euler": scene,
+        },
+        "T-shirt: air that moves against none": lambda: {
+            "with": prepare_scene(shirt, poses, options=SceneOptions(air=Air((3.0, 0.0, 0.0)))),
+            "without": scene,
+        },
         "T-shirt: whole body against what it reaches": lambda: {
             "whole body": prepare_scene(shirt, poses, surface=whole),
             "reached": scene,

@@ -1,6 +1,7 @@
 """Time the parts of a frame of the solver, by size, with and without self-contact.
 
-    python experiments/benchmarks/frame_cost.py [--sizes 1k 4k 10k 50k] [--out DIR] [--smoke]
+    python experiments/benchmarks/frame_cost.py [--sizes 1k 4k 10k] [--out DIR] [--smoke]
+    python experiments/benchmarks/frame_cost.py --sizes 50k 200k --no-self-contact  # joins the sizes in the file
 
 A T-shirt in the middle of a walk. Every part is called in turns with the others, and counts as a ratio to one
 iteration of the solver in the same turns: figures of a busy machine then compare with those of a quiet one.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +42,9 @@ from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parents[1] / "results"
-SIZES = ("1k", "4k", "10k", "50k")
+SIZES = ("1k", "4k", "10k", "50k", "200k")
+CASES = {"without self-contact": False, "with self-contact": True}
+RATIO = "whole frame with self-contact / without"
 CLIP = "cmu_016_32"
 FRAMES = 12  # simulated before the one that is timed
 ITERATIONS = 20  # of the whole frame, as in scene_needs.py
@@ -95,48 +99,51 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
     return parts
 
 
-def measure(size: str, turns: int, frames: int) -> dict[str, Any]:
+def measure(size: str, turns: int, frames: int, cases: Sequence[str]) -> dict[str, Any]:
     """Return the milliseconds of every part with and without self-contact, and ratios to one iteration.
 
     Args:
         size: Resolution of the T-shirt.
         turns: Calls of every part.
         frames: Frames simulated before.
+        cases: Which of CASES are measured.
     """
     poses = pose_body(load_body(), load_motion(CLIP), num_frames=frames + 1)
     garment = load_garment("tshirt", vertices=size)
-    cases = {
-        name: frame_parts(prepare_scene(garment, poses, options=SceneOptions(self_contact=layers)), MANY)
-        for name, layers in (("without self-contact", False), ("with self-contact", True))
+    calls = {
+        case: frame_parts(prepare_scene(garment, poses, options=SceneOptions(self_contact=CASES[case])), MANY)
+        for case in cases
     }
     timed = time_in_turns(
-        {(case, part): call for case, parts in cases.items() for part, call in parts.items()}, turns
+        {(case, part): call for case, parts in calls.items() for part, call in parts.items()}, turns
     )
     # The least of all calls: what else runs on the machine only ever adds.
-    times = {case: {part: min(timed[case, part]) for part in parts} for case, parts in cases.items()}
+    times = {case: {part: min(timed[case, part]) for part in parts} for case, parts in calls.items()}
     result: dict[str, Any] = {"vertices": int(np.sum(garment.vertex_mask))}
     for case, parts in times.items():
         parts["one iteration"] = (parts.pop("many") - parts.pop("few")) / (MANY - FEW)
         result[case] = {"ms": parts, "iterations": {k: v / parts["one iteration"] for k, v in parts.items()}}
-    whole = [times[case][f"whole frame, {ITERATIONS} iterations"] for case in cases]
-    return {**result, "whole frame with self-contact / without": whole[1] / whole[0]}
+    if len(cases) == len(CASES):
+        without, whole = (times[case][f"whole frame, {ITERATIONS} iterations"] for case in CASES)
+        result[RATIO] = whole / without
+    return result
 
 
 def print_table(size: str, result: dict[str, Any]) -> None:
     """Print one size as a table: milliseconds, and iterations that would take as long."""
-    print(f"{size}: {result['vertices']} vertices{'':14}without self-contact{'':12}with", flush=True)
-    with_layers, without = result["with self-contact"], result["without self-contact"]
-    for part in with_layers["ms"]:
+    cases = [result[case] for case in CASES if case in result]
+    names = "".join(f"{case:>25}" for case in CASES if case in result)
+    print(f"{size}: {result['vertices']:8} vertices{'':11}{names}", flush=True)
+    for part in cases[-1]["ms"]:
         cells = [
             f"{case['ms'][part]:9.2f} ms {case['iterations'][part]:6.2f} it"
             if part in case["ms"]
             else " " * 22
-            for case in (without, with_layers)
+            for case in cases
         ]
-        print(f"  {part:32}{cells[0]}  {cells[1]}")
-    print(
-        f"  whole frame with / without: {result['whole frame with self-contact / without']:.2f}", flush=True
-    )
+        print(f"  {part:32}{'   '.join(cells)}")
+    if RATIO in result:
+        print(f"  {RATIO}: {result[RATIO]:.2f}", flush=True)
 
 
 def main() -> None:
@@ -144,20 +151,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--sizes", nargs="+", default=list(SIZES), choices=SIZES)
+    parser.add_argument("--sizes", nargs="+", default=list(SIZES[:3]), choices=SIZES)
+    parser.add_argument("--no-self-contact", action="store_true", help="leave out the frame with it")
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="1k, two frames, one turn")
     arguments = parser.parse_args()
     sizes, turns, frames = (["1k"], 1, 2) if arguments.smoke else (arguments.sizes, arguments.turns, FRAMES)
+    cases = list(CASES)[:1] if arguments.no_self_contact else list(CASES)
+    path = arguments.out / "frame_cost.json"
     result: dict[str, Any] = {}
-    for size in sizes:
-        result[size] = measure(size, turns, frames)
-        print_table(size, result[size])
-    result |= {"clip": CLIP, "device": device_name(), "environment": environment()}
+    if path.exists() and not arguments.smoke:
+        result = json.loads(path.read_text())
     arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / "frame_cost.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    for size in sizes:
+        row = measure(size, turns, frames, cases)
+        print_table(size, row)
+        result[size] = {**row, "clip": CLIP, "device": device_name(), "environment": environment()}
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Run the fifteen hard cases with a simulator and keep the figures, with device and versions.
 
     python experiments/hard_cases physics
+    python experiments/hard_cases physics --integrator bdf2 --skin   # as `eslr simulate` has the solver
     python experiments/hard_cases network --model eslr-small
     python experiments/hard_cases corrected --model smooth-small --sheet
     python experiments/hard_cases vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
@@ -43,6 +44,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--model", default=DEFAULT_MODEL)
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
     parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
+    parser.add_argument(
+        "--skin", action="store_true", help="physics: keep faces of the cloth off the body too"
+    )
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
     parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
@@ -67,7 +71,7 @@ def find_simulator(arguments: argparse.Namespace):
 
     name = arguments.simulator
     if name == "physics":
-        return solver_simulator(arguments.iterations, arguments.integrator)
+        return solver_simulator(arguments.iterations, arguments.integrator, has_skin=arguments.skin)
     if name in ITERATIONS:
         return network_simulator(arguments.model, *load_model(arguments.model), arguments.iterations)
     if arguments.iterations is not None:
@@ -104,6 +108,7 @@ def run(arguments: argparse.Namespace) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
     other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
+    other += "_skin" if arguments.skin else ""
     path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
     outcomes = []
     for case in cases:

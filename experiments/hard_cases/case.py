@@ -40,6 +40,12 @@ class Simulator:
     simulate: Callable[[Scene], Trajectory]
     garment_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of `prepare_garment`
     integrator: Integrator = "euler"
+    has_skin: bool = False  # faces of the cloth keep off the body too
+
+    def prepare(self, scene: Scene) -> Scene:
+        """Return a case's scene with what this simulator models."""
+        body = scene.body and scene.body.replace(has_skin=self.has_skin)
+        return scene.replace(body=body, initial_state=start_integrator(scene.initial_state, self.integrator))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,8 +151,7 @@ def run_case(case: HardCase, simulator: Simulator) -> Outcome:
         try:
             if isinstance(built, EslrError):
                 raise built
-            state = start_integrator(built.scene.initial_state, simulator.integrator)
-            scene = built.scene.replace(initial_state=state)
+            scene = simulator.prepare(built.scene)
             runs[label] = Run(scene, built.colliders, simulator.simulate(scene))
         except EslrError as error:
             refusals[label] = error

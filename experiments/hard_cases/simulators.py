@@ -11,14 +11,22 @@ from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Simulator
 
 
-def solver_simulator(iterations: int = 200, integrator: Integrator = "euler") -> Simulator:
-    """Return the L-BFGS solver as a simulator, with so many iterations per frame at most."""
+def solver_simulator(
+    iterations: int = 200, integrator: Integrator = "euler", *, has_skin: bool = False
+) -> Simulator:
+    """Return the L-BFGS solver as a simulator.
+
+    Args:
+        iterations: Per frame, at most.
+        integrator: How time is stepped.
+        has_skin: Keep faces of the cloth off the body, besides its vertices.
+    """
 
     def run(scene: Scene) -> Trajectory:
         return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
 
-    name = "physics" if integrator == "euler" else f"physics, {integrator}"
-    return Simulator(f"{name}, {iterations} iterations", run, integrator=integrator)
+    parts = ["physics", integrator * (integrator != "euler"), "skin" * has_skin, f"{iterations} iterations"]
+    return Simulator(", ".join(filter(None, parts)), run, integrator=integrator, has_skin=has_skin)
 
 
 def network_simulator(name: str, params: Any, model: ModelConfig, iterations: int = 0) -> Simulator:
