@@ -12,6 +12,9 @@ from eslr_jax.types import Garment
 # Of a direction along a normal (cosine) at rest, below which it says nothing. A T-shirt's sleeve and trunk, which
 # cross at the armpit where an arm hangs down, have .2 to 1.2 for the sum of both.
 _LEAST_COSINE = 0.2
+# [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
+# around another one they are then on the other side than at rest.
+_NEXT_LAYER = 0.01
 _FACE_PER_EDGE = 3**0.5 / 4  # area of an equilateral triangle over its squared edge
 
 
@@ -22,10 +25,11 @@ def sides_where_crossed(
     garment: Garment,
     radius: float,
 ) -> Float[Array, " pairs"]:
-    """Return the sides of pairs; near cloth that passes through cloth they are those of the rest mesh.
+    """Return the sides of pairs; those of close ones where cloth passes through cloth are the rest mesh's.
 
     Elsewhere layers are in order, and stay as they are. Where they cross, whatever keeps them so would lock them
-    together. A pair that the rest mesh says nothing about is left out there: its cloth may slide free.
+    together. Pairs there that are farther apart, or that the rest mesh says nothing about, are left out: one that
+    pulled the other way would tear at the cloth, and without it the cloth may slide free.
 
     Args:
         position: Vertices [m].
@@ -43,7 +47,10 @@ def sides_where_crossed(
     rings = jnp.ceil(radius / jnp.sqrt(jnp.maximum(area / _FACE_PER_EDGE, 1e-12))).astype(jnp.int32)
     marks = jax.lax.fori_loop(0, rings, lambda _, m: m | jnp.any(m[garment.neighbors], axis=1), marks)
     is_near = marks[vertices] | jnp.any(marks[corners], axis=1)
-    return jnp.where(is_near & (side != 0), _sides_at_rest(vertices, corners, weights, garment), side)
+    place = jnp.sum(weights[:, :, None] * position[corners], axis=1)
+    is_close = jnp.sum(jnp.square(position[vertices] - place), axis=1) < _NEXT_LAYER**2
+    at_rest = jnp.where(is_close, _sides_at_rest(vertices, corners, weights, garment), 0.0)
+    return jnp.where(is_near & (side != 0), at_rest, side)
 
 
 def _sides_at_rest(

@@ -29,7 +29,9 @@ TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
 # [m] within which layers see each other: they may approach by this much in a frame. At 0.02 the walls of a pleat
 # that closes at a metre a second passed through each other unseen (hard case `layers`).
 SEARCH_RADIUS = 0.04
-_NEAR = 0.01  # [m] within which a pair is kept even if it doesn't seem to approach (ContourCraft)
+# [m] within which a pair is kept even if it doesn't seem to approach. With ContourCraft's 0.01 the walls of fast
+# folds, which the inertial guess sees moving apart, passed through each other: `layers` of the hard cases.
+_NEAR = 0.02
 _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a hem there is nothing to hit
 _MAX_SLOPE = 0.75  # the same as sideways distance over height: sin / cos
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
@@ -89,7 +91,7 @@ def find_self_contacts(
 ) -> FacePairs:
     """Pair every vertex with the faces of the same cloth that it could touch during the frame.
 
-    A pair is closer than `radius` at t, and closer than a centimetre at t or at the prediction. The vertex
+    A pair is closer than `radius` at t, and closer than two centimetres at t or at the prediction. The vertex
     must stand over the face rather than beside it. Which side it is on is decided at t, and in the rest mesh
     where the cloth passes through itself at t. Faces around the vertex are no pairs: those that hold it, and
     those within two edges of it that are also within 2 cm in the rest mesh.

@@ -16,7 +16,7 @@ from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.embedding import EmbeddingMode, geodesic_embedding
 from eslr_jax.geometry.groups import compact_groups
 from eslr_jax.geometry.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
-from eslr_jax.geometry.validate import validate_mesh, validate_orientation
+from eslr_jax.geometry.validate import validate_lengths, validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 
 
@@ -67,7 +67,7 @@ def prepare_garment(
                 f"{name}: sewn positions {sewn.shape} do not fit rest positions {positions.shape}; "
                 "give one row per vertex"
             )
-        validate_mesh(sewn, faces, name=f"{name}, as sewn", allow_components=allow_components)
+        validate_lengths(sewn, faces, name=f"{name}, as sewn")
     faces = np.asarray(faces, np.int64)
     num_vertices = len(positions)
     is_pinned = _pin_mask(name, num_vertices, is_pinned)

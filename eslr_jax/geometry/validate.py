@@ -67,6 +67,27 @@ def validate_mesh(
         )
 
 
+def validate_lengths(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str
+) -> None:
+    """Check other positions of a valid mesh, on which lengths and areas alone are measured.
+
+    Vertices of several garments may coincide there: an outfit's garments are sewn one by one.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles of a mesh that `validate_mesh` has accepted, shape [faces, 3].
+        name: Name of the mesh in messages.
+
+    Raises:
+        MeshError: NaN, an implausible scale, or degenerate faces.
+    """
+    positions, faces = np.asarray(positions), np.asarray(faces)
+    check_arrays(positions, faces, name)
+    _check_scale(positions, name)
+    _check_faces(positions, faces, name)
+
+
 def check_arrays(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
     """Raise on empty arrays, wrong shapes or dtypes, non-finite positions and indices out of range."""
     if positions.size == 0 or faces.size == 0:

@@ -44,6 +44,13 @@ def test_a_garment_beneath_another_is_moved_over_it_and_keeps_its_lengths():
     np.testing.assert_array_equal(outfit.sewn_positions, sewn)
 
 
+def test_garments_that_coincide_as_sewn_are_worn_over_each_other():
+    outfit = combine_garments([tube(0.10, 0.0, 0.4)] * 2, ["underskirt", "skirt"])
+    garment = prepare_stored(outfit, cache=False)
+    first, second = np.split(np.asarray(garment.vertex_areas)[np.asarray(garment.vertex_mask)], 2)
+    np.testing.assert_allclose(first, second, rtol=1e-6)
+
+
 def test_garments_far_from_each_other_stay_as_they_are():
     garments = [tube(0.10, 0.0, 0.4), tube(0.10, 0.5, 0.9)]
     outfit = combine_garments(garments, ["skirt", "top"])
