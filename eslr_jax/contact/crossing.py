@@ -14,7 +14,7 @@ from eslr_jax.types import Garment
 _LEAST_COSINE = 0.2
 # [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
 # around another one they are then on the other side than at rest.
-_NEXT_LAYER = 0.01
+_NEXT_LAYER = 0.02
 _FACE_PER_EDGE = 3**0.5 / 4  # area of an equilateral triangle over its squared edge
 
 
