@@ -73,3 +73,23 @@ def test_a_pair_that_the_rest_mesh_says_nothing_about_is_left_out_where_cloth_cr
         count = np.sum(np.abs(flat[vertices, 0]) > CROSSING)
         assert count == 0 if crosses else count > 30
         assert (sides == 1.0).all()
+
+
+@pytest.mark.parametrize("crosses", [False, True])
+def test_pairs_beyond_the_next_layer_are_left_out_where_cloth_crosses(crosses):
+    flat, faces = sheet()
+    count, up = len(flat), np.array([[0.0, 1.0, 0.0]])
+    middle = flat * [1, 0, 1] + up * (0.1 * flat[:, :1] if crosses else 0.013) + [0, 0, 0.3 * SPACING]
+    layers = [flat, middle, flat + 0.026 * up]
+    rest = np.concatenate([flat + 0.026 * k * up for k in range(3)])
+    garment = make_garment(rest, np.concatenate([faces + k * count for k in range(3)]))
+    here = np.concatenate(layers)
+    ahead = np.concatenate([*layers[:2], flat + 0.018 * up])  # the third comes nearer to the first
+    pairs = find(jnp.asarray(here, jnp.float32), jnp.asarray(ahead, jnp.float32), garment, AMPLE)
+    is_used = np.asarray(pairs.side) != 0
+    layer = np.asarray(pairs.vertices)[is_used] // count, np.asarray(pairs.corners)[is_used][:, 0] // count
+    is_far = np.abs(layer[0] - layer[1]) == 2
+    is_middle = np.abs(here[np.asarray(pairs.vertices)[is_used], 0]) < 0.03
+    found_far = np.sum(is_far & is_middle)
+    assert found_far == 0 if crosses else found_far > 30
+    assert np.sum(~is_far & is_middle) > 30

@@ -14,7 +14,7 @@ from eslr_jax.geometry.prepare import to_device
 from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
 from eslr_jax.types import PairCapacity, tree_cast
 
-NEAR, RADIUS, COSINE = 0.01, 0.04, 0.8
+NEAR, RADIUS, COSINE = 0.02, 0.04, 0.8
 STIFFNESS, THICKNESS = 3.5e7, 3e-3
 AMPLE = PairCapacity(pairs=8000)
 find_self_contacts = jax.jit(self_contact.find_self_contacts, static_argnames="capacity")
