@@ -181,6 +181,7 @@ class PastState(NamedTuple):
 
     position: Float[Array, "vertices 3"]  # [m]
     velocity: Float[Array, "vertices 3"]  # [m/s]
+    timestep: Float[Array, ""]  # from there to now [s]
     is_known: Bool[Array, ""]  # False before the first frame: that one is stepped by implicit Euler
 
 
@@ -261,6 +262,7 @@ class Scene:
     air: Air | None = None
     damping: Float[Array, ""] | None = None  # of the fabric [s], see `physics.damping`
     energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
+    substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
 
 
 class PotentialTerms(NamedTuple):

@@ -46,7 +46,7 @@ from eslr_jax.evaluation.score import score_trajectory
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
-from eslr_jax.simulation.rollout import rollout_scene, scan_frames
+from eslr_jax.simulation.rollout import rollout_scene, step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import ClothState, Scene, Trajectory
 
@@ -95,36 +95,17 @@ class Method:
         return f"{self.substeps}x{self.iterations}"
 
 
-def split_frames(scene: Scene, substeps: int) -> Scene:
-    """Return a scene with `substeps` shorter frames in place of each one; all else moves straight."""
-
-    def split(track):
-        share = (jnp.arange(substeps, dtype=track.dtype) / substeps)[None, :, None, None]
-        between = (1 - share) * track[:-1, None] + share * track[1:, None]
-        return jnp.concatenate([between.reshape(-1, *track.shape[1:]), track[-1:]])
-
-    body, pins = scene.body, scene.pin_targets
-    return scene.replace(
-        body=None if body is None else body.replace(positions=split(body.positions)),
-        pin_targets=None if pins is None else split(pins),
-        timestep=scene.timestep / substeps,
-        num_frames=(scene.num_frames - 1) * substeps + 1,
-    )
-
-
 def our_method(scene: Scene, substeps: int, iterations: int, name: str = "ours") -> Method:
     """Return our solver on a scene."""
-    fine = split_frames(scene, substeps)
-    inputs, constant = frame_inputs(fine), without_tracks(fine).replace(num_frames=substeps + 1)
+    inputs, constant = frame_inputs(scene), without_tracks(scene).replace(substeps=substeps)
     stepper = make_stepper(None, SimConfig(iterations=iterations))
 
     @jax.jit
-    def advance(scene: Scene, state: ClothState, inputs: FrameInput) -> ClothState:
-        return scan_frames(stepper, scene, state, inputs)[0]
+    def advance(scene: Scene, state: ClothState, frame: FrameInput) -> ClothState:
+        return step_frame(stepper, scene, state, frame)[0]
 
     def run(state: ClothState, frame: int) -> ClothState:
-        rows = slice(frame * substeps, (frame + 1) * substeps)
-        return advance(constant, state, jax.tree.map(lambda leaf: leaf[rows], inputs))
+        return advance(constant, state, jax.tree.map(lambda leaf: leaf[frame], inputs))
 
     return Method(name, substeps, iterations, run)
 

@@ -44,6 +44,7 @@ class Options:
     no_self_contact: bool = False
     ground: Literal["auto", "on", "off"] = "auto"
     integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
+    substeps: int = 1
     wind: tuple[float, float, float] | None = None
     gust: float = 0.0
     damping: float | None = None

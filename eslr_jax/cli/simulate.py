@@ -61,6 +61,7 @@ def simulate(
     loop: str | None = None,
     settle: int | None = None,
     integrator: Literal["euler", "bdf2"] | None = None,
+    substeps: int = 1,
     self_contact: tyro.conf.FlagCreatePairsOff[bool] = False,
     no_self_contact: tyro.conf.FlagCreatePairsOff[bool] = False,
     ground: Literal["auto", "on", "off"] = "auto",
@@ -113,6 +114,8 @@ def simulate(
             default 15, and 0 for a network alone.
         integrator: How time is stepped: bdf2 keeps swinging cloth in motion; euler, the paper's, loses two thirds
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
+        substeps: Shorter steps in which every frame is simulated; 2 keeps layers apart that swing fast against
+            each other. Iterations count for each of them.
         self_contact: Keep layers of cloth apart, also within one piece; two pieces that can meet are kept apart
             anyway.
         no_self_contact: Let layers of cloth pass through each other.
@@ -223,6 +226,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             ground=options.ground,
             has_skin=method.config.iterations > 0,
             integrator=integrator,
+            substeps=options.substeps,
             air=blowing(options.wind, options.gust),
             damping=options.damping,
         )
@@ -277,6 +281,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "motion": motion,
             "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
             "integrator": integrator,
+            "substeps": scene.substeps,
             "settle": settle,
             "skin_contacts": modelled.has_skin,
             "wind_m_s": options.wind,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -15,7 +14,6 @@ _LEAST_COSINE = 0.2
 # [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
 # around another one they are then on the other side than at rest.
 _NEXT_LAYER = 0.02
-_FACE_PER_EDGE = 3**0.5 / 4  # area of an equilateral triangle over its squared edge
 
 
 def sides_where_crossed(
@@ -23,34 +21,25 @@ def sides_where_crossed(
     pairs: tuple[Int[Array, " pairs"], Int[Array, "pairs 3"], Float[Array, "pairs 3"]],
     side: Float[Array, " pairs"],
     garment: Garment,
-    radius: float,
 ) -> Float[Array, " pairs"]:
-    """Return the sides of pairs; those of close ones where cloth passes through cloth are the rest mesh's.
+    """Return the sides of pairs; those that pass through each other, and are close, have the rest mesh's.
 
-    Elsewhere layers are in order, and stay as they are. Where they cross, whatever keeps them so would lock them
-    together. Pairs there that are farther apart, or that the rest mesh says nothing about, are left out: one that
-    pulled the other way would tear at the cloth, and without it the cloth may slide free.
+    All others stay as they are. Where a pair crosses, whatever keeps it so would lock it. Of those that are
+    farther apart, or that the rest mesh says nothing about, nobody knows the side: they are left out, and may
+    slide free.
 
     Args:
         position: Vertices [m].
         pairs: Vertices, corners of faces, and barycentric weights of the places on the faces.
         side: 1 in front of the face, -1 behind, 0 where a row is not used.
         garment: Rest mesh.
-        radius: Distance along the cloth from where it crosses [m].
     """
     vertices, corners, weights = pairs
-    is_crossed = (side != 0) & _are_crossed(position, vertices, corners, garment)
-    marks = jnp.zeros(position.shape[0], bool)
-    marks = marks.at[vertices].max(is_crossed).at[corners].max(is_crossed[:, None])
-    is_real = garment.rest_areas > 0
-    area = jnp.sum(garment.rest_areas) / jnp.maximum(jnp.sum(is_real, dtype=garment.rest_areas.dtype), 1.0)
-    rings = jnp.ceil(radius / jnp.sqrt(jnp.maximum(area / _FACE_PER_EDGE, 1e-12))).astype(jnp.int32)
-    marks = jax.lax.fori_loop(0, rings, lambda _, m: m | jnp.any(m[garment.neighbors], axis=1), marks)
-    is_near = marks[vertices] | jnp.any(marks[corners], axis=1)
     place = jnp.sum(weights[:, :, None] * position[corners], axis=1)
     is_close = jnp.sum(jnp.square(position[vertices] - place), axis=1) < _NEXT_LAYER**2
     at_rest = jnp.where(is_close, _sides_at_rest(vertices, corners, weights, garment), 0.0)
-    return jnp.where(is_near & (side != 0), at_rest, side)
+    is_crossed = (side != 0) & _are_crossed(position, vertices, corners, garment)
+    return jnp.where(is_crossed, at_rest, side)
 
 
 def _sides_at_rest(

@@ -93,7 +93,7 @@ def find_self_contacts(
 
     A pair is closer than `radius` at t, and closer than two centimetres at t or at the prediction. The vertex
     must stand over the face rather than beside it. Which side it is on is decided at t, and in the rest mesh
-    where the cloth passes through itself at t. Faces around the vertex are no pairs: those that hold it, and
+    where the two pass through each other at t. Faces around the vertex are no pairs: those that hold it, and
     those within two edges of it that are also within 2 cm in the rest mesh.
 
     Args:
@@ -110,7 +110,7 @@ def find_self_contacts(
     cloth = _Cloth(ends, garment, has_points=True, pieces=pieces)
     pairs = _find_pairs(points, cloth, radius, capacity)
     rows = (pairs.vertices, pairs.corners, pairs.weights)
-    return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment, radius))
+    return pairs.replace(side=sides_where_crossed(position, rows, pairs.side, garment))
 
 
 def find_tip_contacts(

@@ -15,6 +15,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
+from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import find_start, make_stepper, past_state
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
@@ -78,7 +79,9 @@ def past_states(
     if first is None:
         return None
     left = jnp.zeros(len(positions) - 2) if residuals is None else residuals[1:-1]
-    tracks = past_state(positions[:-2], velocities[:-2], jnp.nan_to_num(left, nan=0.0))
+    before = jax.vmap(initial_state)(positions[:-2], velocities[:-2])
+    timesteps = jnp.broadcast_to(scene.timestep, left.shape)
+    tracks = past_state(before, timesteps, jnp.nan_to_num(left, nan=0.0))
     return jax.tree.map(lambda start, track: jnp.concatenate([start[None], track]), first, tracks)
 
 

@@ -74,6 +74,7 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
         air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
         damping=run.report.get("damping_s"),
+        substeps=run.report.get("substeps", 1),
     )
 
 

@@ -261,8 +261,12 @@ def layer_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProble
     """Return the Hessian of the repulsion between layers per pair [N/m], shape [pairs, 12, 12]."""
     if problem.layers is None:
         return np.zeros((0, 12, 12))
-    stiffness, thickness = float(problem.constants.repulsion_stiffness), float(problem.layers.thickness)
-    return pair_blocks(position, problem.layers.pairs, stiffness, thickness)
+    layers = problem.layers
+    stiffness, thickness = (
+        float(problem.constants.repulsion_stiffness),
+        np.asarray(layers.thickness, np.float64),
+    )
+    return pair_blocks(position, layers.pairs, stiffness, thickness)
 
 
 def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
@@ -287,7 +291,7 @@ def pair_blocks(
     position: Float[np.ndarray, "vertices 3"],
     pairs: FacePairs,
     stiffness: float,
-    thickness: float,
+    thickness: Float[np.ndarray, " pairs"] | float,
     next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
 ) -> Float[np.ndarray, "pairs size size"]:
     """Return the Gauss-Newton Hessian of the repulsion per pair in use: 6 k a depth g g^T, g = dd/dx.
@@ -323,5 +327,6 @@ def pair_blocks(
         gradient = np.concatenate([normal[:, None], gradient], axis=1)
     gradient = gradient.reshape(len(side), -1)
     curvature = 6.0 * stiffness * np.asarray(pairs.areas, np.float64)[is_used]
-    curvature = curvature * np.maximum(thickness - height, 0.0)
+    kept = np.broadcast_to(thickness, is_used.shape)[is_used]
+    curvature = curvature * np.maximum(kept - height, 0.0)
     return curvature[:, None, None] * gradient[:, :, None] * gradient[:, None, :]

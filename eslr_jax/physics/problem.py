@@ -56,7 +56,7 @@ class SelfContact:
     """Contact between layers of the cloth."""
 
     pairs: FacePairs
-    thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
+    thickness: Float[Array, " pairs"]  # distance kept [m], see `simulation.frame`
 
 
 class SecondOrder(NamedTuple):

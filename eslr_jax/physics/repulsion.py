@@ -43,7 +43,7 @@ def pair_heights(
 def overlaps(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: FacePairs,
-    thickness: Float[Array, ""] | float,
+    thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " pairs"]:
     """Return max(thickness - d, 0) per pair [m]; zero where a row is not used."""
@@ -55,7 +55,7 @@ def repulsion_energy(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: FacePairs,
     stiffness: Float[Array, ""] | float,
-    thickness: Float[Array, ""] | float,
+    thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, ""]:
     """Return stiffness sum_pairs a_p max(thickness - d, 0)^3 [J].
@@ -78,7 +78,7 @@ def repulsion_diagonal(
     position: Float[Array, "vertices 3"],
     pairs: FacePairs,
     stiffness: Float[Array, ""] | float,
-    thickness: Float[Array, ""] | float,
+    thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " vertices"]:
     """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal."""
@@ -91,7 +91,7 @@ def repulsion_diagonal(
 def push_apart(
     position: Float[Array, "vertices 3"],
     pairs: FacePairs,
-    thickness: Float[Array, ""] | float,
+    thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, "vertices 3"]:
     """Move the sides of every overlapping pair apart, a few times: both by half, or the cloth by all of it.

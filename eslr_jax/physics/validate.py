@@ -121,6 +121,17 @@ def validate_damping(damping: Any) -> Any:
     return damping
 
 
+def validate_substeps(substeps: Any) -> int:
+    """Check the number of substeps of a frame, and return it.
+
+    Raises:
+        ConfigError: It is no whole number from one on.
+    """
+    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
+        raise ConfigError(f"substeps = {substeps!r}; give a whole number, 1 or more")
+    return substeps
+
+
 def _check_range(label: str, value: Any, accepted: Range) -> np.ndarray:
     """Return `value` as an array; raise where it is not finite or out of range."""
     try:

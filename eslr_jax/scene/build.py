@@ -49,6 +49,7 @@ class ScenePlan:
     air: Air | None = None
     damping: Float[Array, ""] | None = None  # of the fabric [s]
     energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
+    substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
 
 
 def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: ScenePlan) -> Scene:
@@ -89,6 +90,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         air=plan.air,
         damping=plan.damping,
         energies=plan.energies,
+        substeps=plan.substeps,
     )
 
 
@@ -128,7 +130,7 @@ def start_integrator(state: ClothState, integrator: Integrator) -> ClothState:
     if integrator == "euler":
         return state.replace(past=None)
     nothing = jnp.zeros_like(state.position)
-    return state.replace(past=PastState(nothing, nothing, jnp.zeros((), bool)))
+    return state.replace(past=PastState(nothing, nothing, jnp.ones((), nothing.dtype), jnp.zeros((), bool)))
 
 
 def initial_state(position: Float[Array, "vertices 3"], velocity: Float[Array, "vertices 3"]) -> ClothState:

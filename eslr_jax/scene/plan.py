@@ -21,7 +21,7 @@ from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.physics.materials import COTTON, constants_for
-from eslr_jax.physics.validate import validate_air, validate_damping
+from eslr_jax.physics.validate import validate_air, validate_damping, validate_substeps
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
@@ -43,6 +43,7 @@ class SceneOptions:
     self_contact: bool | None = None  # keep layers of cloth apart; None: where two pieces can meet
     has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
     integrator: Integrator = "euler"
+    substeps: int = 1  # in which a frame is simulated
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
     ground: Literal["auto", "on", "off"] = "auto"
     air: Air | None = None  # drag and wind; None: a vacuum
@@ -108,6 +109,7 @@ def plan_scene(
         pieces=jnp.asarray(piece) if has_layers and is_undecided else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
+        substeps=validate_substeps(options.substeps),
         ground=ground_height(poses) if has_ground else None,
         air=None if options.air is None else validate_air(options.air),
         damping=None if options.damping is None else validate_damping(options.damping),

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.contact.ground import ground_contacts
 from eslr_jax.contact.nearest import find_both_sides
-from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
+from eslr_jax.contact.self_contact import FacePairs, find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
 from eslr_jax.physics.air import air_flow
 from eslr_jax.physics.collision import contact_forces
@@ -24,6 +24,7 @@ from eslr_jax.physics.problem import (
     TipContact,
     contact_thickness,
 )
+from eslr_jax.physics.repulsion import pair_heights
 from eslr_jax.scene.build import slice_tracks
 from eslr_jax.types import ClothState, PastState, Scene, SceneBody
 
@@ -47,6 +48,27 @@ def frame_inputs(scene: Scene) -> FrameInput:
     return FrameInput(
         body=None if scene.body is None else BodyStep(scene.body.positions[:-1], scene.body.positions[1:]),
         pin_targets=None if scene.pin_targets is None else scene.pin_targets[1:],
+    )
+
+
+def part_of_frame(state: ClothState, frame: FrameInput, row: Int[Array, ""], parts: int) -> FrameInput:
+    """Return what the outside world does during one of the equal parts of a frame; it moves straight.
+
+    Args:
+        state: Cloth at t: its pinned vertices are where the pins are.
+        frame: The outside world from t to t + 1.
+        row: Number of the part, from zero.
+        parts: Number of parts.
+    """
+
+    def between(start: Float[Array, "rows 3"], end: Float[Array, "rows 3"], number: Int[Array, ""]) -> Array:
+        share = number.astype(start.dtype) / parts
+        return (1 - share) * start + share * end
+
+    body, pins = frame.body, frame.pin_targets
+    return FrameInput(
+        body=None if body is None else BodyStep(between(*body, row), between(*body, row + 1)),
+        pin_targets=None if pins is None else between(state.position, pins, row + 1),
     )
 
 
@@ -94,8 +116,7 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         pairs = find_self_contacts(
             state.position, guess, scene.garment, scene.self_contact, pieces=scene.pieces
         )
-        thickness = contact_thickness(scene.garment, scene.constants.repulsion_thickness)
-        problem = problem.replace(layers=SelfContact(pairs, thickness))
+        problem = problem.replace(layers=_layers(problem, pairs))
     return problem
 
 
@@ -111,17 +132,21 @@ def _second_order(problem: FrameProblem, state: ClothState, past: PastState) -> 
     With an acceleration a that acts for a time h, v' = v + h a and x' = x + h v'. Implicit Euler takes x and v at
     t, and h = dt. BDF2 takes (4 x_t - x_{t-1}) / 3, (4 v_t - v_{t-1}) / 3 and h = 2/3 dt. Both minimise
     m abs(x' - x - h v)^2 / (2 h^2) with the other energies. The first frame has no past and takes Euler's.
+    After a step of another length, with r = dt / dt_last, it takes ((1 + r)^2 x_t - r^2 x_{t-1}) / (1 + 2 r), v
+    likewise, and h = (1 + r) / (1 + 2 r) dt.
 
-    Source: Hairer and Wanner 1996, Solving Ordinary Differential Equations II, section III.1.
+    Source: Hairer, Norsett and Wanner 1993, Solving Ordinary Differential Equations I, section III.5.
     """
+    ratio = problem.timestep / past.timestep
+    now_weight, whole = jnp.square(1.0 + ratio), 1.0 + 2.0 * ratio
 
     def before(
         now: Float[Array, "vertices 3"], then: Float[Array, "vertices 3"]
     ) -> Float[Array, "vertices 3"]:
-        return jnp.where(past.is_known, (4.0 * now - then) / 3.0, now)
+        return jnp.where(past.is_known, (now_weight * now - jnp.square(ratio) * then) / whole, now)
 
     origin, velocity = before(state.position, past.position), before(state.velocity, past.velocity)
-    acts = jnp.where(past.is_known, 2.0 / 3.0, 1.0) * problem.timestep
+    acts = jnp.where(past.is_known, (1.0 + ratio) / whole, 1.0) * problem.timestep
     return problem.replace(inertial_guess=origin + acts * velocity, bdf2=SecondOrder(origin, acts))
 
 
@@ -150,6 +175,18 @@ def _body_contact(
         skin=skin,
         tips=tips,
     )
+
+
+def _layers(problem: FrameProblem, pairs: FacePairs) -> SelfContact:
+    """Return the contact of a frame between layers of the cloth.
+
+    A vertex on the wrong side of a face is asked back by one thickness a frame. Asked back at once, from
+    centimetres deep, it tore the cloth: pairs beside each other that ask for opposite sides pull with thousands
+    of weights.
+    """
+    thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
+    height, _ = pair_heights(problem.position, pairs)
+    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0))
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:

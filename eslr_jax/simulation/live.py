@@ -16,8 +16,9 @@ from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, without_tracks
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
+from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
 
@@ -142,7 +143,7 @@ def _step(
     scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""], *, config: SimConfig
 ) -> Step:
     stepper = make_stepper(None, config, iterations)
-    return Step(*stepper(frame_problem(scene, state, frame), state))
+    return Step(*step_frame(stepper, scene, state, frame))
 
 
 def there_and_back(step: int, num_frames: int) -> tuple[int, int]:

@@ -15,8 +15,8 @@ from eslr_jax.models.registry import check_params
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.solve import SOLUTION
 from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan
-from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
-from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, part_of_frame
+from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper, past_state
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
 
 
@@ -118,7 +118,7 @@ def scan_frames(
     """
 
     def advance(state: ClothState, frame: FrameInput) -> tuple[ClothState, Frames]:
-        state, report = stepper(frame_problem(scene, state, frame), state)
+        state, report = step_frame(stepper, scene, state, frame)
         return state, Frames(state.position, state.velocity, state.friction_load, report)
 
     # A derivative through time keeps each frame's state and solution, and does the rest of it again.
@@ -126,6 +126,41 @@ def scan_frames(
     advance = jax.checkpoint(advance, prevent_cse=False, policy=policy)
     has_tracks = bool(jax.tree.leaves(inputs))
     return jax.lax.scan(advance, state, inputs, length=None if has_tracks else scene.num_frames - 1)
+
+
+def step_frame(
+    stepper: Stepper, scene: Scene, state: ClothState, frame: FrameInput
+) -> tuple[ClothState, FrameReport]:
+    """Simulate one frame, in the substeps that the scene asks for.
+
+    Args:
+        stepper: Of `make_stepper`.
+        scene: Its constant parts.
+        state: Cloth at t.
+        frame: The outside world from t to t + 1.
+    """
+    if scene.substeps == 1:
+        return stepper(frame_problem(scene, state, frame), state)
+    part = scene.replace(timestep=scene.timestep / scene.substeps)
+
+    def substep(now: ClothState, row: Int[Array, ""]) -> tuple[ClothState, FrameReport]:
+        return stepper(frame_problem(part, now, part_of_frame(state, frame, row, scene.substeps)), now)
+
+    # Counted in substeps, so that gusts see the time.
+    begin = state.replace(frame=scene.substeps * state.frame)
+    end, reports = jax.lax.scan(substep, begin, jnp.arange(scene.substeps, dtype=jnp.int32))
+    residual, number = jnp.max(reports.residual), state.frame + 1
+    past = None if state.past is None else past_state(state, scene.timestep, residual)
+    is_first_bad = (state.status == 0) & (end.status != 0)
+    bad_frame = jnp.where(is_first_bad, number, state.first_bad_frame)
+    end = end.replace(frame=number, first_bad_frame=bad_frame, past=past)
+    demand = reports.pair_demand
+    return end, FrameReport(
+        terms=jax.tree.map(lambda values: values[-1], reports.terms),
+        residual=residual,
+        iterations=jnp.sum(reports.iterations, dtype=jnp.int32),
+        pair_demand=None if demand is None else jnp.max(demand),
+    )
 
 
 def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajectory:

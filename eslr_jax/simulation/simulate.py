@@ -176,8 +176,8 @@ def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothStat
     position, velocity = np.asarray(trajectory.positions), np.asarray(trajectory.velocities)
     past = scene.initial_state.past
     if past is not None and frame > 0:
-        before = jnp.asarray(position[frame - 1]), jnp.asarray(velocity[frame - 1])
-        past = past_state(*before, np.asarray(trajectory.residuals)[frame])
+        before = initial_state(jnp.asarray(position[frame - 1]), jnp.asarray(velocity[frame - 1]))
+        past = past_state(before, jnp.asarray(scene.timestep), np.asarray(trajectory.residuals)[frame])
     state = initial_state(jnp.asarray(position[frame]), jnp.asarray(velocity[frame]))
     load = jnp.asarray(np.asarray(trajectory.friction_loads)[frame])
     return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)

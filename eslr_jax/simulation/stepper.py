@@ -140,12 +140,12 @@ def next_state(
         frame=frame,
         status=status,
         first_bad_frame=jnp.where((state.status == 0) & (status != 0), frame, state.first_bad_frame),
-        past=None if state.past is None else past_state(state.position, state.velocity, residual),
+        past=None if state.past is None else past_state(state, problem.timestep, residual),
     )
 
 
 def past_state(
-    position: Float[Array, ...], velocity: Float[Array, ...], residual: Float[Array, ...] | float
+    before: ClothState, timestep: Float[Array, ...], residual: Float[Array, ...] | float
 ) -> PastState:
     """Return what BDF2 remembers of the state before a frame, and whether it may be trusted.
 
@@ -153,11 +153,12 @@ def past_state(
     which 20 iterations leave 40 weights flew apart. The next frame is then stepped by implicit Euler.
 
     Args:
-        position: At the beginning of the frame [m].
-        velocity: There [m/s].
+        before: Cloth at the beginning of the frame.
+        timestep: Length of the frame [s].
         residual: Force norm over weight that the frame ended with.
     """
-    return PastState(position, velocity, jnp.asarray(residual) <= MOST_RESIDUAL)
+    is_known = jnp.asarray(residual) <= MOST_RESIDUAL
+    return PastState(before.position, before.velocity, timestep, is_known)
 
 
 def problem_status(problem: FrameProblem) -> Int[Array, ""]:

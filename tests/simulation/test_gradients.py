@@ -199,6 +199,7 @@ def test_hanging_frames_have_right_gradients_by_every_parameter():
 SCENES = {
     "friction": lambda: small_scene(4, has_body=True),
     "bdf2": lambda: small_scene(4, has_body=True, integrator="bdf2"),
+    "substeps": lambda: small_scene(3, has_body=True, integrator="bdf2", substeps=2),
     "skin": lambda: small_scene(3, has_body=True, has_skin=True),
     "air": lambda: windy_scene(4),
     "ground": lambda: grounded_scene(4),

@@ -77,4 +77,4 @@ def test_euler_compiles_what_it_compiled_before(draped):
     """What BDF2 remembers is not there at all."""
     euler = prepare_scene(square(), drifting_ball(13))
     assert euler.initial_state.past is None
-    assert len(jax.tree.leaves(draped)) == len(jax.tree.leaves(euler)) + 3
+    assert len(jax.tree.leaves(draped)) == len(jax.tree.leaves(euler)) + 4
