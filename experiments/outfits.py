@@ -1,0 +1,111 @@
+"""Count where garments that are worn together pass through each other, and what substeps change.
+
+    python experiments/outfits.py [--substeps 1 2] [--smoke] [--out DIR]
+
+Four outfits on a walk, with what `eslr simulate` models: BDF2, skin contacts, a tolerance of 1 %. The referee of the
+hard cases counts intersecting pairs of a face of one garment and a face of the other. Writes outfits.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.body.motion import pose_body
+from eslr_jax.body.timing import with_settling
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.referee import intersecting_pairs
+from eslr_jax.evaluation.report import environment
+from eslr_jax.fit.outfit import combine_garments
+from eslr_jax.geometry.topology import is_on_boundary
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.garment import GarmentFile
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.budget import device_name
+from eslr_jax.simulation.simulate import simulate
+
+RESULTS = Path(__file__).parent / "results"
+OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
+CLIP = "cmu_016_32"  # of the test split
+FRAMES = 100
+SETTLE = 15  # frames
+EVERY = 5  # frames between those that are judged
+CONFIG = SimConfig(iterations=300, tolerance=0.01)
+
+
+def skirt_of(dress: GarmentFile) -> GarmentFile:
+    """Return a dress from the waist down, held there."""
+    height = dress.rest_positions[:, 1]
+    waist = height.min() + 0.55 * np.ptp(height)
+    faces = dress.faces[np.all(height[dress.faces] < waist, axis=1)]
+    kept, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    upper = is_on_boundary(faces, len(kept)) & (height[kept] > waist - 0.1)
+    return GarmentFile(
+        dress.rest_positions[kept], faces, dress.skin_weights[kept], dress.skin_indices[kept], upper
+    )
+
+
+def load(name: str) -> GarmentFile:
+    """Return a bundled garment, or a skirt."""
+    return skirt_of(load_garment_file("dress")) if "skirt" in name else load_garment_file(name)
+
+
+def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1) -> dict[str, Any]:
+    """Return the intersecting pairs of two garments in every so many frames of a walk, and milliseconds a frame.
+
+    Args:
+        names: Garments, the inner one first.
+        frames: Of the walk.
+        substeps: Of every frame.
+    """
+    outfit = combine_garments([load(name) for name in names], names)
+    poses = with_settling(pose_body(load_body(), load_motion(CLIP), num_frames=frames), SETTLE)
+    options = SceneOptions(has_skin=True, integrator="bdf2", substeps=substeps)
+    run = simulate(None, prepare_scene(prepare_stored(outfit), poses, options=options), config=CONFIG)
+    garment = np.repeat([0, 1], list(outfit.metadata["outfit"].values()))[outfit.faces[:, 0]]
+    positions = np.asarray(run.trajectory.positions)[SETTLE:][::EVERY]
+    counts = [
+        int(np.sum(garment[pairs[:, 0]] != garment[pairs[:, 1]]))
+        for pairs in (intersecting_pairs(position, outfit.faces) for position in positions)
+    ]
+    return {
+        "outfit": names,
+        "substeps": substeps,
+        "pairs": counts,
+        "residual_max": float(np.max(run.trajectory.residuals)),
+        "frame_ms": run.timing.frame_ms,
+    }
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--substeps", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="one outfit, six frames, no substeps")
+    arguments = parser.parse_args()
+    outfits, frames, substeps = OUTFITS, FRAMES, arguments.substeps
+    if arguments.smoke:
+        outfits, frames, substeps = OUTFITS[:1], 6, [1]
+    rows = []
+    for names in outfits:
+        for count in substeps:
+            rows.append(row := count_pairs(names, frames, count))
+            print(json.dumps(row), flush=True)
+    result = {"clip": CLIP, "frames": frames, "every": EVERY, "rows": rows}
+    result |= {"device": device_name(), "environment": environment()}
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(arguments.out / "outfits.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
