@@ -2,8 +2,8 @@
 
     python experiments/outfits.py [--substeps 1 2] [--smoke] [--out DIR]
 
-Four outfits on a walk, with what `eslr simulate` models: BDF2, skin contacts, a tolerance of 1 %. The referee of the
-hard cases counts intersecting pairs of a face of one garment and a face of the other. Writes outfits.json.
+Four outfits on a walk, with what `eslr simulate` models: BDF2, skin contacts, a tolerance of 1 %. The referee of
+the hard cases counts intersecting pairs of a face of one garment and a face of the other. Writes outfits.json.
 """
 
 from __future__ import annotations

@@ -47,6 +47,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--skin", action="store_true", help="physics: keep faces of the cloth off the body too"
     )
+    parser.add_argument("--substeps", type=int, default=1, help="physics: of every frame")
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
     parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
@@ -71,7 +72,9 @@ def find_simulator(arguments: argparse.Namespace):
 
     name = arguments.simulator
     if name == "physics":
-        return solver_simulator(arguments.iterations, arguments.integrator, has_skin=arguments.skin)
+        return solver_simulator(
+            arguments.iterations, arguments.integrator, has_skin=arguments.skin, substeps=arguments.substeps
+        )
     if name in ITERATIONS:
         return network_simulator(arguments.model, *load_model(arguments.model), arguments.iterations)
     if arguments.iterations is not None:
@@ -109,6 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
     other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
     other += "_skin" if arguments.skin else ""
+    other += f"_{arguments.substeps}_substeps" if arguments.substeps > 1 else ""
     path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
     outcomes = []
     for case in cases:

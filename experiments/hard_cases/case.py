@@ -41,11 +41,13 @@ class Simulator:
     garment_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of `prepare_garment`
     integrator: Integrator = "euler"
     has_skin: bool = False  # faces of the cloth keep off the body too
+    substeps: int = 1  # of every frame
 
     def prepare(self, scene: Scene) -> Scene:
         """Return a case's scene with what this simulator models."""
         body = scene.body and scene.body.replace(has_skin=self.has_skin)
-        return scene.replace(body=body, initial_state=start_integrator(scene.initial_state, self.integrator))
+        start = start_integrator(scene.initial_state, self.integrator)
+        return scene.replace(body=body, initial_state=start, substeps=self.substeps)
 
 
 @dataclasses.dataclass(frozen=True)

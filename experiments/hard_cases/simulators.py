@@ -12,7 +12,11 @@ from hard_cases.case import Simulator
 
 
 def solver_simulator(
-    iterations: int = 200, integrator: Integrator = "euler", *, has_skin: bool = False
+    iterations: int = 200,
+    integrator: Integrator = "euler",
+    *,
+    has_skin: bool = False,
+    substeps: int = 1,
 ) -> Simulator:
     """Return the L-BFGS solver as a simulator.
 
@@ -20,13 +24,16 @@ def solver_simulator(
         iterations: Per frame, at most.
         integrator: How time is stepped.
         has_skin: Keep faces of the cloth off the body, besides its vertices.
+        substeps: Of every frame.
     """
 
     def run(scene: Scene) -> Trajectory:
         return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
 
-    parts = ["physics", integrator * (integrator != "euler"), "skin" * has_skin, f"{iterations} iterations"]
-    return Simulator(", ".join(filter(None, parts)), run, integrator=integrator, has_skin=has_skin)
+    parts = ["physics", integrator * (integrator != "euler"), "skin" * has_skin]
+    parts += [f"{substeps} substeps" * (substeps > 1), f"{iterations} iterations"]
+    name = ", ".join(filter(None, parts))
+    return Simulator(name, run, integrator=integrator, has_skin=has_skin, substeps=substeps)
 
 
 def network_simulator(name: str, params: Any, model: ModelConfig, iterations: int = 0) -> Simulator:
