@@ -1,11 +1,12 @@
 """Measure what is known of cloth in closed form, and what the error of a walk consists of.
 
-    python experiments/known_answers [--smoke] [--out DIR] [--part answers drape walk]
+    python experiments/known_answers [--smoke] [--out DIR] [--part answers peers drape walk]
 
 Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigidity of a cantilever and of a
-cylinder, a twisted sheet, a slope, a ball. Drape: Cusick's coefficient of woven fabrics. Walk: millimetres by
-tolerance, timestep and mesh. Writes known_answers.json, part by part, and with matplotlib (extra `plot`)
-known_answers.png.
+cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Peers: four
+of these by Newton's solvers (extra `peers`) and Blender's cloth (BLENDER_PYTHON, see peers.py), where they are
+installed. Drape: Cusick's coefficient of woven fabrics. Walk: millimetres by tolerance, timestep and mesh.
+Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png.
 """
 
 from __future__ import annotations
@@ -18,19 +19,20 @@ from pathlib import Path
 from typing import Any
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-PARTS = ("answers", "drape", "walk")
+PARTS = ("answers", "peers", "drape", "walk")
 _DRAPED = ("satin-woven", "jersey-woven", "suiting-woven", "denim-woven", "brocade-woven", "crepe-woven")
 
 
 def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
     """Yield a part's rows, each with its drape for the picture or None."""
     if part == "answers":
-        from known_answers.cases import CASES
+        from known_answers.cases import answer
 
-        for case in CASES:
-            for one in case(is_smoke):
-                numbers = {"found": float(one.found), "known": float(one.known), "is_within": one.is_within}
-                yield {**one._asdict(), **numbers}, None
+        yield from ((one.as_dict(), None) for one in answer(is_smoke))
+    elif part == "peers":
+        from known_answers.peers import compare
+
+        yield from ((one.as_dict(), None) for one in compare(is_smoke))
     elif part == "walk":
         from known_answers.walk import refine
 
@@ -54,17 +56,15 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(16, 6), layout="constrained")
-    answers = result.get("answers", [])
-    labels = [f"{row['case']}, {row['setting']}" for row in answers]
-    errors = [100 * (row["found"] / row["known"] - 1) for row in answers]
-    left.barh(
-        labels, errors, color=["#3b7" if row["is_within"] in (True, None) else "#c33" for row in answers]
+    figure, (left, others, middle, right) = plt.subplots(
+        1, 4, figsize=(20, 8), layout="constrained", width_ratios=(1.2, 1, 1.2, 1)
     )
-    left.set_xlim(-20, 20)
-    left.set_xlabel("error [%]")
-    left.tick_params(axis="y", labelsize=6)
-    left.invert_yaxis()
+    for axes, part, limit, title in (
+        (left, "answers", 5, "ours"),
+        (others, "peers", 60, "other simulators"),
+    ):
+        _draw_errors(axes, result.get(part, []), limit)
+        axes.set_title(title)
     for place, one in enumerate(drapes):
         rows, columns = one.outline.shape
         x, y = (place % 3) * columns, -(place // 3) * 1.25 * rows
@@ -86,6 +86,29 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     right.tick_params(axis="x", rotation=90, labelsize=7)
     figure.savefig(path, dpi=100)
     plt.close(figure)
+
+
+def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
+    """Draw the errors of answers as bars, up to a limit [%]; beyond it as numbers. Red ones miss their bar."""
+    errors = [100 * (row["found"] / row["known"] - 1) for row in rows]
+    labels = [f"{row['case']}, {row['setting']}" for row in rows]
+    colors = ["#c33" if row["is_within"] is False else "#3b7" for row in rows]
+    axes.barh(labels, errors, color=colors)
+    for place, error in enumerate(errors):
+        if abs(error) > limit:
+            side = 1 if error > 0 else -1
+            axes.text(
+                0.97 * side * limit,
+                place,
+                f"{error:.0f} %",
+                ha="right" if side > 0 else "left",
+                va="center",
+                size=6,
+            )
+    axes.set_xlim(-limit, limit)
+    axes.set_xlabel("error [%]")
+    axes.tick_params(axis="y", labelsize=6)
+    axes.invert_yaxis()
 
 
 def main() -> None:

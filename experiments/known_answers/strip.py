@@ -41,13 +41,18 @@ def strip(integrator="euler", *, frames, is_pinned, timestep=1 / 30, tilt=0.35, 
 
 
 def kept_per_period(integrator: str, *, timestep: float = 1 / 30, substeps: int = 1) -> float:
-    """Return the share of its energy that a swinging strip keeps over a period, in the median.
+    """Return the share of its energy that a swinging strip keeps over a period, in the median."""
+    scene = strip(integrator, frames=round(10 / 3 / timestep), is_pinned=True, timestep=timestep)
+    trajectory = rollout_scene(None, scene.replace(substeps=substeps), SimConfig(iterations=60))
+    return kept_in(np.asarray(trajectory.positions))
+
+
+def kept_in(positions: np.ndarray) -> float:
+    """Return the share of its energy that a strip keeps per period, from positions of all frames [m].
 
     Two turning points, heights of the mean angle over the lowest point, are half a period apart.
     """
-    scene = strip(integrator, frames=round(10 / 3 / timestep), is_pinned=True, timestep=timestep)
-    trajectory = rollout_scene(None, scene.replace(substeps=substeps), SimConfig(iterations=60))
-    side = np.asarray(trajectory.positions[:, :, 2].mean(axis=1)) * 2
+    side = positions[:, :, 2].mean(axis=1) * 2
     is_turn = (np.diff(side[:-1]) * np.diff(side[1:]) <= 0) & (np.abs(side[1:-1]) > 1e-3)
     turns = np.abs(side[1:-1][is_turn])
     heights = LENGTH - np.sqrt(LENGTH**2 - turns**2)

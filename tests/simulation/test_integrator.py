@@ -1,6 +1,5 @@
 """Implicit Euler and BDF2 against what is known of falling and swinging cloth."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ GRAVITY = 9.81  # [m/s^2]
 
 def test_bdf2_keeps_a_strip_swinging_and_euler_does_not():
     per_period = {name: kept_per_period(name) for name in ("euler", "bdf2")}
-    assert per_period["bdf2"] > 0.9, per_period
+    assert per_period["bdf2"] > 0.95, per_period
     assert per_period["euler"] < 0.5, per_period
 
 
@@ -71,10 +70,3 @@ def test_a_network_alone_refuses_bdf2(draped):
     model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
     with pytest.raises(ConfigError, match="implicit Euler"):
         rollout_scene(init_model(model), draped, SimConfig(model=model, iterations=0))
-
-
-def test_euler_compiles_what_it_compiled_before(draped):
-    """What BDF2 remembers is not there at all."""
-    euler = prepare_scene(square(), drifting_ball(13))
-    assert euler.initial_state.past is None
-    assert len(jax.tree.leaves(draped)) == len(jax.tree.leaves(euler)) + 4
