@@ -104,6 +104,7 @@ def test_the_papers_networks_have_a_recipe_each():
     shared = load_recipe(folder / "full-size.toml")
     for name in ("eslr-15", "eslr-10", "lsdmp-15", "gsa-15", "mgn-15", "mgn-48", "hood"):
         assert load_recipe(folder / f"{name}.toml") == dataclasses.replace(shared, model=MODELS[name])
+    assert load_recipe(folder / "full-size.toml", {"batch_size": 8}).batch_size == 8  # for eight devices
 
 
 def test_a_recipe_changes_the_values_of_its_base(tmp_path):
