@@ -10,6 +10,9 @@ from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from eslr_jax.errors import ConfigError
 
+Criterion = Literal["postcvpr", "cvpr", "metric"]
+"""Readings of HOOD's losses, see `physics.hood`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
@@ -153,8 +156,10 @@ class TrainConfig:
     split: str = "train"  # clips of this split
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
+    # Of the set "hood": which of its three readings, see physics.hood. "metric" has the constants of its tables.
+    criterion: Criterion = "postcvpr"
     self_contact: bool = False  # layers of cloth keep apart, as in SimConfig
-    schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate
+    schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate; "hood" also of the horizon
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine
     warmup: int = 100  # steps of linear warm-up
@@ -163,11 +168,12 @@ class TrainConfig:
     # from which gap and distance are measured, and the trajectory goes on. 0 trains a network of its own.
     iterations: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
-    slots_per_garment: int = 4  # trajectories kept alive per garment
+    slots_per_garment: int = 4  # trajectories kept alive per garment; more where a batch needs them
     horizon: int = 60  # longest trajectory [frames]
-    horizon_growth: int = 60  # steps per frame of horizon
+    horizon_growth: int = 60  # steps per frame of horizon; trajectories with the schedule "hood"
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
+    shape_range: float = 0.0  # [standard deviations] of its shape coefficients, drawn evenly (HOOD: 3)
     reset_stretch: float = 2.5  # a trajectory that stretches further starts anew
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
@@ -201,14 +207,13 @@ class TrainConfig:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.iterations < 0 or (self.iterations and self.energy_set == "hood"):
             raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
-        for name in ("noise", "girth"):
+        if self.criterion != "postcvpr" and self.energy_set != "hood":
+            raise ValueError(f'criterion = "{self.criterion}" needs energy_set = "hood"')
+        for name in ("noise", "girth", "shape_range"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if not 0 <= self.material_probability <= 1:
             raise ValueError(f"material_probability must be between 0 and 1, got {self.material_probability}")
-        pool = len(self.garments) * self.slots_per_garment
-        if self.batch_size > pool:
-            raise ValueError(f"batch_size = {self.batch_size} is more than the pool of {pool} trajectories")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
 

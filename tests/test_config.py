@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import pytest
@@ -12,6 +13,7 @@ from eslr_jax.config import (
     to_dict,
 )
 from eslr_jax.errors import ConfigError
+from eslr_jax.models.registry import MODELS
 from eslr_jax.training.recipe import load_recipe
 
 
@@ -88,7 +90,32 @@ def test_broken_recipes_are_refused(tmp_path, text, message):
 def test_shipped_recipes_load():
     from pathlib import Path
 
-    recipes = sorted((Path(__file__).parents[1] / "experiments" / "configs").glob("*.toml"))
+    recipes = sorted((Path(__file__).parents[1] / "experiments" / "configs").rglob("*.toml"))
     assert recipes
     for recipe in recipes:
+        load_recipe(recipe)
+
+
+def test_the_papers_networks_have_a_recipe_each():
+    """They differ in the network alone."""
+    from pathlib import Path
+
+    folder = Path(__file__).parents[1] / "experiments" / "configs" / "paper"
+    shared = load_recipe(folder / "full-size.toml")
+    for name in ("eslr-15", "eslr-10", "lsdmp-15", "gsa-15", "mgn-15", "mgn-48", "hood"):
+        assert load_recipe(folder / f"{name}.toml") == dataclasses.replace(shared, model=MODELS[name])
+    assert load_recipe(folder / "full-size.toml", {"batch_size": 8}).batch_size == 8  # for eight devices
+
+
+def test_a_recipe_changes_the_values_of_its_base(tmp_path):
+    (tmp_path / "base.toml").write_text('model = "eslr-small"\nsteps = 7\nseed = 3')
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text('base = "base.toml"\nsteps = 9\n[model]\nbase = "mgn-small"')
+    config = load_recipe(recipe, {"seed": 4})
+    assert (config.steps, config.seed, config.model) == (9, 4, MODELS["mgn-small"])
+    (tmp_path / "base.toml").write_text('base = "recipe.toml"')
+    with pytest.raises(ConfigError, match="has a base of its own"):
+        load_recipe(recipe)
+    recipe.write_text('base = "missing.toml"')
+    with pytest.raises(ConfigError, match="no config file"):
         load_recipe(recipe)

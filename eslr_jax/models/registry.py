@@ -71,15 +71,16 @@ SHALLOW = dataclasses.replace(
     attention_features=110,  # floor(32 ln 32)
     remat="none",
 )
-# The published hierarchical network, "postcvpr".
-HOOD = dataclasses.replace(_without_attention(_without_smoothing(PAPER)), hierarchical=True, update_body=True)
+# HOOD's published networks, which update body rows: MeshGraphNet, "fine15", and the hierarchical "postcvpr".
+FINE = dataclasses.replace(_without_attention(_without_smoothing(PAPER)), update_body=True)
+HOOD = dataclasses.replace(FINE, hierarchical=True)
 MODELS: dict[str, ModelConfig] = {
     "eslr-15": PAPER,
     "eslr-10": dataclasses.replace(PAPER, message_passing_steps=10, attention_blocks=3),
     "lsdmp-15": _without_attention(PAPER),
     "gsa-15": _without_smoothing(PAPER),
-    "mgn-15": _without_attention(_without_smoothing(PAPER)),
-    "mgn-48": dataclasses.replace(_without_attention(_without_smoothing(PAPER)), message_passing_steps=48),
+    "mgn-15": FINE,
+    "mgn-48": dataclasses.replace(FINE, message_passing_steps=48),
     "hood": HOOD,
     "eslr-5": SHALLOW,
     "lsdmp-5": _without_attention(SHALLOW),

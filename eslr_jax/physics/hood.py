@@ -16,13 +16,14 @@ Source: HOOD (arXiv 2212.07242), repository at 9bc1076: criterions/{cvpr,postcvp
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from eslr_jax.config import Criterion
 from eslr_jax.numerics import (
     components,
     cross3,
@@ -37,8 +38,6 @@ from eslr_jax.physics.gravity import gravity_energy
 from eslr_jax.physics.inertia import inertia_energy, vertex_masses
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.types import Garment, Material, PotentialTerms
-
-Criterion = Literal["postcvpr", "cvpr", "metric"]
 
 _CHUNK = 64  # garment vertices whose distances to all faces are held at once
 _FLOOR_AXIS = 2  # friction's "floor normal" is z although gravity acts along y

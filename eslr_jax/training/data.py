@@ -14,12 +14,29 @@ from eslr_jax.body.motion import Motion, joint_transforms
 from eslr_jax.body.retarget import abduct_arms, resample
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.prepare import pad_alike
+from eslr_jax.geometry.skinning import smooth
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.scene.plan import shared_surface
 from eslr_jax.types import Body, BodySurface, Garment
 
 _FPS = 30.0
+_SMOOTHING_STEPS = 10  # of what a garment takes over from the body, as for its skin weights
+
+
+@struct.dataclass
+class Shapes:
+    """How far everything at rest moves with the body's shape coefficients [m per standard deviation]."""
+
+    surface: Float[Array, "surface_vertices 3 shapes"]
+    joints: Float[Array, "frames joints 3 shapes"]  # of the offsets in the joints' transforms
+    garments: Float[Array, "garments vertices 3 shapes"]  # of the skinned start; lengths at rest stay
+
+    @property
+    def count(self) -> int:
+        """Number of shape coefficients."""
+        return self.surface.shape[-1]
 
 
 @struct.dataclass
@@ -35,6 +52,7 @@ class TrainingData:
     joint_transforms: Float[Array, "frames joints 3 4"]  # all clips, end to end
     frames_left: Int[Array, " frames"]  # frames of the same clip after this one
     start_frames: Int[Array, " starts"]  # frames that another one follows
+    shapes: Shapes | None  # None: all trajectories have the same body
 
     @property
     def num_garments(self) -> int:
@@ -45,19 +63,42 @@ class TrainingData:
         """Return one of the garments."""
         return jax.tree.map(lambda leaf: leaf[index], self.garments)
 
-    def transforms(self, frame: Int[Array, ""], yaw: Float[Array, ""]) -> Float[Array, "joints 3 4"]:
+    def transforms(
+        self, frame: Int[Array, ""], yaw: Float[Array, ""], shape: Float[Array, " shapes"] | None = None
+    ) -> Float[Array, "joints 3 4"]:
         """Return joint transforms of a frame, the scene turned about the vertical by `yaw` [rad]."""
+        transforms = self.joint_transforms[frame]
+        if self.shapes is not None and shape is not None:
+            transforms = transforms.at[:, :, 3].add(self.shapes.joints[frame] @ shape)
         cos, sin = jnp.cos(yaw), jnp.sin(yaw)
         zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
         turn = jnp.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
-        return turn @ self.joint_transforms[frame]
+        return turn @ transforms
 
     def body(
-        self, transforms: Float[Array, "joints 3 4"], girth: Float[Array, ""]
+        self,
+        transforms: Float[Array, "joints 3 4"],
+        girth: Float[Array, ""],
+        shape: Float[Array, " shapes"] | None = None,
     ) -> Float[Array, "surface_vertices 3"]:
-        """Return the posed surface of a body that is thicker than the bundled one by `girth` [m]."""
+        """Return the posed surface of a body of some shape, thicker by `girth` [m]."""
         rest = self.surface_rest + girth * self.surface_normals
+        if self.shapes is not None and shape is not None:
+            rest = rest + self.shapes.surface @ shape
         return lbs.skin(rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
+
+    def skinned(
+        self,
+        index: Int[Array, ""],
+        transforms: Float[Array, "joints 3 4"],
+        shape: Float[Array, " shapes"] | None = None,
+    ) -> Float[Array, "vertices 3"]:
+        """Return a garment carried by the joints [m]; it moves with the shape of the body under it."""
+        garment = self.garment(index)
+        rest = garment.rest_positions
+        if self.shapes is not None and shape is not None:
+            rest = rest + self.shapes.garments[index] @ shape
+        return lbs.skin(rest, garment.skin_weights, garment.skin_indices, transforms)
 
 
 def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
@@ -69,21 +110,23 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     """
     options = config.model.garment_options
     unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    return build_training_data(
-        pad_alike(unpadded), load_body(), [load_motion(clip) for clip in split_clips(config.split)]
-    )
+    motions = [load_motion(clip) for clip in split_clips(config.split)]
+    return build_training_data(pad_alike(unpadded), load_body(), motions, has_shapes=config.shape_range > 0)
 
 
-def build_training_data(garments: list[Garment], body: Body, motions: list[Motion]) -> TrainingData:
+def build_training_data(
+    garments: list[Garment], body: Body, motions: list[Motion], *, has_shapes: bool = False
+) -> TrainingData:
     """Return what training samples from.
 
     Args:
         garments: Garments padded to equal sizes.
         body: The body that wears them.
         motions: Its clips.
+        has_shapes: Trajectories draw the coefficients of the body's shape.
 
     Raises:
-        ConfigError: The garments are not near the body.
+        ConfigError: The garments are not near the body, or the body has no shapes and they are asked for.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *garments)
     surface = shared_surface(garments, body)
@@ -91,6 +134,15 @@ def build_training_data(garments: list[Garment], body: Body, motions: list[Motio
         raise ConfigError("none of the garments is near the body; train on garments that are worn")
     surface_rest = jnp.asarray(body.rest_positions[surface.vertex_ids])
     rotations, translations, frames_left = _join_clips(motions)
+    shapes = None
+    if has_shapes:
+        if not body.shape_directions.shape[-1]:
+            raise ConfigError("the body has no shapes; train with shape_range = 0")
+        shapes = Shapes(
+            surface=body.shape_directions[surface.vertex_ids],
+            joints=_joint_shifts(rotations, body),
+            garments=jnp.stack([_garment_shifts(garment, body) for garment in garments]),
+        )
     return TrainingData(
         garments=stacked,
         surface=surface,
@@ -101,7 +153,32 @@ def build_training_data(garments: list[Garment], body: Body, motions: list[Motio
         joint_transforms=joint_transforms(rotations, translations, body.joint_rest_positions, body.parents),
         frames_left=jnp.asarray(frames_left, jnp.int32),
         start_frames=jnp.asarray(np.flatnonzero(frames_left), jnp.int32),
+        shapes=shapes,
     )
+
+
+def _joint_shifts(rotations: np.ndarray, body: Body) -> Float[Array, "frames joints 3 shapes"]:
+    """Return how the offsets of joint transforms move with the shape: they are linear in the joints' places."""
+    nowhere = np.zeros((len(rotations), 3))
+    shifts = [
+        joint_transforms(rotations, nowhere, body.joint_shape_directions[..., k], body.parents)[..., 3]
+        for k in range(body.joint_shape_directions.shape[-1])
+    ]
+    return jnp.stack(shifts, axis=-1)
+
+
+def _garment_shifts(garment: Garment, body: Body) -> Float[Array, "vertices 3 shapes"]:
+    """Return how a garment moves with the shape: as the closest point of the body at rest, smoothed.
+
+    HOOD takes the nearest body vertex's shape directions too, and for loose garments a mean over several.
+    """
+    faces = np.asarray(body.faces)
+    nearest, weights = closest_points(
+        np.asarray(garment.rest_positions, np.float64), np.asarray(body.rest_positions, np.float64), faces
+    )
+    shifts = np.einsum("vk,vkxs->vxs", weights, np.asarray(body.shape_directions)[faces[nearest]])
+    flat = smooth(shifts.reshape(len(shifts), -1), np.asarray(garment.faces), _SMOOTHING_STEPS)
+    return jnp.asarray(flat.reshape(shifts.shape), jnp.float32)
 
 
 def _join_clips(motions: list[Motion]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

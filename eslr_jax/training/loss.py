@@ -16,7 +16,7 @@ from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.network import predict_acceleration, refine
 from eslr_jax.types import ClothState, PotentialTerms
 
-_FALL = 0.01  # [m]; the loss is in units of the work of lifting the garment by this
+_FALL = 0.01  # [m]; the loss of set "consistent" is in units of the work of lifting the garment by this
 _MIN_GAP = 1e-2  # after a refinement step, as a share of the first one's: the optimum is not known better
 _MIN_INITIAL_GAP = 1e-7  # [J] of a frame in which nothing happens
 _MIN_DISTANCE = 1e-5  # [m] likewise, root of the sum over vertices
@@ -50,7 +50,7 @@ def physics_loss(
     config: TrainConfig,
     terms_of: EnergyTerms = potential_terms,
 ) -> tuple[Float[Array, ""], LossReport]:
-    """Return the loss, without unit, and its report.
+    """Return the loss, without unit or in joules (set "hood"), and its report.
 
     Args:
         params: Weights of the network.
@@ -77,7 +77,10 @@ def physics_loss(
     elif config.refinement_weights == "contraction":
         loss = _mean_contraction(jnp.concatenate([jnp.reshape(guess_value, 1), energies]))
     else:
-        scale = _FALL * problem.constants.gravity * jnp.sum(problem.masses)
+        # HOOD's is in joules, and its gradient is clipped in these.
+        scale = 1.0
+        if config.energy_set == "consistent":
+            scale = _FALL * problem.constants.gravity * jnp.sum(problem.masses)
         is_last = config.refinement_weights == "last"
         loss = (energies[-1] if is_last else jnp.mean(energies)) / scale
     last = jax.tree.map(lambda values: values[-1], terms)

@@ -11,9 +11,9 @@ from eslr_jax.config import TrainConfig
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state, skin_frame
+from eslr_jax.scene.build import initial_state
 from eslr_jax.training.data import TrainingData
-from eslr_jax.types import ClothState, Garment, Material
+from eslr_jax.types import ClothState, Material
 
 _DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD)
 FPS = 30.0  # frames per second of training
@@ -30,6 +30,8 @@ class Slot:
     age: Int[Array, ""]  # frames since the start
     material: Material
     is_done: Bool[Array, ""]  # start anew before the next use
+    # coefficients of the body's shape [standard deviations]; None: all trajectories have the same body
+    shape: Float[Array, " shapes"] | None = None
 
 
 def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
@@ -52,32 +54,40 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
         age=jnp.zeros(count, jnp.int32),
         material=jax.tree.map(lambda leaf: jnp.full(count, leaf, jnp.float32), COTTON),
         is_done=jnp.ones(count, bool),
+        shape=None if data.shapes is None else jnp.zeros((count, data.shapes.count)),
     )
 
 
-def start_trajectory(key: Array, data: TrainingData, garment: Garment, config: TrainConfig) -> Slot:
-    """Start at a random frame of a random clip on a body of random girth: skinned, noisy, pushed out of it.
+def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:
+    """Start at a random frame of a random clip on a body of random shape: skinned, noisy, pushed out of it.
 
     Args:
         key: Random key.
-        data: Clips and body.
-        garment: Whose trajectory it is.
-        config: Noise, girth and materials; static.
+        data: Garments, clips and body.
+        index: Number of the garment.
+        config: Noise, girth, shapes and materials; static.
     """
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 6)
+    garment = data.garment(index)
     frame = data.start_frames[jax.random.randint(keys[0], (), 0, data.start_frames.shape[0])]
     yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
-    transforms, later = data.transforms(frame, yaw), data.transforms(frame + 1, yaw)
-    skinned = skin_frame(garment, transforms)
-    velocity = (skin_frame(garment, later) - skinned) * FPS
+    shape = None
+    if data.shapes is not None:
+        bound = config.shape_range
+        shape = jax.random.uniform(keys[5], (data.shapes.count,), minval=-bound, maxval=bound)
+    transforms, later = (data.transforms(frame + k, yaw, shape) for k in (0, 1))
+    skinned = data.skinned(index, transforms, shape)
+    velocity = (data.skinned(index, later, shape) - skinned) * FPS
     noise = config.noise * jax.random.normal(keys[2], skinned.shape)
     position = skinned + jnp.where(garment.is_pinned[:, None], 0.0, noise)
     girth = jax.random.uniform(keys[4], minval=-config.girth, maxval=config.girth)
-    body = data.body(transforms, girth)
+    body = data.body(transforms, girth, shape)
     position = clear_of_body(position, body, data.surface, garment)
     state = initial_state(position, velocity)
     material = sample_material(keys[3], config.material_probability)
-    return Slot(state, frame.astype(jnp.int32), yaw, girth, jnp.int32(0), material, jnp.zeros((), bool))
+    return Slot(
+        state, frame.astype(jnp.int32), yaw, girth, jnp.int32(0), material, jnp.zeros((), bool), shape
+    )
 
 
 def sample_material(key: Array, probability: float) -> Material:

@@ -14,6 +14,8 @@ from eslr_jax.models.registry import MODELS
 def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> TrainConfig:
     """Read a training configuration; `model` is a table, a name, or a table with a `base` name.
 
+    A file with `base`, the path of another one from where it is, changes that one's values.
+
     Args:
         path: TOML file.
         overrides: Dotted keys and their values, such as {"model.refinement_steps": 4}.
@@ -21,12 +23,12 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
     Raises:
         ConfigError: The file is missing or not TOML, or a value is unknown or impossible.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text())
-    except (FileNotFoundError, IsADirectoryError) as error:
-        raise ConfigError(f"no config file {path}; give an existing TOML file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    values = _read(Path(path))
+    if "base" in values:
+        base = Path(path).parent / str(values.pop("base"))
+        values = _read(base) | values
+        if "base" in values:
+            raise ConfigError(f"{base} has a base of its own; give {path} the values of both")
     overrides = dict(overrides or {})
     model = overrides.pop("model", values.get("model"))
     values["model"] = {"base": model} if isinstance(model, str) else model
@@ -40,3 +42,17 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
     if not isinstance(values.get("model"), dict):
         raise ConfigError(f'{path} names no model; add model = "eslr-small" or a [model] table')
     return from_dict(TrainConfig, values)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the values of a TOML file.
+
+    Raises:
+        ConfigError: The file is missing or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text())
+    except (FileNotFoundError, IsADirectoryError) as error:
+        raise ConfigError(f"no config file {path}; give an existing TOML file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error

@@ -14,24 +14,30 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from eslr_jax.config import TrainConfig
+from eslr_jax.config import Criterion, TrainConfig
 from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import is_warming_up
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
-from eslr_jax.physics.hood import BodyFrames, HoodParameters, HoodProblem, collision_weight, hood_terms
+from eslr_jax.physics.hood import (
+    METRIC_PARAMETERS,
+    BodyFrames,
+    HoodParameters,
+    HoodProblem,
+    collision_weight,
+    hood_terms,
+)
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import potential_terms
 from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.scene.build import skin_frame
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.network import graph_inputs
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.training.data import TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import FPS, Slot, empty_pool, start_trajectory
-from eslr_jax.types import Garment, Normalizer, PhysicsConstants, Scene, SceneBody
+from eslr_jax.types import Normalizer, PhysicsConstants, Scene, SceneBody
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
@@ -73,11 +79,16 @@ def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) ->
     return TrainState(
         params=params,
         optimizer=make_optimizer(config).init(params["params"]),
-        pools=tuple(empty_pool(data, config.slots_per_garment) for data in datasets),
+        pools=tuple(empty_pool(data, _slots_per_garment(config, data)) for data in datasets),
         key=jax.random.key_data(jax.random.key(config.seed)),
         step=jnp.int32(0),
         skipped=jnp.int32(0),
     )
+
+
+def _slots_per_garment(config: TrainConfig, data: TrainingData) -> int:
+    """Return how many trajectories of a garment are kept alive: a batch takes every one at most once."""
+    return max(config.slots_per_garment, -(-config.batch_size // data.num_garments))
 
 
 def make_mesh(config: TrainConfig) -> Mesh | None:
@@ -204,16 +215,17 @@ def _sample_gradient(
     params: Any, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
 ) -> tuple[Any, _Sample]:
     """Return one trajectory's gradient, and move it on by a frame."""
-    garment = data.garment(entry.index % data.num_garments)
+    index = entry.index % data.num_garments
     slot = jax.lax.cond(
         entry.slot.is_done,
-        lambda: start_trajectory(entry.key, data, garment, config),
+        lambda: start_trajectory(entry.key, data, index, config),
         lambda: entry.slot,
     )
-    problem = slot_problem(slot, data, garment, config)
+    problem = slot_problem(slot, data, index, config)
+    progress = curriculum(config, step)
     terms_of = potential_terms
     if config.energy_set == "hood":
-        terms_of = _hood_terms(slot, data, step // config.horizon)
+        terms_of = _hood_terms(slot, data, progress.num_samples, config.criterion)
 
     def loss_of(trained):
         return physics_loss({**params, "params": trained}, problem, slot.state, config, terms_of)
@@ -222,7 +234,8 @@ def _sample_gradient(
     statistics = {}
     if params["statistics"]:
         statistics = _statistics(params, slot, problem, config)
-    slot = _advance(slot, problem, report, data, _horizon(config, step))
+    horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
+    slot = _advance(slot, problem, report, data, horizon)
     metrics = {
         "loss": loss,
         "inertial_energy": report.inertial_energy,
@@ -233,10 +246,11 @@ def _sample_gradient(
     return gradient, _Sample(slot, metrics, statistics)
 
 
-def slot_problem(slot: Slot, data: TrainingData, garment: Garment, config: TrainConfig) -> FrameProblem:
-    """Pose the body at both ends of the frame and state the frame's problem."""
-    transforms, later = (data.transforms(slot.frame + k, slot.yaw) for k in (0, 1))
-    body = BodyStep(data.body(transforms, slot.girth), data.body(later, slot.girth))
+def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> FrameProblem:
+    """Pose the body at both ends of the frame and state the frame's problem; `index` is the garment's."""
+    garment = data.garment(index)
+    transforms, later = (data.transforms(slot.frame + k, slot.yaw, slot.shape) for k in (0, 1))
+    body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
     scene = Scene(
         garment=garment,
         material=slot.material,
@@ -248,20 +262,25 @@ def slot_problem(slot: Slot, data: TrainingData, garment: Garment, config: Train
         num_frames=0,
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if config.self_contact else None,
     )
-    inputs = FrameInput(body, skin_frame(garment, later))
+    inputs = FrameInput(body, data.skinned(index, later, slot.shape))
     return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))
 
 
-def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> EnergyTerms:
-    """Return HOOD's losses around this frame, with the collision weight of its ramp."""
+def _hood_terms(
+    slot: Slot, data: TrainingData, num_samples: Int[Array, ""], criterion: Criterion
+) -> EnergyTerms:
+    """Return HOOD's losses around this frame, with the collision weight of its ramp, or that of its tables."""
     # Within a clip `frames_left` falls by one a frame; a clip's first frame has no frame before it.
     last = jnp.maximum(slot.frame - 1, 0)
     before = jnp.where(data.frames_left[last] > data.frames_left[slot.frame], last, slot.frame)
     frames = (before, slot.frame, slot.frame + 1)
     bodies = BodyFrames(
-        *(data.body(data.transforms(frame, slot.yaw), slot.girth) for frame in frames), data.surface.faces
+        *(data.body(data.transforms(k, slot.yaw, slot.shape), slot.girth, slot.shape) for k in frames),
+        data.surface.faces,
     )
-    parameters = HoodParameters(collision_weight=collision_weight(num_samples))
+    parameters = METRIC_PARAMETERS
+    if criterion != "metric":
+        parameters = HoodParameters(collision_weight=collision_weight(num_samples))
     state = slot.state
 
     def terms_of(position, problem: FrameProblem):
@@ -274,7 +293,7 @@ def _hood_terms(slot: Slot, data: TrainingData, num_samples: Int[Array, ""]) -> 
             timestep=problem.timestep,
             parameters=parameters,
         )
-        return hood_terms(position, around)
+        return hood_terms(position, around, criterion=criterion)
 
     return terms_of
 
@@ -287,10 +306,27 @@ class _Horizon(NamedTuple):
     reset_displacement: float  # [m]
 
 
-def _horizon(config: TrainConfig, step: Int[Array, ""]) -> _Horizon:
-    """Return how long trajectories are by now, and what counts as astray."""
-    frames = jnp.minimum(config.horizon, 1 + step // config.horizon_growth)
-    return _Horizon(frames, config.reset_stretch, config.reset_displacement)
+class Progress(NamedTuple):
+    """How far a run is."""
+
+    horizon: Int[Array, ""]  # frames of a trajectory
+    num_samples: Int[Array, ""]  # trajectories so far, each counted with its horizon: HOOD's iterations
+
+
+def curriculum(config: TrainConfig, step: Int[Array, ""] | int) -> Progress:
+    """Return how far a run is after some optimiser steps; a batch counts as one trajectory.
+
+    The horizon grows by a frame after every `horizon_growth` steps, or with the schedule "hood" after as many
+    trajectories, as HOOD's does: there n frames take n times as many steps.
+    """
+    frames = np.arange(1, config.horizon)
+    steps = config.horizon_growth * (frames if config.schedule == "hood" else np.ones_like(frames))
+    starts, samples = (  # step at which every horizon begins, and trajectories by then
+        jnp.asarray([0, *np.cumsum(counts)], jnp.int32) for counts in (steps, steps // frames)
+    )
+    horizon = jnp.sum(step >= starts, dtype=jnp.int32)
+    now = horizon - 1
+    return Progress(horizon, samples[now] + (step - starts[now]) // horizon)
 
 
 def _advance(

@@ -227,7 +227,7 @@ def _train_step(params, moments, network, data: TrainingData, frames, key, *, mo
         zero = jnp.zeros(())
         state = initial_state(before, jnp.where(is_last, velocity, 0.0))
         slot = Slot(state, frame - 1, zero, zero, jnp.int32(0), material, jnp.zeros((), bool))
-        problem = slot_problem(slot, data, garment, TrainConfig(model=ModelConfig()))
+        problem = slot_problem(slot, data, jnp.int32(0), TrainConfig(model=ModelConfig()))
 
         def loss(position):
             terms = potential_terms(position, problem)

@@ -45,7 +45,7 @@ if [[ $size == tshirt ]]; then
   exit
 elif [[ $size == full ]]; then
   for model in mgn-15 mgn-48 hood lsdmp-15 gsa-15 eslr-10 eslr-15; do
-    train "$model" full-size "model=$model"
+    train "$model" "$model"
     rows+=("$model=$out/$model/model.npz")
   done
   vertices=4k

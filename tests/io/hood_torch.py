@@ -1,8 +1,12 @@
-"""HOOD's networks in PyTorch, with the names and shapes of its checkpoints; written from their description."""
+"""HOOD's networks in PyTorch, with the names and shapes of its checkpoints; written from their description.
+
+`PYTHONPATH=.:tests python tests/io/hood_torch.py` writes the checkpoints and answers of `tests/fixtures`.
+"""
 
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -193,3 +197,66 @@ class Network(nn.Module):
         new["garment"] = v + step.vertex(v, sums, to_garment)
         new["body"] = b + step.vertex(b, [torch.zeros_like(b)] * len(sums), to_body)
         return new
+
+
+def save(path, layout, *, size, steps, graph=None):
+    """Write a checkpoint with random weights, whose normalisers have seen a graph; return the network."""
+    torch.manual_seed(0)
+    network = Network(layout, size, steps)
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    with torch.no_grad():
+        for parameter in trained:  # scales of one and biases of zero would hide where they go
+            parameter += 0.1 * torch.randn(parameter.shape)
+    if graph is not None:
+        network(graph, is_collecting=True)
+    runner = nn.Module()
+    runner.model = network
+    content = {
+        "training_module": runner.state_dict(),
+        "config": {"lr": 5e-5},
+        "optimizer": torch.optim.Adam(trained).state_dict(),
+    }
+    torch.save(content, path)
+    return network
+
+
+def plain_graph(graph):
+    """Return what the network in PyTorch reads of a graph."""
+    names = [name for name in graph.edges if not name.startswith("world")]
+    return {
+        **{name: np.asarray(rows) for name, rows in {**graph.nodes, **graph.edges}.items()},
+        "garment_type": graph.globals["garment_type"],
+        "body_type": graph.globals["body_type"],
+        "world_mask": graph.globals["world_mask"],
+        "edges": {name: (graph.senders[name], graph.receivers[name]) for name in names},
+        "kept": [np.asarray(level.is_kept) for level in graph.globals.get("coarse", ())],
+    }
+
+
+def write_fixtures(folder):
+    """Write a checkpoint of every layout, as narrow as a perceptron can be read, its input and its answer."""
+    from reference_models import make_scene
+
+    from eslr_jax.geometry.coarse import add_coarse_edges
+    from eslr_jax.graph.build import build_graph
+    from eslr_jax.models.registry import MODELS
+
+    arrays = {}
+    for layout in ("postcvpr", "cvpr", "fine"):
+        garment, material, inputs = make_scene(8, 6)
+        config = MODELS["mgn-15" if layout == "fine" else "hood"]
+        graph = build_graph(
+            add_coarse_edges(garment) if config.hierarchical else garment, material, inputs, config
+        )
+        seen = plain_graph(graph)
+        network = save(folder / f"hood_{layout}.pth", layout, size=4, steps=5, graph=seen)
+        with torch.no_grad():
+            arrays[f"{layout}/answer"] = network(seen).numpy()
+        rows = {f"{layout}/{name}": rows for name, rows in {**graph.nodes, **graph.edges}.items()}
+        ends = {f"{layout}/{name}_ends": np.stack(pair) for name, pair in seen["edges"].items()}
+        arrays |= rows | ends
+    np.savez_compressed(folder / "hood_answers.npz", **arrays)
+
+
+if __name__ == "__main__":
+    write_fixtures(Path(__file__).parents[1] / "fixtures")

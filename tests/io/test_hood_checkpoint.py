@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit
@@ -20,62 +22,69 @@ from eslr_jax.models.registry import MODELS, apply_model, check_params, count_pa
 
 COUNTS = {"postcvpr": 5_146_852, "cvpr": 5_076_964, "fine": 3_854_164}
 SIZE = 16
+FIXTURES = Path(__file__).parents[1] / "fixtures"
 
 
 def save(path, layout, *, size=SIZE, steps=5, graph=None):
-    """Write a checkpoint with random weights, whose normalisers have seen a graph; return the network."""
-    torch = pytest.importorskip("torch")
-    from hood_torch import Network
+    """Write a checkpoint by PyTorch, or skip the test where there is none."""
+    pytest.importorskip("torch")
+    import hood_torch
 
-    torch.manual_seed(0)
-    network = Network(layout, size, steps)
-    if graph is not None:
-        network(graph, is_collecting=True)
-    runner = torch.nn.Module()
-    runner.model = network
-    optimizer = torch.optim.Adam(parameter for parameter in network.parameters() if parameter.requires_grad)
-    content = {
-        "training_module": runner.state_dict(),
-        "config": {"lr": 5e-5},
-        "optimizer": optimizer.state_dict(),
-    }
-    torch.save(content, path)
-    return network
+    seen = None if graph is None else hood_torch.plain_graph(graph)
+    return hood_torch.save(path, layout, size=size, steps=steps, graph=seen)
 
 
-def plain_graph(graph):
-    """Return what the network in PyTorch reads of a graph."""
-    names = [name for name in graph.edges if not name.startswith("world")]
-    return {
-        **{name: np.asarray(rows) for name, rows in {**graph.nodes, **graph.edges}.items()},
-        "garment_type": graph.globals["garment_type"],
-        "body_type": graph.globals["body_type"],
-        "world_mask": graph.globals["world_mask"],
-        "edges": {name: (graph.senders[name], graph.receivers[name]) for name in names},
-        "kept": [np.asarray(level.is_kept) for level in graph.globals.get("coarse", ())],
-    }
+def answer_of(path, graph, garment):
+    """Return the accelerations of a converted network."""
+    params, config, _ = read_weights(path)
+    run = quick_jit(
+        lambda params, graph: scale_output(config, params, apply_model(config, params, graph, garment))
+    )
+    return run(params, graph)
+
+
+def scene_graph(config):
+    """Return a tube and its graph."""
+    garment, material, inputs = make_scene(8, 6)
+    garment = add_coarse_edges(garment) if config.hierarchical else garment
+    return garment, quick_jit(lambda: build_graph(garment, material, inputs, config))()
+
+
+@pytest.mark.parametrize("layout", COUNTS)
+def test_without_pytorch_its_checkpoint_computes_what_it_computed(tmp_path, layout):
+    """The fixtures hold a network's input and answer; `hood_torch` wrote them."""
+    convert(FIXTURES / f"hood_{layout}.pth", tmp_path / "hood.npz")
+    _, config, _ = read_weights(tmp_path / "hood.npz")
+    garment, graph = scene_graph(config)
+    with np.load(FIXTURES / "hood_answers.npz") as stored:
+        given = {name.removeprefix(f"{layout}/"): stored[name] for name in stored.files if layout in name}
+    for name in ("mesh", "coarse0", "coarse1", "coarse2")[: 4 if config.hierarchical else 1]:
+        np.testing.assert_array_equal(given[f"{name}_ends"], [graph.senders[name], graph.receivers[name]])
+    graph = graph._replace(
+        nodes={name: jnp.asarray(given[name]) for name in graph.nodes},
+        edges={name: jnp.asarray(given[name]) for name in graph.edges},
+    )
+    expected = given["answer"]
+    actual = answer_of(tmp_path / "hood.npz", graph, garment)
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("layout", COUNTS)
 def test_a_converted_network_computes_the_same(tmp_path, layout):
-    pytest.importorskip("torch")
-    import torch
+    torch = pytest.importorskip("torch")
+    from hood_torch import plain_graph
 
-    garment, material, inputs = make_scene(8, 6)
     save(tmp_path / "hood.pth", layout)
     _, config = read_hood(tmp_path / "hood.pth")
-    garment = add_coarse_edges(garment) if config.hierarchical else garment
-    graph = quick_jit(lambda: build_graph(garment, material, inputs, config))()
-    network = save(tmp_path / "hood.pth", layout, graph=plain_graph(graph))
+    garment, graph = scene_graph(config)
+    network = save(tmp_path / "hood.pth", layout, graph=graph)
     with torch.no_grad():
         expected = network(plain_graph(graph)).numpy()
     convert(tmp_path / "hood.pth", tmp_path / "hood.npz")
-    params, config, record = read_weights(tmp_path / "hood.npz")
+    _, config, record = read_weights(tmp_path / "hood.npz")
     assert record == {"converted_from": "hood.pth"}
     assert (config.latent_size, config.message_passing_steps) == (SIZE, 5)
-    actual = quick_jit(
-        lambda params, graph: scale_output(config, params, apply_model(config, params, graph, garment))
-    )(params, graph)
+    actual = answer_of(tmp_path / "hood.npz", graph, garment)
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -109,7 +118,7 @@ def test_what_is_no_network_of_hoods_is_refused(tmp_path):
 def test_a_converted_network_simulates(tmp_path):
     garment, material, inputs = make_scene(8, 6)
     graph = build_graph(add_coarse_edges(garment), material, inputs, MODELS["hood"])
-    save(tmp_path / "hood.pth", "postcvpr", graph=plain_graph(graph))
+    save(tmp_path / "hood.pth", "postcvpr", graph=graph)
     convert(tmp_path / "hood.pth", tmp_path / "hood.npz")
     simulate(model=str(tmp_path / "hood.npz"), frames=4, iterations=20, pictures=False, out=tmp_path / "run")
     report = json.loads((tmp_path / "run" / "report.json").read_text())

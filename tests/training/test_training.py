@@ -14,20 +14,23 @@ import numpy as np
 import pytest
 
 from eslr_jax.assets import load_model, split_clips
+from eslr_jax.body.motion import pose_body, shape_body
 from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax.graph.normalizer import WARMUP_UPDATES
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import pushed_out_guess
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.network import refine
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
+from eslr_jax.training.data import build_training_data, load_training_data
 from eslr_jax.training.loop import train
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.recipe import load_recipe
-from eslr_jax.training.step import make_schedule
+from eslr_jax.training.step import curriculum, init_train_state, make_schedule, make_train_step
 
 RECIPES = Path(__file__).parents[2] / "experiments" / "configs"
 
@@ -173,8 +176,7 @@ def test_overrides_may_name_another_model(tmp_path):
 
 def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(config, small_data):
     config = dataclasses.replace(config, girth=0.01, noise=0.0)
-    garment = small_data.garment(0)
-    start = jax.jit(partial(start_trajectory, data=small_data, garment=garment, config=config))
+    start = jax.jit(partial(start_trajectory, data=small_data, index=jnp.int32(0), config=config))
     slots = [start(jax.random.key(seed)) for seed in range(4)]
     girths = np.array([slot.girth for slot in slots])
     assert np.ptp(girths) > 2e-3
@@ -185,6 +187,111 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(co
         np.testing.assert_allclose(np.linalg.norm(own - thin, axis=-1), abs(slot.girth), rtol=0.1)
         contacts = find_contacts(slot.state.position, own, own, small_data.surface)
         assert np.min(contacts.distances) > 0
+
+
+@pytest.fixture(scope="module")
+def shaped_data(small_garment):
+    """The sleeve on a limb of two shapes: longer, with its joint higher up; and thicker."""
+    from cloth import make_limb, swing_motion
+
+    limb, up = make_limb(), np.float32([0.0, 0.3, 0.0])
+    rest = np.asarray(limb.rest_positions)
+    longer, thicker = rest * np.float32([0.0, 0.1, 0.0]) + up / 15, rest * np.float32([0.05, 0.0, 0.05])
+    body = limb.replace(
+        rest_positions=jnp.asarray(rest + up),
+        shape_directions=jnp.asarray(np.stack([longer, thicker], axis=-1)),
+        joint_rest_positions=jnp.array([[0.0, 0.25, 0.0]]),
+        joint_shape_directions=jnp.array([[[0.0, 0.0], [0.01, 0.0], [0.0, 0.0]]]),
+    )
+    garment = small_garment.replace(rest_positions=jnp.asarray(np.asarray(small_garment.rest_positions) + up))
+    motion = swing_motion(body, 12)
+    return body, motion, build_training_data([garment], body, [motion], has_shapes=True)
+
+
+def test_a_shaped_body_moves_as_the_same_body_shaped_first(shaped_data):
+    body, motion, data = shaped_data
+    coefficients = np.array([1.5, -2.0])
+    expected = pose_body(shape_body(body, coefficients), motion).positions[:, data.surface.vertex_ids]
+    still = jnp.float32(0.0)
+    for frame in (0, 7):
+        shape = jnp.asarray(coefficients, jnp.float32)
+        transforms = data.transforms(jnp.int32(frame), still, shape)
+        found = data.body(transforms, still, shape)
+        np.testing.assert_allclose(found, expected[frame], atol=1e-6)
+        # The sleeve lies 8 mm off the limb, whatever the limb's shape.
+        sleeve = data.skinned(jnp.int32(0), transforms, shape)
+        contacts = find_contacts(sleeve, found, found, data.surface)
+        np.testing.assert_allclose(contacts.distances, 0.008, atol=0.004)
+
+
+def test_bodies_of_trajectories_differ_in_shape_and_cloth_starts_outside_them(config, shaped_data):
+    *_, data = shaped_data
+    config = dataclasses.replace(config, shape_range=2.0, noise=0.0)
+    start = jax.jit(partial(start_trajectory, data=data, index=jnp.int32(0), config=config))
+    slots = [start(jax.random.key(seed)) for seed in range(6)]
+    shapes = np.array([slot.shape for slot in slots])
+    assert shapes.shape == (6, 2)
+    assert np.all(np.ptp(shapes, axis=0) > 1.0)
+    assert np.all(np.abs(shapes) <= 2.0)
+    for slot in slots:
+        transforms = data.transforms(slot.frame, slot.yaw, slot.shape)
+        own = data.body(transforms, slot.girth, slot.shape)
+        contacts = find_contacts(slot.state.position, own, own, data.surface)
+        assert np.min(contacts.distances) > 0
+
+
+def test_a_run_on_shapes_keeps_them_while_a_trajectory_lives(config, shaped_data, tmp_path):
+    *_, data = shaped_data
+    config = dataclasses.replace(config, shape_range=1.0, horizon_growth=1, steps=3, slots_per_garment=1)
+    state = train(config, tmp_path, datasets=(data,))
+    assert int(state.skipped) == 0
+    assert np.abs(np.array(state.pools[0].shape)).max() > 0
+    assert np.isfinite(np.array(state.pools[0].state.position)).all()
+
+
+def test_a_body_without_shapes_refuses_them(small_garment):
+    from cloth import make_limb, swing_motion
+
+    body = make_limb()
+    with pytest.raises(ConfigError, match="no shapes; train with shape_range = 0"):
+        build_training_data([small_garment], body, [swing_motion(body, 3)], has_shapes=True)
+
+
+def test_a_batch_larger_than_the_pool_gets_more_slots(config, small_data):
+    small = init_train_state(dataclasses.replace(config, slots_per_garment=1), (small_data,))
+    assert small.pools[0].is_done.shape == (1,)
+    config = dataclasses.replace(config, slots_per_garment=1, batch_size=5)
+    state = init_train_state(config, (small_data,))
+    assert state.pools[0].is_done.shape == (5,)
+    state, metrics = make_train_step(config, 0)(state, small_data)
+    assert np.isfinite(float(metrics["loss"]))
+    assert np.all(np.array(state.pools[0].age) == 1), "every trajectory went on once"
+
+
+def test_the_criterion_changes_the_loss(cheap_model, small_data):
+    """The body moves: the three readings look at different frames of it, and weigh collision differently."""
+    config = TrainConfig(model=cheap_model, energy_set="hood", slots_per_garment=1, noise=0.0)
+    losses = {}
+    for criterion in ("postcvpr", "cvpr", "metric"):
+        chosen = dataclasses.replace(config, criterion=criterion)
+        state = init_train_state(chosen, (small_data,))
+        losses[criterion] = float(make_train_step(chosen, 0)(state, small_data)[1]["loss"])
+    assert np.isfinite(list(losses.values())).all()
+    assert abs(losses["cvpr"] - losses["postcvpr"]) > 1e-3 * abs(losses["postcvpr"])
+    assert abs(losses["metric"] - losses["postcvpr"]) > 1e-3 * abs(losses["postcvpr"])
+    with pytest.raises(ConfigError, match='"cvpr" needs energy_set = "hood"'):
+        from_dict(TrainConfig, {**to_dict(config), "energy_set": "consistent", "criterion": "cvpr"})
+
+
+def test_hoods_curriculum_counts_trajectories(config):
+    """Steps of HOOD's run by which its iterations, and so its horizon and its collision ramp, are known."""
+    hood = dataclasses.replace(config, schedule="hood", horizon=5, horizon_growth=5000)
+    table = {0: (1, 0), 4_999: (1, 4_999), 5_000: (2, 5_000), 15_000: (3, 10_000), 29_999: (3, 14_999)}
+    table |= {50_000: (5, 20_000), 200_000: (5, 50_000), 450_000: (5, 100_000)}
+    for step, expected in table.items():
+        assert tuple(int(value) for value in curriculum(hood, jnp.int32(step))) == expected
+    plain = dataclasses.replace(config, horizon=3, horizon_growth=10)
+    assert [int(curriculum(plain, jnp.int32(step)).horizon) for step in (9, 10, 20, 900)] == [1, 2, 3, 3]
 
 
 def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small_problem):
@@ -219,6 +326,35 @@ def test_a_network_for_the_solver_trains_from_optima(config, small_data, tmp_pat
     assert np.mean(losses[-2:]) < losses[0] - 0.03
     with pytest.raises(ConfigError, match="iterations"):
         from_dict(TrainConfig, {**to_dict(config), "energy_set": "hood"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["eslr-15", "hood", "mgn-48"])
+def test_full_size_networks_take_five_steps(name):
+    """The paper's networks at their own width and 4k vertices, on one garment and the validation clips."""
+    config = load_recipe(RECIPES / "paper" / f"{name}.toml", {"split": "validation", "garments": ["tshirt"]})
+    data = load_training_data(config, *config.vertices)
+    assert data.garments.rest_positions.shape[1] > 4000
+    state, step = init_train_state(config, (data,)), make_train_step(config, 0)
+    state, _ = step(
+        state, data
+    )  # the normalisers see a frame; HOOD's see a hundred before anything is learned
+    measured = {
+        key: entry.replace(num_updates=jnp.int32(WARMUP_UPDATES))
+        for key, entry in state.params["statistics"].items()
+    }
+    state = state.replace(params={**state.params, "statistics": measured})
+    before = jax.device_get(state.params["params"])
+    for _ in range(5):
+        state, metrics = step(state, data)
+        assert all(np.isfinite(float(value)) for value in metrics.values())
+    assert int(state.skipped) == 0
+    moved = jax.tree.map(
+        lambda new, old: float(np.max(np.abs(new - old))), jax.device_get(state.params["params"]), before
+    )
+    assert np.mean([value > 0 for value in jax.tree.leaves(moved)]) > 0.9
+    # Adam moves a weight by at most its rate at first, 3.2 rates later.
+    assert config.learning_rate < max(jax.tree.leaves(moved)) < 5 * 3.2 * 1.01 * config.learning_rate
 
 
 @pytest.mark.slow
