@@ -292,7 +292,6 @@ BODIES = {
 
 
 RESULTS = Path(__file__).parent / "results"
-BOTTOMS = ("shorts", "kneepants", "pants")  # a body that wears one alone is bare above: not in the pictures
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip
@@ -372,8 +371,9 @@ def _depth(distances: np.ndarray) -> float:
 def _picture(body: Body, panels: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
     """Return a strip of pictures: labels, body vertices, cloth vertices and faces."""
     faces = np.asarray(body.faces)
+    dressed = {"rest_positions": np.asarray(body.rest_positions), "rig": body, "follows": False}
     pictures = [
-        render_frame(skin, faces, cloth, triangles, camera=25.0, size=(180, 280))
+        render_frame(skin, faces, cloth, triangles, camera=25.0, size=(180, 280), **dressed)
         for _, skin, cloth, triangles in panels
     ]
     return side_by_side(pictures, tuple(label for label, *_ in panels))
@@ -406,8 +406,7 @@ def main() -> None:
                 {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()},
             )
             rows.append(row)
-            if row["garment"] not in BOTTOMS:
-                panels.append((row["garment"], moving[-1], positions[-1], faces))
+            panels.append((row["garment"], moving[-1], positions[-1], faces))
         table[name] = rows
         write_png(arguments.out / f"other_bodies_{name}.png", _picture(body, panels))
         with atomic_write(path) as temporary:

@@ -1,6 +1,7 @@
 """The command line as a user meets it."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -53,6 +54,24 @@ def test_garments_may_be_given_again(command):
     _refuse_repetition([command, "--garment", "pants", "--garment", "tshirt"])
     with pytest.raises(ConfigError, match="--motion is given twice"):
         _refuse_repetition([command, "--motion", "turn", "--motion=jump"])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
+def test_a_page_is_opened_where_a_person_sits(tmp_path):
+    import pty
+
+    browser, opened = tmp_path / "browser", tmp_path / "opened"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {opened}\n')
+    browser.chmod(0o755)
+    code = "from eslr_jax.cli.console import open_browser; open_browser('http://localhost:9')"
+    command, settings = [sys.executable, "-c", code], os.environ | {"BROWSER": str(browser)}
+    subprocess.run(command, env=settings, check=True, stdout=subprocess.PIPE)
+    assert not opened.exists()  # nobody watches
+    ours, terminal = pty.openpty()
+    subprocess.run(command, env=settings, check=True, stdout=terminal)
+    os.close(terminal)
+    os.close(ours)
+    assert opened.read_text() == "http://localhost:9\n"
 
 
 def test_assets_lists_every_kind():

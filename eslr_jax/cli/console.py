@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
+import webbrowser
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -25,6 +28,19 @@ stderr = Console(stderr=True)
 def say(text: str) -> None:
     """Print a line on stderr as it is."""
     stderr.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def open_browser(url: str) -> bool:
+    """Open a page in the browser where a person sits at a screen; return whether it was tried.
+
+    Without a screen Python would start a browser of the terminal, which takes the terminal over.
+    """
+    is_linux = sys.platform.startswith("linux")
+    has_screen = not is_linux or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    )
+    is_person = sys.stdout.isatty()
+    return is_person and has_screen and webbrowser.open(url)
 
 
 @contextlib.contextmanager

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from eslr_jax.cli.console import app, say, use_compile_cache
+from eslr_jax.cli.console import app, open_browser, say, use_compile_cache
 from eslr_jax.cli.options import DEFAULT_GARMENT
 
 
@@ -21,6 +21,7 @@ def play(
     out: Path = Path("live"),
     port: int = 8080,
     host: str = "127.0.0.1",
+    opens: Annotated[bool, tyro.conf.arg(name="open")] = True,
 ) -> None:
     """Simulate in the browser while you watch: change fabric, wind and body, pull at the cloth; Ctrl-C ends it.
 
@@ -36,6 +37,7 @@ def play(
         out: Folder that what is recorded is written to, as a run of `eslr simulate`.
         port: Port of the page, or the next free one.
         host: Address to listen on; 0.0.0.0 shows it to the whole network.
+        opens: Open the page in the browser, if this is a terminal with a screen. Its address is printed anyway.
     """
     from eslr_jax.assets.load import own_motion
     from eslr_jax.viewer.live import open_live, run_live
@@ -45,5 +47,7 @@ def play(
     choice = Choice(garment or (DEFAULT_GARMENT,), vertices, motion or own_motion(body), body, betas)
     live = open_live(choice, out=out, host=host, port=port)
     print(live.url, flush=True)
+    if opens:
+        open_browser(live.url)
     say("the first frame compiles for a while; the page says when it moves")
     run_live(live)

@@ -24,6 +24,7 @@ class Minimum(NamedTuple):
     value: Float[Array, ""]  # [J]
     gradient: Float[Array, "vertices 3"]  # [N]
     iterations: Int[Array, ""]
+    gap_bound: Float[Array, ""]  # share of the initial gap that is left at most, see `Stop.tolerance`
 
 
 class Stop(NamedTuple):
@@ -164,7 +165,9 @@ def minimize(
         )
         initial = _advance(initial, first, inverse)
     final = jax.lax.while_loop(is_running, iterate, initial)
-    return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations)
+    gain = stop.reference - final.value
+    gap_bound = jnp.where(gain > 0, jnp.sqrt(2.0 * final.decrement / jnp.where(gain > 0, gain, 1.0)), jnp.inf)
+    return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations, gap_bound)
 
 
 def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:

@@ -59,19 +59,21 @@ def solve(
     start: Start,
     *,
     iterations: int | Int[Array, ""],
-    tolerance: float = 0.0,
+    tolerance: float | Float[Array, ""] = 0.0,
     memory: int = 8,
 ) -> Minimum:
     """Minimise the frame's potential by L-BFGS; differentiable by every real number in `problem`.
 
     Forward and reverse mode solve one linear system (see the module). Where it stalls, the derivative is NaN
-    rather than wrong; `solve_hessian` tells why. `gradient` and `iterations` of the result have no derivative.
+    rather than wrong; `solve_hessian` tells why. `gradient`, `iterations` and `gap_bound` of the result have no
+    derivative.
 
     Args:
         problem: The frame's problem.
         start: Where to begin; it has no influence on the minimum, and its derivative is zero.
         iterations: Upper bound of iterations; may be traced.
-        tolerance: Share of the initial gap that may be left, see `SimConfig.tolerance`.
+        tolerance: Share of the initial gap that may be left, see `SimConfig.tolerance`; may be traced. The
+            minimum does not depend on it: its derivative is zero.
         memory: Number of pairs that L-BFGS keeps; static.
 
     Raises:
@@ -80,28 +82,28 @@ def solve(
     iterations = jnp.asarray(iterations)
     if not jnp.issubdtype(iterations.dtype, jnp.integer):
         raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
-    return _solve(problem, jax.lax.stop_gradient(start), iterations, (tolerance, memory))
+    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance))
+    return _solve(problem, jax.lax.stop_gradient(start), limits, memory)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def _solve(
-    problem: FrameProblem, start: Start, iterations: Int[Array, ""], settings: tuple[float, int]
+    problem: FrameProblem, start: Start, limits: tuple[Int[Array, ""], Float[Array, ""]], memory: int
 ) -> Minimum:
-    tolerance, memory = settings
     return minimize(
         lambda position: potential(position, problem),
         start.point,
         stretched_stiffness(problem, start.point.position),
-        Stop(iterations, tolerance, start.inertial_energy),
+        Stop(*limits, start.inertial_energy),
         memory=memory,
         previous=start.previous,
     )
 
 
 @_solve.defjvp
-def _solve_jvp(settings: tuple[float, int], primals: tuple, tangents: tuple) -> tuple[Minimum, Any]:
-    problem, start, iterations = primals
-    minimum = _solve(problem, start, iterations, settings)
+def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, Any]:
+    problem, start, limits = primals
+    minimum = _solve(problem, start, limits, memory)
     position = checkpoint_name(minimum.position, SOLUTION)
     minimum = minimum._replace(position=position)
 
@@ -112,7 +114,8 @@ def _solve_jvp(settings: tuple[float, int], primals: tuple, tangents: tuple) -> 
     move = -_solve_hessian_linear(problem, position, force_change)
     value_change = value_change + jnp.sum(minimum.gradient * move)
     fixed = np.zeros((), jax.dtypes.float0)
-    return minimum, Minimum(move, value_change, jnp.zeros_like(minimum.gradient), fixed)  # type: ignore[arg-type]
+    zeros = jax.tree.map(jnp.zeros_like, (minimum.gradient, minimum.gap_bound))
+    return minimum, Minimum(move, value_change, zeros[0], fixed, zeros[1])  # type: ignore[arg-type]
 
 
 def _solve_hessian_linear(

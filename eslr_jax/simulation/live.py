@@ -22,9 +22,8 @@ from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
 
-TOLERANCE = 1e-2  # relative gap at which a frame ends
 MOST_ITERATIONS = 100
-_CONFIG = SimConfig(iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
+_CONFIG = SimConfig(iterations=MOST_ITERATIONS)
 _HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
 
 
@@ -65,7 +64,7 @@ def grasp(vertex: int, place: Any) -> Hand:
 def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     """Return a garment on a moving body, with all that one can change while it moves.
 
-    It is stepped by BDF2 in air. Changes of fabric, wind and hand do not compile anew.
+    It is stepped by BDF2 in air. Changes of fabric, wind, hand and tolerance do not compile anew.
 
     Args:
         garment: A prepared garment.
@@ -90,7 +89,7 @@ def _begin_compiling(material: Material, scene: Scene) -> None:
     def first_step(scene: Scene) -> tuple:
         stage = _staged(scene, material)
         frame = jax.tree.map(lambda leaf: leaf[0], stage.inputs)
-        return stage.constant, scene.initial_state, frame, jnp.int32(0)
+        return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
 
     begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
 
@@ -122,7 +121,9 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     return stage._replace(constant=constant)
 
 
-def advance(stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int) -> Step:
+def advance(
+    stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int, tolerance: float
+) -> Step:
     """Step the cloth while the body moves from one frame to a neighbour.
 
     Args:
@@ -130,19 +131,26 @@ def advance(stage: Stage, state: ClothState, frames: tuple[int, int], iterations
         state: Cloth at the first of the two frames.
         frames: Two neighbouring frames.
         iterations: Of the solver, at most.
+        tolerance: Share of the initial gap at which the frame may end.
     """
     now, then = frames
     inputs = stage.inputs if then > now else stage.back
     row = min(now, then)
     frame = jax.tree.map(lambda leaf: leaf[row], inputs)
-    arguments = (stage.constant, state, frame, jnp.int32(iterations))
+    arguments = (stage.constant, state, frame, jnp.int32(iterations), jnp.float32(tolerance))
     return find_program(_step, _CONFIG, arguments)(*arguments)
 
 
 def _step(
-    scene: Scene, state: ClothState, frame: FrameInput, iterations: Int[Array, ""], *, config: SimConfig
+    scene: Scene,
+    state: ClothState,
+    frame: FrameInput,
+    iterations: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    *,
+    config: SimConfig,
 ) -> Step:
-    stepper = make_stepper(None, config, iterations)
+    stepper = make_stepper(None, config, iterations, tolerance)
     return Step(*step_frame(stepper, scene, state, frame))
 
 

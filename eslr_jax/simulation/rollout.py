@@ -159,6 +159,7 @@ def step_frame(
         terms=jax.tree.map(lambda values: values[-1], reports.terms),
         residual=residual,
         iterations=jnp.sum(reports.iterations, dtype=jnp.int32),
+        gap_bound=jnp.max(reports.gap_bound),
         pair_demand=None if demand is None else jnp.max(demand),
     )
 

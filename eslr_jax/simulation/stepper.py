@@ -28,6 +28,7 @@ class FrameReport(NamedTuple):
     terms: PotentialTerms  # energies that it ended with [J]
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
+    gap_bound: Float[Array, ""]  # share of the initial gap that the solver left at most; infinite without one
     pair_demand: Int[Array, ""] | None  # see Trajectory
 
 
@@ -37,7 +38,12 @@ Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
 """Advances the cloth by one frame; the one contract of the solver, of networks, and of both."""
 
 
-def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | int | None = None) -> Stepper:
+def make_stepper(
+    params: Any,
+    config: SimConfig,
+    iterations: Int[Array, ""] | int | None = None,
+    tolerance: Float[Array, ""] | None = None,
+) -> Stepper:
     """Return the stepper that a configuration describes.
 
     Args:
@@ -45,6 +51,7 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
         config: Network, iterations and tolerance; static.
         iterations: Bound of iterations per frame in place of the configuration's. It may be traced, so that all
             numbers share a program.
+        tolerance: In place of the configuration's, likewise.
     """
 
     def step(problem: FrameProblem, state: ClothState) -> tuple[ClothState, FrameReport]:
@@ -55,7 +62,7 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
                 problem,
                 start,
                 iterations=config.iterations if iterations is None else iterations,
-                tolerance=config.tolerance,
+                tolerance=config.tolerance if tolerance is None else tolerance,
                 memory=config.memory,
             )
         else:
@@ -65,13 +72,15 @@ def make_stepper(params: Any, config: SimConfig, iterations: Int[Array, ""] | in
                     "behind the network"
                 )
             start, status = find_start(params, problem, state, config)
-            minimum = Minimum(*start.point, iterations=jnp.int32(0))
+            unknown = jnp.full_like(start.point.value, jnp.inf)
+            minimum = Minimum(*start.point, iterations=jnp.int32(0), gap_bound=unknown)
         position = pin(problem, minimum.position)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
             terms=potential_terms(position, problem),
             residual=residual,
             iterations=minimum.iterations,
+            gap_bound=minimum.gap_bound,
             pair_demand=None if problem.layers is None else problem.layers.pairs.count,
         )
         return next_state(position, problem, state, status, residual), report

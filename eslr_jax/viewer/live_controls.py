@@ -16,6 +16,7 @@ NOTHING = "nothing"  # no garment over the others
 FACTORS = (0.1, 10.0)  # of a fabric's constants
 _MOST_BETAS = 2.5  # [standard deviations]
 _STRONGEST = 12.0  # [m/s], of the wind
+_TOLERANCES = (0.1, 10.0)  # [%]
 # What the first shapes of the bundled body change, in words; it has more, which change little.
 _BUNDLED_SHAPES = ("stature", "hips (+), shoulders (-)", "waist, slim (+)", "weight")
 
@@ -69,9 +70,9 @@ def add_controls(gui: Any, choice: Choice, num_shapes: int) -> dict[str, Any]:
             for k in range(min(num_shapes, max(len(_BUNDLED_SHAPES), len(choice.betas))))
         ]
     with gui.add_folder("speed"):
-        hint = (
-            "a frame gets as many iterations as there is time for; else each ends within 1 % of its optimum"
-        )
+        hint = "a frame ends where its gap is below this share of the gap that it began with"
+        controls["tolerance"] = gui.add_slider("tolerance, %", *_TOLERANCES, 0.1, 1.0, hint=hint)
+        hint = "a frame gets as many iterations as there is time for; else each ends within the tolerance"
         controls["keep_up"] = gui.add_checkbox("keep up with real time", True, hint=hint)
     return controls
 
@@ -114,6 +115,11 @@ def read_wind(controls: dict[str, Any]) -> tuple[float, float, float]:
     """Return the wind that the controls ask for [m/s]; at zero degrees it blows along z."""
     angle, speed = np.deg2rad(controls["direction"].value), controls["wind"].value
     return float(speed * np.sin(angle)), 0.0, float(speed * np.cos(angle))
+
+
+def read_tolerance(controls: dict[str, Any]) -> float:
+    """Return the share of a frame's initial gap that the controls allow to be left."""
+    return 0.01 * float(controls["tolerance"].value)
 
 
 def _garment(gui: Any, number: int, names: Sequence[str], choice: Choice) -> Any:

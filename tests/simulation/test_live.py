@@ -25,12 +25,13 @@ def stage():
     return set_stage(square(5, 0.2, is_pinned=np.array([0])), drifting_ball(4), COTTON)
 
 
-def played(stage, count, first=0):
-    state = stage.scene.initial_state
-    for step in range(first, first + count):
-        state, report = advance(stage, state, there_and_back(step, stage.scene.num_frames), 40)
+def played(stage, count, tolerance=0.01):
+    state, reports = stage.scene.initial_state, []
+    for step in range(count):
+        state, report = advance(stage, state, there_and_back(step, stage.scene.num_frames), 40, tolerance)
+        reports.append(report)
     assert int(state.status) == 0
-    return np.asarray(state.position), int(report.iterations)
+    return np.asarray(state.position), reports
 
 
 def test_a_motion_is_played_forth_and_back():
@@ -40,10 +41,10 @@ def test_a_motion_is_played_forth_and_back():
 
 def test_the_body_carries_pins_forth_and_back(stage):
     for count, frame in ((3, 3), (5, 1), (6, 0)):
-        positions, iterations = played(stage, count)
+        positions, reports = played(stage, count)
         target = np.asarray(stage.scene.pin_targets[frame, 0])
         np.testing.assert_allclose(positions[0], target, atol=1e-6)
-        assert 0 < iterations <= 40
+        assert 0 < reports[-1].iterations <= 40
 
 
 def test_a_hand_holds_its_vertex(stage):
@@ -61,6 +62,17 @@ def test_wind_and_fabric_change_the_cloth_without_compiling_anew(stage):
     stiff, _ = played(changed(stage, fabric_material("denim"), STILL, no_hand()), 8)
     assert (blown - still)[:, 2].mean() > 0.005
     assert np.abs(stiff - still).max() > 1e-3
+    assert _compile.cache_info().misses == before
+
+
+def test_a_tighter_tolerance_takes_more_iterations_and_compiles_nothing(stage):
+    before = _compile.cache_info().misses
+    loose, tight = (played(stage, 8, tolerance)[1] for tolerance in (0.05, 0.001))
+    for reports, tolerance in ((loose, 0.05), (tight, 0.001)):
+        for report in reports:
+            assert report.gap_bound <= tolerance or report.iterations == 40
+    assert sum(int(report.iterations) for report in loose) < sum(int(report.iterations) for report in tight)
+    assert float(np.median([report.gap_bound for report in tight])) <= 0.001
     assert _compile.cache_info().misses == before
 
 
