@@ -291,7 +291,7 @@ def pair_blocks(
     position: Float[np.ndarray, "vertices 3"],
     pairs: FacePairs,
     stiffness: float,
-    thickness: Float[np.ndarray, " pairs"] | float,
+    thickness: Float[np.ndarray, " rows"] | float,
     next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
 ) -> Float[np.ndarray, "pairs size size"]:
     """Return the Gauss-Newton Hessian of the repulsion per pair in use: 6 k a depth g g^T, g = dd/dx.
