@@ -34,9 +34,10 @@ def full_precision():
 
 
 def run_on(device, function, *arguments):
-    """Return a function's result on a device, fetched."""
+    """Return a function's result on a device, fetched; it gets copies, which it may donate."""
+    copies = jax.tree.map(np.array, arguments)
     with jax.default_device(device):
-        result = function(*jax.device_put(arguments, device))
+        result = function(*jax.device_put(copies, device))
         assert all(leaf.devices() == {device} for leaf in jax.tree.leaves(result))
         return jax.device_get(result)
 
