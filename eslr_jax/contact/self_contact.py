@@ -44,7 +44,7 @@ PAIRS_PER_VERTEX = 8  # rows that hold any cloth in the hard cases, a mean over 
 _FEWEST_PAIRS = 64  # rows to begin with, at least
 _BEGINNING = 8  # vertices for a row to begin with: a walking T-shirt has a pair for 20 to 130 vertices
 _PIECES_BEGINNING = 2  # likewise for layers of several pieces; a skirt over trousers has a pair for 2.6
-PAIRS_PER_TIP = 8  # likewise for tips, over the vertices of both; cloth bunched around a needle took 4.7
+PAIRS_PER_TIP = 12  # likewise for tips, over the vertices of both; cloth bunched around a needle took 8.3
 
 
 @struct.dataclass
