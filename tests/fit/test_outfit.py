@@ -80,7 +80,7 @@ def test_a_garment_is_worn_once():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("names", "most"), zip(OUTFITS, MOST, strict=True))
+@pytest.mark.parametrize(("names", "most"), list(zip(OUTFITS, MOST, strict=True)))
 def test_an_outfit_on_a_walk_does_not_cross_itself(names, most):
     rest = combine_garments([load(name) for name in names], names)
     assert not len(intersecting_pairs(rest.rest_positions, rest.faces))
