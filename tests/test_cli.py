@@ -47,6 +47,19 @@ def test_simulate_writes_everything(tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("iterations", "integrator"), [(0, "euler"), (5, "bdf2")])
+def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
+    tmp_path, iterations, integrator
+):
+    options = ("--model", "smooth-small", "--iterations", iterations, "--frames", 3, "--no-pictures")
+    result = eslr("simulate", *options, "--out", tmp_path, "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert (report["model"], report["integrator"]) == ("smooth-small", integrator)
+    assert report["finite"]
+
+
 @pytest.mark.parametrize("command", ["simulate", "play", "score"])
 def test_garments_may_be_given_again(command):
     from eslr_jax.cli import _refuse_repetition

@@ -184,6 +184,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.body.motion import first_poses
     from eslr_jax.body.timing import check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
+    from eslr_jax.evaluation.report import start_crossing
+    from eslr_jax.evaluation.words import describe_start
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
@@ -244,6 +246,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
     if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
+    _say_if_any(describe_start(start_crossing(scene, parts=(stored.face_parts, stored.part_names))))
     for name, worn in zip(names, garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))

@@ -13,10 +13,12 @@ import numpy as np
 
 from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_frames
 from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.crossing import find_crossings
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.garment import split_outfit
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
+_EVERY = 10  # frames between those whose crossings are counted
 _DEEP = 1e-3  # [m] inside the body, from which a depth is measured again
 _PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
 
@@ -46,7 +48,9 @@ def trajectory_report(
         Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
         vertices that penetrate; without a body the penetration values are None. `worst_stretch` and
         `worst_penetration` hold frame, time [s], vertex and part of the largest values. `garments` holds stretch
-        and penetration of every garment of an outfit by name; None for a single garment.
+        and penetration of every garment of an outfit by name; None for a single garment. `crossing_pairs` are the
+        most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
+        any, of every tenth simulated frame and the last; None where self-contact is not modelled.
     """
     measures: FrameMeasures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
@@ -84,7 +88,56 @@ def trajectory_report(
             report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
     several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
     report["garments"] = None if several is None else _garments(trajectory, scene, depth, several)
-    return report
+    return report | _crossings(trajectory, scene, parts)
+
+
+def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
+    """Return where cloth passes through cloth in spite of self-contact."""
+    found: dict[str, Any] = {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
+    if scene.self_contact is None:
+        return found
+    faces = _real_faces(scene)
+    last = trajectory.num_frames - 1
+    frames = sorted({*range(_EVERY, last, _EVERY), last})
+    pairs = [find_crossings(np.asarray(trajectory.positions[frame]), faces).faces for frame in frames]
+    counts = [len(rows) for rows in pairs]
+    worst = int(np.argmax(counts))
+    found |= {"crossing_pairs": counts[worst], "crossing_share": float(np.mean(np.array(counts) > 0))}
+    if counts[worst]:
+        vertex = int(faces[pairs[worst][0, 0], 0])
+        found["worst_crossing"] = _place(frames[worst], vertex, scene, parts)
+    return found
+
+
+def _real_faces(scene: Scene) -> np.ndarray:
+    """Return the faces of the garment that are no padding."""
+    return np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
+
+
+def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any] | None:
+    """Return where cloth lies deepest behind cloth in frame 0, which self-contact has to bring back.
+
+    Args:
+        scene: The scene.
+        parts: Parts of the garment, which the place is named by.
+
+    Returns:
+        Plain values: pairs of faces that intersect, `depth_mm` of the deepest vertex, its `position_m` and its
+        place. None where nothing is behind a layer that it passed, or self-contact is not modelled.
+    """
+    if scene.self_contact is None:
+        return None
+    positions = np.asarray(scene.initial_state.position)
+    crossings = find_crossings(positions, _real_faces(scene))
+    vertex = int(np.argmax(crossings.depths))
+    if crossings.depths[vertex] == 0:
+        return None
+    return {
+        "crossing_pairs": len(crossings.faces),
+        "depth_mm": 1e3 * float(crossings.depths[vertex]),
+        "position_m": positions[vertex].tolist(),
+        "place": _place(0, vertex, scene, parts),
+    }
 
 
 def _garments(

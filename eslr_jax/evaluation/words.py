@@ -8,6 +8,7 @@ _STRETCH = 1.5  # of one face in a hundred, from which cloth looks stretched
 _TORN = 2.0  # of a single face, from which it looks torn
 _PENETRATION_MM = 5.0
 _THROUGH_MM = 1.0  # of skin in front of cloth
+_UNTANGLED_MM = 20.0  # behind other cloth, up to which self-contact pulls it back: `contact.crossing`
 _SLID_M = 0.25
 _LEFT = 0.75  # of the covered skin that cloth should still be near
 
@@ -32,6 +33,7 @@ def describe_report(report: dict[str, Any]) -> Words:
     if report["tolerance"] is not None:
         _describe_tolerance(report, words)
     _describe_penetration(report, words)
+    _describe_layers(report, words)
     _describe_place(report, words)
     stretch, most = report["max_principal_stretch"], report["p99_principal_stretch"]
     text = f"cloth is stretched by {100 * (most - 1):.0f} % (99 % of it), {100 * (stretch - 1):.0f} % at most"
@@ -72,6 +74,36 @@ def _describe_penetration(report: dict[str, Any], words: Words) -> None:
         )
     elif through is not None:
         words.good.append("no skin shows through the cloth")
+
+
+def _describe_layers(report: dict[str, Any], words: Words) -> None:
+    """Say whether cloth passes through cloth, where that is kept from it."""
+    pairs = report["crossing_pairs"]
+    if pairs:
+        place, share = _where(report["worst_crossing"]), report["crossing_share"]
+        words.warnings.append(
+            f"cloth passes through cloth: {pairs} pairs of faces intersect, {place}; "
+            f"in {100 * share:.0f} % of the frames that were looked at"
+        )
+    elif pairs is not None:
+        words.good.append("no cloth passes through cloth")
+
+
+def describe_start(crossing: dict[str, Any] | None) -> str | None:
+    """Return a warning where cloth begins deeper behind cloth than self-contact pulls it back; else None.
+
+    Args:
+        crossing: Of `report.start_crossing`.
+    """
+    if crossing is None or crossing["depth_mm"] <= _UNTANGLED_MM:
+        return None
+    x, y, z = crossing["position_m"]
+    place = f"at {x:.2f} {y:.2f} {z:.2f} m, {_where(crossing['place'])}"
+    return (
+        f"cloth begins {crossing['depth_mm']:.0f} mm behind cloth that it passes through, {place}, with "
+        f"{crossing['crossing_pairs']} pairs of faces. What is deeper than {_UNTANGLED_MM:.0f} mm may stay. "
+        "Begin with another frame (--start), lift the arms (--arm-abduction), or mend the garment there"
+    )
 
 
 def _describe_place(report: dict[str, Any], words: Words) -> None:

@@ -6,7 +6,8 @@ Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigid
 cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Peers: four
 of these by Newton's solvers (extra `peers`) and Blender's cloth (BLENDER_PYTHON, see peers.py), where they are
 installed. Drape: Cusick's coefficient of woven fabrics. Walk: millimetres by tolerance, timestep and mesh.
-Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png.
+Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png and
+known_drapes.png.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
-    """Draw the answers, the drapes' shadows and the walk's error; nothing without matplotlib."""
+    """Draw the answers, the walk's error and what was draped just now; nothing without matplotlib."""
     try:
         import matplotlib
     except ImportError:
@@ -56,29 +57,15 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, others, middle, right) = plt.subplots(
-        1, 4, figsize=(20, 8), layout="constrained", width_ratios=(1.2, 1, 1.2, 1)
-    )
+    if drapes:
+        _draw_drapes(drapes, path.with_name("known_drapes.png"))
+    figure, (left, others, right) = plt.subplots(1, 3, figsize=(16, 8), layout="constrained")
     for axes, part, limit, title in (
         (left, "answers", 5, "ours"),
         (others, "peers", 60, "other simulators"),
     ):
         _draw_errors(axes, result.get(part, []), limit)
         axes.set_title(title)
-    for place, one in enumerate(drapes):
-        rows, columns = one.outline.shape
-        x, y = (place % 3) * columns, -(place // 3) * 1.25 * rows
-        middle.imshow(~one.outline.T, extent=(x, x + columns, y, y + rows), cmap="gray")
-        middle.text(
-            x + columns / 2,
-            y - 0.1 * rows,
-            f"{one.fabric} {100 * one.coefficient:.0f} %",
-            ha="center",
-            size=7,
-        )
-    middle.autoscale()
-    middle.set_axis_off()
-    middle.set_title("Cusick's drape: shadows and coefficients")
     walk = result.get("walk", [])
     right.bar([f"{row['what']}: {row['setting']}" for row in walk], [row["rms_mm"] for row in walk])
     right.set_yscale("log")
@@ -88,11 +75,29 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     plt.close(figure)
 
 
+def _draw_drapes(drapes: list, path: Path) -> None:
+    """Draw the shadows of drapes with their coefficients."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
+    for place, one in enumerate(drapes):
+        rows, columns = one.outline.shape
+        x, y = (place % 3) * columns, -(place // 3) * 1.25 * rows
+        axes.imshow(~one.outline.T, extent=(x, x + columns, y, y + rows), cmap="gray")
+        label = f"{one.fabric} {100 * one.coefficient:.0f} %"
+        axes.text(x + columns / 2, y - 0.1 * rows, label, ha="center", size=7)
+    axes.autoscale()
+    axes.set_axis_off()
+    axes.set_title("Cusick's drape: shadows and coefficients")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
 def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
-    """Draw the errors of answers as bars, up to a limit [%]; beyond it as numbers. Red ones miss their bar."""
+    """Draw errors as bars, up to a limit [%]; then as numbers. Red misses its bar, grey has none."""
     errors = [100 * (row["found"] / row["known"] - 1) for row in rows]
     labels = [f"{row['case']}, {row['setting']}" for row in rows]
-    colors = ["#c33" if row["is_within"] is False else "#3b7" for row in rows]
+    colors = [{True: "#3b7", False: "#c33", None: "#999"}[row["is_within"]] for row in rows]
     axes.barh(labels, errors, color=colors)
     for place, error in enumerate(errors):
         if abs(error) > limit:

@@ -3,12 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_sheet
 from draped_ball import RADIUS, drifting_ball, square
+from hard_cases.build import make_cloth, make_scene
 
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.report import trajectory_report
+from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.evaluation.referee import judge
+from eslr_jax.evaluation.report import start_crossing, trajectory_report
 from eslr_jax.evaluation.wear import _sides, wear_report
-from eslr_jax.evaluation.words import describe_report
+from eslr_jax.evaluation.words import describe_report, describe_start
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import prepare_scene
@@ -74,6 +78,46 @@ def test_penetration_and_stretch_name_frame_part_and_vertex(worn):
     warnings = describe_report(report).warnings
     assert any("mm inside the body, frame 2 (0.07 s), part scarf, vertex 27" in text for text in warnings)
     assert any("cloth is stretched by" in text and "part scarf" in text for text in warnings)
+
+
+def rolled(flat):
+    """The square with one half turned about its middle, through the other half."""
+    x, y, z = flat.T
+    return np.where((x > 0)[:, None], np.stack([-x, y + 0.3 * (x - 0.06), z], axis=1), flat)
+
+
+def test_cloth_through_cloth_is_told_where_it_is_modelled(worn):
+    garment, poses, scene, trajectory, skinned = worn
+    layered = scene.replace(self_contact=default_capacity(len(skinned[0])))
+    crossed = skinned.copy()
+    crossed[2] = rolled(skinned[0] - skinned[0].mean(axis=0))
+    report = report_of((garment, poses, layered, trajectory, skinned), crossed)
+    assert report["crossing_pairs"] == judge(crossed[2], np.asarray(garment.faces)).cloth_cloth > 0
+    assert report["worst_crossing"]["frame"] == 2
+    words = describe_report(report)
+    assert any("cloth passes through cloth" in text and "part scarf" in text for text in words.warnings)
+    clean = report_of((garment, poses, layered, trajectory, skinned), skinned)
+    assert (clean["crossing_pairs"], clean["worst_crossing"]) == (0, None)
+    assert "no cloth passes through cloth" in describe_report(clean).good
+    assert report_of(worn, crossed)["crossing_pairs"] is None
+
+
+@pytest.mark.parametrize(("dent", "is_told"), [(0.0, False), (0.02, False), (0.05, True)])
+def test_a_start_with_cloth_deep_behind_cloth_is_told_with_its_place(dent, is_told):
+    """Two sheets a centimetre apart, the middle of the upper one pushed down through the lower one."""
+    flat, faces = make_sheet(13, 13, 0.02, jitter=0.1)
+    flat = flat - flat.mean(axis=0)
+    upper = flat + np.array([0.003, 0.01, 0.004])
+    upper[:, 1] -= dent * np.exp(-np.sum(upper[:, [0, 2]] ** 2, axis=1) / (2 * 0.04**2))
+    start, faces = np.concatenate([flat, upper]), np.concatenate([faces, faces + len(flat)])
+    scene = make_scene(make_cloth((start, faces), {}, allow_components=True), start, 2, self_contact=True)
+    parts = (np.repeat([0, 1], len(faces) // 2), ("skirt", "coat"))
+    text = describe_start(start_crossing(scene, parts=parts))
+    assert (text is not None) == is_told
+    if text is not None:
+        assert " pairs of faces" in text
+        assert "frame 0 (0.00 s), part coat" in text or "part skirt" in text
+    assert start_crossing(scene.replace(self_contact=None)) is None
 
 
 def test_cloth_that_slides_or_falls_is_told(worn):
