@@ -96,10 +96,8 @@ class ModelConfig:
             raise ValueError(
                 "hierarchical = true needs smoothing_steps = 0 and message_passing_steps in fives"
             )
-        if self.hierarchical and not (self.update_body and self.features == "hood" and self.edge_latents):
-            raise ValueError(
-                'hierarchical = true needs update_body = true, edge_latents = true and features = "hood"'
-            )
+        if self.hierarchical and not (self.update_body and self.edge_latents):
+            raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
         if self.output in ("descent", "subspace") and self.features != "gradient":
             raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
 

@@ -194,7 +194,13 @@ def plain_hood(params, graph, steps_per_stage):
     coarse = graph.globals["coarse"]
     level = np.max([(k + 1) * edges.is_kept for k, edges in enumerate(coarse)], axis=0)
     rows = {}
+    is_hood = "type_embedding" in weights
     for name, features in graph.nodes.items():
+        if not is_hood:
+            is_garment = name == "garment"
+            parts = [features, weights["level_embedding"][level]] if is_garment else [features]
+            rows[name] = plain_mlp(np.concatenate(parts, axis=1), weights[f"{name}_encoder"], np)
+            continue
         embeddings = (
             weights["type_embedding"][graph.globals[f"{name}_type"]],
             weights["level_embedding"][level if name == "garment" else np.zeros_like(level)],
@@ -205,7 +211,8 @@ def plain_hood(params, graph, steps_per_stage):
     for name, features in graph.edges.items():
         kind, num_static = ("world", 0) if name.startswith("world") else ("mesh", 3)
         encoder = weights[f"coarse_encoders_{name}" if name.startswith("coarse") else f"{kind}_encoder"]
-        rows[name] = plain_mlp(plain_normalize(features, statistics[kind], num_static, np), encoder, np)
+        features = plain_normalize(features, statistics[kind], num_static, np) if is_hood else features
+        rows[name] = plain_mlp(features, encoder, np)
     for stage, names in enumerate(HOOD_STAGES):
         joined = np.zeros(len(level), bool) | ("mesh" in names)
         for k, edges in enumerate(coarse):

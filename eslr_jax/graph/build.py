@@ -16,7 +16,7 @@ go with them: `Topology` names all entries of `globals`.
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import TypedDict, cast
 
 import jax.numpy as jnp
 import jraph
@@ -87,9 +87,9 @@ def build_frame_graph(
         nodes = {"garment": features.hood_garment_features(garment, material, inputs)}
         edges = {"mesh": features.hood_edge_features(garment, material, inputs, garment)}
     else:
-        spacing = topology["edge_length"] = features.mean_edge_length(garment)
+        spacing = topology["edge_length"] = features.mean_edge_length(garment, garment)
         nodes = {"garment": features.frame_node_features(garment, material, inputs, spacing)}
-        edges = {"mesh": features.frame_mesh_features(garment, inputs.position, spacing)}
+        edges = {"mesh": features.frame_mesh_features(garment, inputs.position, garment, spacing)}
     if config.hierarchical:
         if garment.coarse is None:
             raise ConfigError(
@@ -97,7 +97,13 @@ def build_frame_graph(
             )
         topology["coarse"] = garment.coarse
         for name, level in zip(COARSE_SETS, garment.coarse, strict=True):
-            edges[name] = features.hood_edge_features(garment, material, inputs, level)
+            edges[name] = (
+                features.hood_edge_features(garment, material, inputs, level)
+                if is_hood
+                else features.frame_mesh_features(
+                    garment, inputs.position, level, features.mean_edge_length(garment, level)
+                )
+            )
             senders[name], receivers[name] = level.senders, level.receivers
     if inputs.contacts is not None:
         mask = (jnp.abs(inputs.contacts.distances) <= config.world_edge_radius) & garment.vertex_mask
@@ -138,7 +144,11 @@ def build_refinement_graph(
     spacing = frame_graph.globals["edge_length"]
     guess = required(inputs, "guess")
     nodes = {"garment": features.refinement_node_features(garment, material, inputs, spacing)}
-    edges = {"mesh": features.refinement_mesh_features(garment, guess, spacing)}
+    edges = {"mesh": features.refinement_mesh_features(garment, guess, garment, spacing)}
+    coarse = cast(Topology, frame_graph.globals).get("coarse", ())
+    for name, level in zip(COARSE_SETS, coarse, strict=False):
+        length = features.mean_edge_length(garment, level)
+        edges[name] = features.refinement_mesh_features(garment, guess, level, length)
     if inputs.contacts is not None:
         world = features.refinement_world_features(guess, inputs.contacts)
         edges["world"] = _mask_rows(world, frame_graph.globals["world_mask"])

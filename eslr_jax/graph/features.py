@@ -104,11 +104,11 @@ def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.log(jnp.where(x > 0, x, 1))
 
 
-def mean_edge_length(garment: Garment) -> Float[Array, ""]:
-    """Return the mean length of the rest mesh's edges [m]."""
-    rest = _edge_vectors(garment, garment.rest_positions)
-    total = jnp.sum(jnp.where(garment.edge_mask, safe_norm(rest), 0))
-    return total / jnp.maximum(jnp.sum(garment.edge_mask.astype(rest.dtype)), 1)
+def mean_edge_length(garment: Garment, edges: Garment | CoarseEdges) -> Float[Array, ""]:
+    """Return the mean length at rest of the garment's edges, or of a coarse level's [m]."""
+    rest = _edge_vectors(edges, garment.rest_positions)
+    total = jnp.sum(jnp.where(edges.edge_mask, safe_norm(rest), 0))
+    return total / jnp.maximum(jnp.sum(edges.edge_mask.astype(rest.dtype)), 1)
 
 
 def timestep_input(timestep: Float[Array, ""]) -> Float[Array, ""]:
@@ -268,11 +268,21 @@ def refinement_node_features(
 
 
 def frame_mesh_features(
-    garment: Garment, position: Float[Array, "vertices 3"], edge_length: Float[Array, ""]
+    garment: Garment,
+    position: Float[Array, "vertices 3"],
+    edges: Garment | CoarseEdges,
+    edge_length: Float[Array, ""],
 ) -> Float[Array, "edges 8"]:
-    """Return sender minus receiver 3, the same at rest 3, rest length less one, in mesh spacings; strain."""
-    current = _edge_vectors(garment, position)
-    rest = _edge_vectors(garment, garment.rest_positions)
+    """Return sender minus receiver 3, the same at rest 3, rest length less one, in mean lengths; strain.
+
+    Args:
+        garment: Rest mesh.
+        position: Positions [m].
+        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
+        edge_length: Their mean length at rest [m].
+    """
+    current = _edge_vectors(edges, position)
+    rest = _edge_vectors(edges, garment.rest_positions)
     rest_length = safe_norm(rest, keepdims=True)
     return jnp.concatenate(
         [
@@ -286,11 +296,14 @@ def frame_mesh_features(
 
 
 def refinement_mesh_features(
-    garment: Garment, guess: Float[Array, "vertices 3"], edge_length: Float[Array, ""]
+    garment: Garment,
+    guess: Float[Array, "vertices 3"],
+    edges: Garment | CoarseEdges,
+    edge_length: Float[Array, ""],
 ) -> Float[Array, "edges 4"]:
-    """Return sender minus receiver at the guess 3, in mesh spacings, and its strain."""
-    rest = _edge_vectors(garment, garment.rest_positions)
-    vector = _edge_vectors(garment, guess)
+    """Return sender minus receiver at the guess 3, in mean lengths, and its strain; see `frame_mesh_features`."""
+    rest = _edge_vectors(edges, garment.rest_positions)
+    vector = _edge_vectors(edges, guess)
     return jnp.concatenate(
         [clip(vector / edge_length), _strain(vector, safe_norm(rest, keepdims=True))], axis=1
     )

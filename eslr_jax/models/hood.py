@@ -9,6 +9,9 @@ Two things differ from the published network. Every garment vertex has a body ro
 point of the body, where HOOD's garment vertices share the nearest body vertex. And the centre of the levels
 is not random.
 
+With features "gradient" the level's embedding stands behind a vertex's features, and body rows have an encoder
+of their own.
+
 Source: Grigorev, Black and Hilliges, "HOOD" (2023); its `models/core/postcvpr.py`.
 """
 
@@ -23,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import ModelConfig
 from eslr_jax.graph import features
-from eslr_jax.graph.build import COARSE_SETS, Rows, feature_sizes
+from eslr_jax.graph.build import COARSE_SETS, Rows, feature_sizes, join_features
 from eslr_jax.graph.operators import (
     MeshTables,
     coarse_tables,
@@ -103,17 +106,20 @@ class HoodLayer(nn.Module):
 
 
 class HierarchicalNetwork(EncodeProcessDecode):
-    """The whole network, from a graph's features to an acceleration per vertex."""
+    """The whole network, from a graph's features to a vector per vertex."""
 
     def setup(self) -> None:
         """Declare embeddings, encoders, stages and decoder."""
         config, sizes = self.config, feature_sizes(self.config)
-        size, types = config.latent_size, features.NUM_TYPES
+        size, types = config.latent_size, features.NUM_TYPES if self.config.features == "hood" else 0
 
         def encoder(input_size: int) -> MLP:
             return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
 
-        self.type_embedding = self.param("type_embedding", kernel_spread(types), (types, types))
+        if types:
+            self.type_embedding = self.param("type_embedding", kernel_spread(types), (types, types))
+        else:
+            self.body_encoder = encoder(sizes["body"])
         self.level_embedding = self.param(
             "level_embedding", kernel_spread(NUM_LEVELS), (NUM_LEVELS, NUM_LEVELS)
         )
@@ -129,24 +135,47 @@ class HierarchicalNetwork(EncodeProcessDecode):
         self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
     ) -> Float[Array, "vertices outputs"]:
         """Return the raw output for a whole graph; see `EncodeProcessDecode`."""
+        return self.process(graph, places, statistics)
+
+    def encode_frame(self, graph: jraph.GraphsTuple) -> jraph.GraphsTuple:
+        """Return the graph: this network encodes all of it in every refinement step."""
+        return graph
+
+    def encode_refinement(self, encoded: jraph.GraphsTuple, changing: jraph.GraphsTuple) -> jraph.GraphsTuple:
+        """Return the graph with the features of a refinement step; see `EncodeProcessDecode`."""
+        return join_features(encoded, changing)
+
+    def process(
+        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
+    ) -> Float[Array, "vertices outputs"]:
+        """Encode a whole graph, run all stages and decode."""
         nodes, edges = self.normalized(graph, statistics)
-        encoded = self.garment_encoder(nodes["garment"])
+        vertices = garment = self.garment_encoder(nodes["garment"])
         latents = {name: self.coarse_encoders[name](edges[name]) for name in COARSE_SETS}
         latents["mesh"] = self.mesh_encoder(edges["mesh"])
         world = None
         if "world" in edges:
             toward, reverse = (self.world_encoder(edges[name]) for name in ("world", "world_reverse"))
-            world = WorldLatents(self.garment_encoder(nodes["body"]), toward, reverse)
+            is_hood = self.config.features == "hood"
+            body_encoder = self.garment_encoder if is_hood else self.body_encoder
+            world = WorldLatents(body_encoder(nodes["body"]), toward, reverse)
         tables = {name: coarse_tables(graph, level) for level, name in enumerate(COARSE_SETS)}
-        tables["mesh"] = mesh_tables(graph, encoded.dtype)
-        garment = encoded
+        tables["mesh"] = mesh_tables(graph, vertices.dtype)
         for sets, layers in zip(STAGES, self.stages, strict=True):
             kept = kept_vertices(graph, sets)[:, None]
-            mask = jnp.where(kept, world_mask(graph, encoded.dtype), 0.0)
+            mask = jnp.where(kept, world_mask(graph, vertices.dtype), 0.0)
             state = StageLatents(garment, {name: latents[name] for name in sets}, world)
             state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
-        return self.decode(garment, encoded, places)
+        return self.decode(garment, vertices, places)
+
+    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
+        """Return node and edge features as the encoders read them, with the embedding of a vertex's level."""
+        nodes, edges = super().normalized(graph, statistics)
+        if self.config.features == "hood":
+            return nodes, edges
+        levels = self.level_embedding.astype(nodes["garment"].dtype)[vertex_levels(graph)]
+        return {**nodes, "garment": jnp.concatenate([nodes["garment"], levels], axis=1)}, edges
 
     def with_types(self, graph: jraph.GraphsTuple) -> Rows:
         """Return the node features with the embeddings of vertex type and level behind the velocity."""

@@ -29,6 +29,7 @@ from eslr_jax.models.smoothing import EncodedVertices, SmoothingNetwork
 from eslr_jax.types import CoarseEdges, Garment
 
 Params = dict[str, Any]
+AnyEncoded = Encoded | EncodedVertices | jraph.GraphsTuple  # the hierarchical network encodes in every step
 
 PAPER = ModelConfig()
 SMALL = ModelConfig(
@@ -86,6 +87,9 @@ MODELS: dict[str, ModelConfig] = {
     "lsdmp-5": _without_attention(SHALLOW),
     "gsa-5": _without_smoothing(SHALLOW),
     "mgn-5": _without_attention(_without_smoothing(SHALLOW)),
+    "hood-5": dataclasses.replace(
+        _without_attention(_without_smoothing(SHALLOW)), hierarchical=True, update_body=True
+    ),
     "mgn-16": dataclasses.replace(_without_attention(_without_smoothing(SHALLOW)), message_passing_steps=16),
     "eslr-small": SMALL,
     "lsdmp-small": _without_attention(SMALL),
@@ -139,7 +143,7 @@ def apply_model(
 
 def encode_frame(
     config: ModelConfig, params: Params, graph: jraph.GraphsTuple, garment: Garment
-) -> Encoded | EncodedVertices:
+) -> AnyEncoded:
     """Return what all refinement steps of a frame share.
 
     Args:
@@ -154,7 +158,7 @@ def encode_frame(
 def apply_refinement(
     config: ModelConfig,
     params: Params,
-    encoded: Encoded | EncodedVertices,
+    encoded: AnyEncoded,
     changing: jraph.GraphsTuple,
     garment: Garment,
 ) -> Float[Array, "vertices outputs"]:

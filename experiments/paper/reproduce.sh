@@ -4,7 +4,7 @@
 #   experiments/paper/reproduce.sh [full|small|tshirt] [OUT]
 #
 # full: the paper's sizes at 4k vertices, by HOOD's recipe; needs a GPU with the extra `cuda`, and days.
-# small: five layers at 1k vertices, two seeds; some four hours of one CPU core.
+# small: five layers at 1k vertices, two seeds; some eight hours of one CPU core.
 # tshirt: the systems that are made for one garment, PBNS to MAT; less than an hour of one CPU core.
 # Run it again to go on where it stopped. STEPS=2 shortens every training, to see that all works.
 set -euo pipefail
@@ -50,7 +50,7 @@ elif [[ $size == full ]]; then
   done
   vertices=4k
 else
-  for model in mgn-5 lsdmp-5 gsa-5 eslr-5; do
+  for model in mgn-5 hood-5 lsdmp-5 gsa-5 eslr-5; do
     for seed in 0 1; do
       train "$model-s$seed" 1k "model.base=$model" "seed=$seed"
     done

@@ -97,7 +97,9 @@ def read_system(name: str) -> System:
         raise SystemExit(f"{name}: no change {change!r}; there are {', '.join((*CONTROLS, *EMBEDDINGS))}")
     cost = {"parameters": count_parameters(params)}
     hours = model_record(network).get("core_hours")
-    return System(params, config, options, control, cost if hours is None else {**cost, "core_hours": hours})
+    if hours is not None and control not in CONTROLS_OF_WEIGHTS:  # those show nothing of the training
+        cost["core_hours"] = hours
+    return System(params, config, options, control, cost)
 
 
 def _read_trained(kind: str, folder: str) -> System:

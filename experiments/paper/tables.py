@@ -1,24 +1,29 @@
 """The paper's tables: every system beside its controls, the solver and the optimum.
 
     python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
-        [--models LABEL=NAME,NAME ...] [--controls] [--keep] [--clips NAME ...] [--frames 100] [--smoke]
+        [--models LABEL=NAME,NAME ...] [--train] [--controls] [--keep] [--clips NAME ...] [--frames 100] [--smoke]
 
-native_garments (I, II): six garments on unseen clips. unseen_garments (III): garments that no network has seen,
-with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a Mixamo
-character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them. model_cost (V):
-parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks.
+native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
+seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
+Mixamo character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them.
+model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
 bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the gap
 from the optimum's states, and the energies of free rollouts; a second row says it of the same network untrained.
 --controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
+
+--train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
+paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
+A table is never written over one of another setting: give another --out.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -39,6 +44,7 @@ from rollouts import (
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.assets.load import START_MODEL, default_model
 from eslr_jax.body.motion import pose_body
+from eslr_jax.cli.train import train
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.models.registry import MODELS, count_parameters, init_model
@@ -48,7 +54,9 @@ from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 
 # Trained alike, applied once a frame (configs/paper/1k.toml); the rest have recipes of their own.
-DEEP = ("mgn-5=mgn-5-correction", "eslr-5=eslr-5-correction")
+DEEP = tuple(f"{name}-5={name}-5-correction" for name in ("mgn", "lsdmp", "gsa", "eslr"))
+CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
+RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
 BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20")
 SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
@@ -60,11 +68,28 @@ _TURNS = 7  # in which latencies are measured
 Rows = dict[str, tuple[str, ...]]
 
 
+class Training(NamedTuple):
+    """A network to train."""
+
+    model: str  # name in the registry
+    seed: int
+    recipe: Path
+    folder: Path
+
+    def changes(self) -> tuple[str, ...]:
+        """Return what the run changes in its recipe."""
+        key = "model.base" if self.recipe.stem == "1k" else "model"
+        return (f"{key}={self.model}", f"seed={self.seed}")
+
+
 def main() -> None:
     """Measure and write."""
     parser = arguments(__doc__)
     parser.add_argument("--tables", nargs="+", default=TABLES, choices=TABLES)
     parser.add_argument("--models", nargs="+", metavar="LABEL=NAME,NAME", help="rows")
+    parser.add_argument(
+        "--train", action="store_true", help="train the rows that are named by an architecture"
+    )
     parser.add_argument("--controls", action="store_true", help="rows for each network's controls")
     parser.add_argument(
         "--keep", action="store_true", help="keep the rows that a table of the same setting has"
@@ -80,6 +105,10 @@ def main() -> None:
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
     }
+    if chosen.train:
+        rows, trainings = plan_trainings(rows, chosen.out)
+        for training in trainings:
+            run_training(training, ("steps=2",) if chosen.smoke else ())
     for name in chosen.tables:
         if name == "model_cost":
             result = cost_table(rows, chosen.vertices, chosen.smoke)
@@ -89,10 +118,42 @@ def main() -> None:
             if chosen.smoke:
                 setting = setting._replace(garments=setting.garments[:1])
             file = chosen.out / f"{name}.json"
-            known = json.loads(file.read_text()) if chosen.keep and file.exists() else {}
+            found = json.loads(file.read_text()) if file.exists() else {}
+            check_setting(found, setting, file)
+            known = found if chosen.keep else {}
             has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
             for result in energy_table(with_changes(rows, name, has_controls), setting, known):
                 write(result, file)
+
+
+def plan_trainings(rows: Rows, out: Path) -> tuple[Rows, list[Training]]:
+    """Return the rows with exported files for the architectures among their names, and how these are made.
+
+    Args:
+        rows: Names by label.
+        out: Folder of the tables; a network's own is MODEL-sSEED in it.
+    """
+    changed, trainings = {}, []
+    for label, names in rows.items():
+        files = []
+        for seed, name in enumerate(names):
+            recipe = RECIPES.get(MODELS[name].latent_size) if name in MODELS else None
+            folder = out / f"{name}-s{seed}"
+            if recipe:
+                trainings.append(Training(name, seed, CONFIGS / f"{recipe}.toml", folder))
+            files.append(str(folder / "model.npz") if recipe else name)
+        changed[label] = tuple(files)
+    return changed, trainings
+
+
+def run_training(training: Training, changes: tuple[str, ...]) -> None:
+    """Train a network as `eslr train` does, or go on with it; nothing is done if it is trained."""
+    if (training.folder / "model.npz").exists():
+        return
+    if (training.folder / "checkpoints").exists():
+        train(training.folder, resume=True)
+    else:
+        train(training.folder, training.recipe, (*training.changes(), *changes))
 
 
 def table_setting(
@@ -154,6 +215,23 @@ def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterato
             row = parts["mean"][with_control]
             row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
         yield {**shared, **parts}
+
+
+def check_setting(found: dict[str, Any], setting: Setting, file: Path) -> None:
+    """Refuse to write over a table of other garments, clips, frames or vertices.
+
+    Raises:
+        SystemExit: Says which, and what to give.
+    """
+    garments = found.get("garments", [])
+    rows = garments.values() if isinstance(garments, dict) else [garments] if garments else []
+    asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
+    differs = [name for name, value in asked.items() if found.get(name, value) != value]
+    differs += ["garments"] if any(set(row) != set(setting.garments) for row in rows) else []
+    if differs:
+        raise SystemExit(
+            f"{file} is of other {', '.join(differs)}; give another --out, or move the file away"
+        )
 
 
 def rows_of_setting(known: dict[str, Any], setting: Setting) -> dict[str, dict[str, Any]]:

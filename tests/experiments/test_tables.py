@@ -1,9 +1,14 @@
 """Tables of the paper that grow row by row."""
 
 import json
+from pathlib import Path
 
-from paper.rollouts import Setting
-from paper.tables import rows_of_setting
+import pytest
+from paper.rollouts import Setting, read_system
+from paper.tables import DEEP, check_setting, plan_trainings, rows_of_setting
+
+from eslr_jax.assets.catalog import asset_names
+from eslr_jax.training.recipe import load_recipe
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
 ROW = {"stretch": 0.1}
@@ -27,3 +32,49 @@ def test_rows_of_another_setting_are_dropped():
         SETTING._replace(frames=50),
     ):
         assert not any(rows_of_setting(json.loads(json.dumps(TABLE)), other).values())
+
+
+def test_a_table_of_another_setting_is_not_written_over():
+    check_setting({}, SETTING, Path("table.json"))
+    check_setting(json.loads(json.dumps(TABLE)), SETTING, Path("table.json"))
+    for other, name in (
+        (SETTING._replace(garments=("tshirt",)), "garments"),
+        (SETTING._replace(clips=("cmu_016_29",)), "clips"),
+        (SETTING._replace(frames=50), "frames"),
+    ):
+        with pytest.raises(SystemExit, match=f"other {name}; give another --out"):
+            check_setting(json.loads(json.dumps(TABLE)), other, Path("table.json"))
+
+
+def test_controls_of_weights_show_no_training_cost():
+    assert read_system("mgn-5-correction").cost["core_hours"] > 0
+    for control in ("untrained", "no_decoder"):
+        assert "core_hours" not in read_system(f"mgn-5-correction~{control}").cost
+
+
+def test_default_rows_have_every_bundled_network_of_five_layers():
+    bundled = {name for name in asset_names("model") if name.endswith("-5-correction")}
+    assert {row.split("=")[1] for row in DEEP} == bundled
+
+
+def test_rows_of_architectures_are_trained_by_their_recipe(tmp_path):
+    rows = {
+        "mgn": ("mgn-5", "mgn-5"),
+        "hood": ("hood",),
+        "eslr-small": ("eslr-small",),
+        "optimum": ("optimum",),
+    }
+    changed, trainings = plan_trainings(rows, tmp_path)
+    assert changed["mgn"] == tuple(str(tmp_path / f"mgn-5-s{seed}" / "model.npz") for seed in (0, 1))
+    assert changed["eslr-small"] == ("eslr-small",)
+    assert changed["optimum"] == ("optimum",)
+    assert [(run.model, run.seed, run.recipe.stem) for run in trainings] == [
+        ("mgn-5", 0, "1k"),
+        ("mgn-5", 1, "1k"),
+        ("hood", 0, "full-size"),
+    ]
+    recipes = [
+        load_recipe(run.recipe, dict(text.split("=") for text in run.changes()[:1])) for run in trainings
+    ]
+    assert [recipe.model.latent_size for recipe in recipes] == [64, 64, 128]
+    assert recipes[0].model.output == "correction"

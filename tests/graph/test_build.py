@@ -106,7 +106,7 @@ def test_gradient_node_features(scene, gradient_graph):
     garment, _, inputs = (to_float64(tree) for tree in scene)
     rest = garment.rest_positions
     spacing = np.mean(np.linalg.norm(rest[garment.senders] - rest[garment.receivers], axis=1))
-    np.testing.assert_allclose(mean_edge_length(scene[0]), spacing, rtol=1e-6)
+    np.testing.assert_allclose(mean_edge_length(scene[0], scene[0]), spacing, rtol=1e-6)
     cut = lambda x: np.clip(x, -5, 5)  # noqa: E731
     rows = []
     for v, normal in enumerate(numpy_normals(garment.faces, inputs.position)):
@@ -127,7 +127,7 @@ def test_gradient_node_features(scene, gradient_graph):
 
 def test_gradient_edge_features(scene, gradient_graph):
     garment, _, inputs = (to_float64(tree) for tree in scene)
-    spacing = float(mean_edge_length(scene[0]))
+    spacing = float(mean_edge_length(scene[0], scene[0]))
     rows = []
     for sender, receiver in zip(garment.senders, garment.receivers, strict=True):
         rest = garment.rest_positions[sender] - garment.rest_positions[receiver]

@@ -13,16 +13,17 @@ from reference_models import make_scene, plain_hood, quick_jit, to_float64
 from eslr_jax.config import ModelConfig, from_dict
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.coarse import add_coarse_edges
-from eslr_jax.graph.build import build_graph
+from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
 from eslr_jax.models import registry
 from eslr_jax.models.registry import MODELS, apply_model, count_parameters, init_model
 from eslr_jax.types import tree_cast
 
 SMALL = dataclasses.replace(MODELS["hood"], message_passing_steps=5, latent_size=8, remat="none")
+CORRECTING = dataclasses.replace(SMALL, features="gradient", output="correction")
 
 
-def weights():
-    params, generator = init_model(SMALL), np.random.default_rng(1)
+def weights(config=SMALL):
+    params, generator = init_model(config), np.random.default_rng(1)
     scrambled = jax.tree.map(
         lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), params["params"]
     )
@@ -51,6 +52,45 @@ def test_network_matches_numpy(body):
     params, graph, actual = run(weights(), *coarse_scene(body=body))
     expected = plain_hood(*(to_float64(tree) for tree in (params, graph)), 1)
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_network_with_gradient_features_matches_numpy():
+    params, scene = weights(CORRECTING), coarse_scene()
+
+    @quick_jit
+    def both(params, garment, material, inputs):
+        graph = build_graph(garment, material, inputs, CORRECTING)
+        frame = build_frame_graph(garment, material, inputs, CORRECTING)
+        changing = build_refinement_graph(garment, material, inputs, frame)
+        encoded = registry.encode_frame(CORRECTING, params, frame, garment)
+        return (
+            graph,
+            apply_model(CORRECTING, params, graph, garment),
+            registry.apply_refinement(CORRECTING, params, encoded, changing, garment),
+        )
+
+    graph, actual, stepwise = both(params, *scene)
+    expected = plain_hood(*(to_float64(tree) for tree in (params, graph)), 1)
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_array_equal(stepwise, actual)
+
+
+def test_gradient_features_of_a_coarse_level_match_numpy():
+    garment, material, inputs = coarse_scene()
+    graph = quick_jit(build_graph, static_argnums=3)(garment, material, inputs, CORRECTING)
+    for name, level in zip(("coarse0", "coarse1"), garment.coarse[:2], strict=True):
+        is_real = np.asarray(level.edge_mask)
+        senders, receivers = np.asarray(level.senders)[is_real], np.asarray(level.receivers)[is_real]
+        rest, now, guess = (
+            x[senders] - x[receivers]
+            for x in to_float64((garment.rest_positions, inputs.position, inputs.guess))
+        )
+        length = np.linalg.norm(rest, axis=1, keepdims=True)
+        unit = length.mean()
+        strains = [(np.linalg.norm(x, axis=1, keepdims=True) / length - 1) / 0.1 for x in (now, guess)]
+        columns = [now / unit, rest / unit, length / unit - 1, strains[0], guess / unit, strains[1]]
+        expected = np.clip(np.concatenate(columns, axis=1), -5, 5)
+        np.testing.assert_allclose(graph.edges[name][is_real], expected, atol=5e-4)
 
 
 @pytest.mark.slow
