@@ -1,5 +1,6 @@
 """Files of other programs, written in exactly their layout, for the readers' tests."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -142,6 +143,30 @@ def smpl_model(body, rng):
         "shapedirs": rng.normal(0.0, 0.01, (len(positions), 3, 10)),
         "posedirs": rng.normal(0.0, 0.002, (len(positions), 3, 207)),
     }
+
+
+def write_smpl(path, mesh):
+    """Write a body on SMPL's 24 joints as a SMPL file, without blend shapes.
+
+    Args:
+        path: The pickle.
+        mesh: A RiggedMesh, its joints in SMPL's order.
+    """
+    count = len(mesh.positions)
+    weights = np.zeros((count, 24))
+    np.add.at(weights, (np.arange(count)[:, None], mesh.skin_indices), mesh.skin_weights)
+    tree = np.array([mesh.skeleton.parents, np.arange(24)], np.int64)
+    tree[0, 0] = 2**32 - 1
+    values = {
+        "v_template": mesh.positions,
+        "f": mesh.faces.astype(np.uint32),
+        "weights": weights,
+        "J_regressor": joint_regressor(mesh.positions, mesh.skeleton.rest_positions),
+        "kintree_table": tree,
+        "shapedirs": np.zeros((count, 3, 10)),
+        "posedirs": np.zeros((count, 3, 207)),
+    }
+    path.write_bytes(pickle.dumps(values, protocol=2))
 
 
 def joint_regressor(positions, joints):
@@ -325,20 +350,29 @@ def write_bvh(path, motion, *, names=None, unit=1.0, axes=None, order="ZXY"):
     path.write_text("\n".join(lines) + "\n")
 
 
-def write_walker(character, shirt, body):
-    """Write the bundled body as a character of Mixamo becomes in Blender, walking, and its T-shirt as OBJ."""
+def write_walker(character, shirt, body, *, size=1.0):
+    """Write the bundled body as a character of Mixamo becomes in Blender, walking, and its T-shirt as OBJ.
+
+    Args:
+        character: The GLB file.
+        shirt: The OBJ file [m].
+        body: The bundled body.
+        size: Factor on all lengths of the character.
+    """
     motion = skeleton_motion(load_motion(), body)
+    skeleton = body_skeleton(body)
+    skeleton = dataclasses.replace(skeleton, rest_positions=size * skeleton.rest_positions)
     order = np.argsort(-np.asarray(body.skin_weights), axis=1)[:, :4]
     weights = np.take_along_axis(np.asarray(body.skin_weights, np.float64), order, axis=1)
     write_character(
         character,
-        body_skeleton(body),
-        np.asarray(body.rest_positions, np.float64),
+        skeleton,
+        size * np.asarray(body.rest_positions, np.float64),
         np.asarray(body.faces),
         weights / weights.sum(axis=1, keepdims=True),
         np.take_along_axis(np.asarray(body.skin_indices), order, axis=1),
         names=[f"mixamorig:{MIXAMO_FROM_CMU.get(name, name)}" for name in body.joint_names],
-        motion=(motion.rotations[:8], motion.positions[:8]),
+        motion=(motion.rotations[:8], size * motion.positions[:8]),
         frames=Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix(),
         fps=motion.fps,
     )

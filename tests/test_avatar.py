@@ -6,7 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from formats import write_walker
+from formats import write_smpl, write_walker
+from other_bodies import smpl_female
 
 from eslr_jax.assets import load_motion
 from eslr_jax.io.mesh_sequence import obj_text
@@ -132,3 +133,38 @@ def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
     assert json.loads((tmp_path / "map.json").read_text()) == found
     assert found["LeftArm"] == "mixamorig:LeftArm"
     assert found["Spine1"] == "mixamorig:Spine2"
+
+
+@pytest.mark.slow
+def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(tmp_path, body):
+    write_walker(tmp_path / "giant.glb", tmp_path / "shirt.obj", body, size=118.0)
+    out = tmp_path / "out"
+    result = eslr(
+        "simulate", "--body", tmp_path / "giant.glb", "--simulator", "physics", "--frames", 3, "--iterations", 20,
+        "--no-pictures", "--json", "--out", out,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "taken to be in cm" in result.stderr
+    report = json.loads(result.stdout)
+    assert report["finite"]
+    assert report["motion"].endswith("giant.glb")
+    run = read_trajectory(out / "trajectory.npz")
+    assert 1.5 < np.ptp(run.body.positions[-1][:, 1]) < 2.2
+    assert report["max_principal_stretch"] < 2.0
+    assert report["penetration_max_mm"] < 1.0
+
+
+@pytest.mark.slow
+def test_the_default_shirt_is_carried_to_a_smpl_file(tmp_path):
+    write_smpl(tmp_path / "smpl.pkl", smpl_female())
+    result = eslr(
+        "simulate", "--body", tmp_path / "smpl.pkl", "--simulator", "physics", "--frames", 3, "--iterations", 20,
+        "--no-pictures", "--json", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["finite"]
+    assert report["garment"] == "tshirt"
+    assert report["max_principal_stretch"] < 2.0
+    assert report["penetration_max_mm"] < 1.0
+    assert "tshirt carried to " in result.stderr

@@ -89,6 +89,14 @@ def test_links_between_pages_lead_somewhere():
     assert [(page, link) for page, link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "guides").glob("*.md")), ids=name)
+def test_every_guide_has_one_picture_and_ends_in_what_can_go_wrong(page):
+    text = page.read_text()
+    (picture,) = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
+    assert (page.parent / picture).exists()
+    assert re.findall(r"^## (.+)$", text, flags=re.M)[-1] == "What can go wrong"
+
+
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory, body):
     """A folder with the files of the guides: a shirt, a clip, a character with a jacket, and recipes."""

@@ -49,6 +49,18 @@ class Player:
         """Return how far the cloth is in front of the page's middle [m]."""
         return self.positions()[:, 2].mean()
 
+    def first_frames(self, count=12):
+        """Return where the cloth is after so many frames, one by one from the first."""
+        from eslr_jax.viewer.live import _restart
+
+        self.live.controls["playing"].value = False
+        time.sleep(0.5)
+        _restart(self.live)
+        for _ in range(count):
+            self.live.asked.set()
+            self.wait(1)
+        return self.positions()
+
     def shown(self):
         return [mesh for _, mesh in self.live.cast.drawn]
 
@@ -199,16 +211,31 @@ def test_page_sliders_change_the_cloth(player, page):
     enter(page, "towards, deg", 180)
     player.until(lambda: player.forward() < before - 0.003, seconds=240)
     enter(page, "speed, m/s", 0)
+    player.until(lambda: controls["wind"].value == 0, seconds=240)
+
+
+def test_page_fabric_changes_the_cloth(player, page):
+    controls = player.live.controls
+    page.get_by_label("keep up with real time").uncheck()  # else the clock decides about the iterations
+    enter(page, "tolerance, %", 0.1)
+    player.until(lambda: controls["tolerance"].value == 0.1 and not controls["keep_up"].value, seconds=240)
+    plain = player.first_frames()
+    np.testing.assert_allclose(player.first_frames(), plain, atol=1e-6)
     for label, name in (("weight x", "density"), ("stretch x", "stretch"), ("bending x", "bending")):
-        enter(page, label, 3)
-        player.until(lambda name=name: controls[name].value == 3, seconds=240)
+        enter(page, label, 8)
+        player.until(lambda name=name: controls[name].value == 8, seconds=240)
+        assert np.abs(player.first_frames() - plain).max() > 1e-3, name
+        enter(page, label, 1)
+        player.until(lambda name=name: controls[name].value == 1, seconds=240)
     choose(page, "fabric", "denim")
     player.until(lambda: controls["fabric"].value == "denim", seconds=240)
-    player.wait(3)
-    for label in ("weight x", "stretch x", "bending x"):
-        enter(page, label, 1)
+    assert np.abs(player.first_frames() - plain).max() > 1e-3
     choose(page, "fabric", "cotton")
-    player.wait(3)
+    player.until(lambda: controls["fabric"].value == "cotton", seconds=240)
+    controls["playing"].value = True
+    page.get_by_label("keep up with real time").check()
+    enter(page, "tolerance, %", 1)
+    player.until(lambda: controls["tolerance"].value == 1 and controls["keep_up"].value, seconds=240)
 
 
 def test_page_pauses_steps_and_restarts(player, page):
@@ -232,6 +259,11 @@ def test_page_keeps_up_or_is_exact(player, page):
     player.until(lambda: not player.live.controls["keep_up"].value, seconds=240)
     player.wait(12)
     assert "within 1 % of the optimum" in player.live.controls["status"].content
+    enter(page, "tolerance, %", 6.5)
+    player.until(lambda: "within 6.5 % of the optimum" in player.live.controls["status"].content, seconds=240)
+    bound = float(player.live.controls["status"].content.split("gap below ")[1].split(" %")[0])
+    assert 0 < bound <= 6.5
+    enter(page, "tolerance, %", 1)
     page.get_by_label("keep up with real time").check()
 
 
@@ -287,6 +319,16 @@ def test_page_changes_the_body_s_shape(player, page):
     choose(page, "motion", "deepmimic_jump")
     player.until(lambda: player.live.cast.choice.motion == "deepmimic_jump")
     player.wait(3)
+
+
+def test_page_takes_finer_cloth(player, page):
+    choose(page, "vertices", "4k")
+    player.until(lambda: player.live.cast.choice.vertices == "4k")
+    player.wait(2)
+    assert len(player.positions()) == 4000
+    choose(page, "vertices", "1k")
+    player.until(lambda: player.live.cast.choice.vertices == "1k")
+    player.wait(2)
 
 
 def test_page_dresses_in_an_outfit_of_two_colours(player, page):

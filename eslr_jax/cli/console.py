@@ -45,11 +45,15 @@ def open_browser(url: str) -> bool:
 
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Any]:
-    """Show a progress bar on stderr; yields a function of (done, total)."""
+    """Show a progress bar on stderr; yields a function of (done, total), and of a new label if there is one."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=stderr, transient=False) as bars:
         task = bars.add_task(label, total=total)
-        yield lambda done, total: bars.update(task, completed=done, total=total)
+
+        def advance(done: int, total: int, now: str = label) -> None:
+            bars.update(task, completed=done, total=total, description=now)
+
+        yield advance
 
 
 def use_compile_cache() -> None:

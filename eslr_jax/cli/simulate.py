@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
 _SETTLE = 15  # frames: a T-shirt's start is stretched by 1.87 at an armpit, and by 1.2 after these
+_LONG = 5.0  # [s] of waiting for the compiler, from which on it is told
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
 
@@ -255,6 +256,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     if num_vertices >= LARGE:
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
     whole, timing, scene = _run(method, scene, done)
+    if timing.compile_s > _LONG:
+        say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not")
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
     count = kept.num_frames - settle
     try:
@@ -354,10 +357,14 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
     if method.choice is not None and method.budget_ms is not None:
         pace = keep_budget(method.choice, method.budget_ms)
     words = "stopping after these frames; Ctrl-C again stops at once and loses them"
-    with Interruption(lambda: say(words)) as stop, progress("simulating", scene.num_frames - 1) as advance:
+    # The first frames compile; the bar counts the time.
+    with (
+        Interruption(lambda: say(words)) as stop,
+        progress("compiling a frame", scene.num_frames - 1) as advance,
+    ):
 
         def on_frames(count: int, total: int) -> None:
-            advance(count, total)
+            advance(count, total, "simulating")
             stop.begin()  # before the first frames are done there is nothing to keep
 
         return run(
@@ -396,6 +403,7 @@ def _measure(
     from eslr_jax.scene.build import skin_garment
 
     trajectory, timing, scene = simulation
+    parts = stored.face_parts, stored.part_names
     skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
     has_stopped = np.asarray(trajectory.iterations[1:]) < method.config.iterations
     return {
@@ -404,11 +412,11 @@ def _measure(
         **trajectory_report(
             trajectory,
             scene,
-            parts=(stored.face_parts, stored.part_names),
+            parts=parts,
             poses=poses,
             outfit=stored.outfit,
         ),
-        **wear_report(trajectory.positions, scene.garment, skinned, poses),
+        **wear_report(trajectory.positions, scene.garment, skinned, poses, parts=parts),
         "choice": None if method.choice is None else dataclasses.asdict(method.choice),
         "tolerance": method.tolerance,
         "within_tolerance": None if method.tolerance is None else float(np.mean(has_stopped)),

@@ -78,7 +78,7 @@ def score_trajectory(
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:
         skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-        report |= wear_report(positions, scene.garment, skinned, poses)
+        report |= wear_report(positions, scene.garment, skinned, poses, parts=parts)
     ends = jax.device_get(trajectory_gap(trajectory, scene, every=every))
     is_face = np.asarray(scene.garment.rest_areas) > 0
     stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))[:, is_face]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 from numpy.typing import NDArray
 
+from eslr_jax.evaluation.report import Parts
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
 from eslr_jax.types import BodyMotion, Garment
@@ -26,6 +27,8 @@ def wear_report(
     garment: Garment,
     skinned: Float[ArrayLike, "frames vertices 3"],
     poses: BodyMotion,
+    *,
+    parts: Parts = (None, ()),
 ) -> dict[str, Any]:
     """Measure how a garment sits on a moving body.
 
@@ -40,17 +43,19 @@ def wear_report(
         garment: The garment in the body's rest pose.
         skinned: The garment carried by the joints [m], shape [frames, vertices, 3].
         poses: The body in the same frames.
+        parts: Parts of the garment; where skin shows most, the cloth's part is named.
 
     Returns:
         Plain values: `coverage`, the least share of covered skin that cloth is still within 10 cm of;
-        `skin_through_mm` and `skin_through_share` of the covered skin with `worst_skin_through`, its frame, time
-        and body vertex; `slide_m`, the farthest that the garment's centre is from its skinned place, with
+        `skin_through_mm` and `skin_through_share` of the covered skin with `worst_skin_through`, its frame, time,
+        body vertex and part; `slide_m`, the farthest that the garment's centre is from its skinned place, with
         `worst_slide`; `below_feet_at`, the first frame in which all cloth is below the body, or None.
     """
     is_real = np.asarray(garment.vertex_mask)
     cloth, carried = np.asarray(positions)[:, is_real], np.asarray(skinned)[:, is_real]
     areas = np.asarray(garment.vertex_areas)[is_real]
-    faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
+    is_face = np.asarray(garment.rest_areas) > 0
+    faces = np.asarray(garment.faces)[is_face]
     body, skin_faces = np.asarray(poses.positions), np.asarray(poses.faces)
     timestep = float(poses.timestep)
     slides = np.linalg.norm(np.average(cloth - carried, axis=1, weights=areas), axis=-1)
@@ -74,13 +79,14 @@ def wear_report(
     if not len(covered):
         return result
     frames = sorted({*range(0, len(cloth), _EVERY), len(cloth) - 1})
-    through, shares = [], []
+    through, shares, fronts = [], [], []
     for frame in frames:
         outward = vertex_normals(body[frame], skin_faces)[covered]
         side, distance, nearest = _sides(body[frame, covered], outward, cloth[frame], faces, hem)
         is_own = np.linalg.norm(rest[faces[nearest]].mean(axis=1) - unposed[covered], axis=1) < _OWN
         through.append(np.where(is_own & (distance < _POKING), np.maximum(side, 0.0), 0.0))
         shares.append(float(np.mean(distance < _NEAR)))
+        fronts.append(nearest)
     depth = np.stack(through)
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     result |= {
@@ -93,8 +99,15 @@ def wear_report(
             "frame": frames[row],
             "time_s": frames[row] * timestep,
             "body_vertex": int(covered[column]),
+            "part": _part(np.flatnonzero(is_face)[fronts[row][column]], parts),
         }
     return result
+
+
+def _part(face: int, parts: Parts) -> str | None:
+    """Return the name of a face's part, if parts are known."""
+    owners, names = parts
+    return names[owners[face]] if owners is not None and names else None
 
 
 def _sides(

@@ -82,7 +82,7 @@ def solve(
     iterations = jnp.asarray(iterations)
     if not jnp.issubdtype(iterations.dtype, jnp.integer):
         raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
-    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance))
+    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance, start.point.value.dtype))
     return _solve(problem, jax.lax.stop_gradient(start), limits, memory)
 
 

@@ -34,7 +34,9 @@ def report_of(worn, positions):
     rest = {"error": None, "tolerance": 0.01, "within_tolerance": 1.0}
     parts = (np.zeros(len(garment.faces), int), ("scarf",))
     return (
-        rest | trajectory_report(moved, scene, parts=parts) | wear_report(positions, garment, skinned, poses)
+        rest
+        | trajectory_report(moved, scene, parts=parts)
+        | wear_report(positions, garment, skinned, poses, parts=parts)
     )
 
 
@@ -58,7 +60,7 @@ def test_skin_through_cloth_is_measured_and_told(worn):
     top = np.asarray(worn[1].rest_positions)[report["worst_skin_through"]["body_vertex"]]
     np.testing.assert_allclose(top, [0, RADIUS, 0], atol=1e-6)
     assert any(
-        "skin shows through the cloth, by up to 6.0 mm, frame 2 (0.07 s)" in text
+        "skin shows through the cloth, by up to 6.0 mm, frame 2 (0.07 s), part scarf" in text
         for text in describe_report(report).warnings
     )
 

@@ -10,7 +10,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-_PROGRESS = re.compile(r"simulating\D.*?(\d+)/(\d+)")
+_PROGRESS = re.compile(r"(?:compiling|simulating)\D.*?(\d+)/(\d+)")
 _PATIENCE = 10.0  # [s] that a cancelled process gets to end by itself
 
 
