@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -106,19 +108,46 @@ Vector3 = tuple[Array, Array, Array]
 """Component arrays x, y, z of many vectors: on a CPU XLA vectorises these, but not a trailing axis of three."""
 
 
-def dot3(a: Vector3, b: Vector3) -> Array:
+_Component = TypeVar("_Component", Array, np.ndarray)  # NumPy's on the host, in float64
+_Vector = tuple[_Component, _Component, _Component]
+
+
+def dot3(a: _Vector[_Component], b: _Vector[_Component]) -> _Component:
     """Return the dot products of vectors given by components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross3(a: Vector3, b: Vector3) -> Vector3:
+def cross3(a: _Vector[_Component], b: _Vector[_Component]) -> _Vector[_Component]:
     """Return the cross products of vectors given by components."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def sub3(a: Vector3, b: Vector3) -> Vector3:
+def sub3(a: _Vector[_Component], b: _Vector[_Component]) -> _Vector[_Component]:
     """Return the differences of vectors given by components."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def pierces(
+    start: _Vector[_Component], end: _Vector[_Component], triangle: Sequence[_Vector[_Component]]
+) -> _Component:
+    """Return which segments pass through which triangles; one that only touches the plane does not.
+
+    Args:
+        start: First ends of the segments, by components.
+        end: Second ends.
+        triangle: Three corners, each by components.
+    """
+    a, b, c = triangle
+    normal = cross3(sub3(b, a), sub3(c, a))
+    before, after = dot3(sub3(start, a), normal), dot3(sub3(end, a), normal)
+    is_inside = before * after < 0
+    span = before - after
+    share = before / (span + (span == 0).astype(span.dtype))
+    x, y, z = (u + share * (v - u) for u, v in zip(start, end, strict=True))
+    for first, second in ((a, b), (b, c), (c, a)):
+        inwards = dot3(cross3(sub3(second, first), sub3((x, y, z), first)), normal)
+        is_inside = is_inside & (inwards >= 0)
+    return is_inside
 
 
 def take3(a: Vector3, rows: Int[Array, ...]) -> Vector3:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, vertex_normals
+from eslr_jax.numerics import Vector3, pierces, safe_normalize, vertex_normals
 from eslr_jax.types import Garment
 
 # Of a direction along a normal (cosine) at rest, below which it says nothing. A T-shirt's sleeve and trunk, which
@@ -76,7 +76,7 @@ def _are_crossed(
     face = _corners(x[:, corners.T[:, :, None]])
     ends = garment.neighbors[vertices]  # [pairs, degree], padded with the vertex itself
     is_apart = ~jnp.any(ends[:, :, None] == corners[:, None, :], axis=2)
-    pierced = is_apart & _pierces(tuple(x[:, vertices[:, None]]), tuple(x[:, ends]), face)
+    pierced = is_apart & pierces(tuple(x[:, vertices[:, None]]), tuple(x[:, ends]), face)
     slots = garment.face_incidence[vertices]
     around = garment.faces[slots % garment.faces.shape[0]]  # [pairs, degree, 3]
     is_real = slots < garment.faces.size
@@ -85,7 +85,7 @@ def _are_crossed(
     for k in range(3):
         first, second = corners[:, k, None], corners[:, (k + 1) % 3, None]
         is_apart = is_real & ~jnp.any((around == first[:, None]) | (around == second[:, None]), axis=2)
-        pierced = is_apart & _pierces(face[k], face[(k + 1) % 3], faces)
+        pierced = is_apart & pierces(face[k], face[(k + 1) % 3], faces)
         crossed = crossed | jnp.any(pierced, axis=1)
     return crossed
 
@@ -93,18 +93,3 @@ def _are_crossed(
 def _corners(places: Float[Array, "3 corners ..."]) -> list[Vector3]:
     """Return the corners of triangles, each by components."""
     return [tuple(places[:, k]) for k in range(places.shape[1])]  # type: ignore[misc]
-
-
-def _pierces(start: Vector3, end: Vector3, corners: list[Vector3]) -> Bool[Array, ...]:
-    """Return which segments pass through which triangles."""
-    a, b, c = corners
-    normal = cross3(sub3(b, a), sub3(c, a))
-    before, after = dot3(sub3(start, a), normal), dot3(sub3(end, a), normal)
-    is_inside = before * after < 0
-    span = before - after
-    share = before / jnp.where(span == 0, 1.0, span)
-    x, y, z = (u + share * (v - u) for u, v in zip(start, end, strict=True))
-    for first, second in ((a, b), (b, c), (c, a)):
-        inwards = dot3(cross3(sub3(second, first), sub3((x, y, z), first)), normal)
-        is_inside = is_inside & (inwards >= 0)
-    return is_inside

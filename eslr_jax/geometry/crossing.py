@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.topology import unique_edges, vertex_components
+from eslr_jax.numerics import pierces
 
 _AT_ONCE = 200_000  # pairs of faces that are compared at a time; bounds memory
 
@@ -82,27 +83,13 @@ def _piercing_edges(
         for owner, target in ((one, other), (other, one)):
             for k in range(3):
                 ends = faces[owner][:, [k, (k + 1) % 3]]
-                hits = _pierces(positions[ends], corners[target])
+                start, end = positions[ends[:, 0]].T, positions[ends[:, 1]].T
+                hits = pierces(
+                    tuple(start), tuple(end), [tuple(corner) for corner in corners[target].T.swapaxes(0, 1)]
+                )
                 found.append((owner[hits], ends[hits], target[hits]))
     owners, ends, pierced = zip(*found, strict=True)
     return np.concatenate(owners), np.concatenate(ends), np.concatenate(pierced)
-
-
-def _pierces(
-    edges: Float[np.ndarray, "pairs 2 3"], triangles: Float[np.ndarray, "pairs 3 3"]
-) -> Bool[np.ndarray, " pairs"]:
-    """Return which edges pass through which triangles."""
-    start, end = edges[:, 0], edges[:, 1]
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    before = np.sum((start - triangles[:, 0]) * normal, axis=1)
-    after = np.sum((end - triangles[:, 0]) * normal, axis=1)
-    is_through = before * after < 0
-    span = before - after
-    place = start + (before / np.where(span == 0, 1.0, span))[:, None] * (end - start)
-    for k in range(3):
-        side, offset = triangles[:, (k + 1) % 3] - triangles[:, k], place - triangles[:, k]
-        is_through &= np.sum(np.cross(side, offset) * normal, axis=1) >= 0
-    return is_through
 
 
 def _regions(
