@@ -66,7 +66,8 @@ def use_compile_cache() -> None:
     with contextlib.suppress(OSError):
         cache.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        # The sixty small programs of a start take a second together.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
