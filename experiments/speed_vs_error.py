@@ -2,6 +2,7 @@
 
     python experiments/speed_vs_error.py                 # 1k and 4k, about half an hour on two cores
     python experiments/speed_vs_error.py --sizes 10k     # joins the sizes that the file already holds
+    python experiments/speed_vs_error.py --sizes 50k --models smooth-small --garments tshirt --frames 6
     python experiments/speed_vs_error.py --peers         # with Newton's solvers, which the extra `peers` installs
     python experiments/speed_vs_error.py --smoke --out DIR
 
@@ -138,18 +139,20 @@ def main() -> None:
     )
     parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
     parser.add_argument("--models", nargs="*", default=list(asset_names("model")))
+    parser.add_argument("--garments", nargs="+", default=list(GARMENTS))
+    parser.add_argument("--frames", type=int, default=40, help="of every garment; gaps are measured in all")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
     arguments = parser.parse_args()
-    garments, frames, rollout_frames = GARMENTS, 40, 60
+    garments, frames, rollout_frames = arguments.garments, arguments.frames, 60
     solver_counts, network_counts = ROLLOUTS
     if arguments.smoke:
-        garments, frames, rollout_frames = GARMENTS[:1], 8, 8
+        garments, frames, rollout_frames = garments[:1], 8, 8
         arguments.sizes, arguments.models = ["1k"], [START_MODEL]
         solver_counts = network_counts = (10,)  # which the calibration has compiled
     path = arguments.out / "speed_vs_error.json"
-    result: dict = {"clip": CLIP, "garments": garments, "device": device_name(), "peers": [], "sizes": {}}
+    result: dict = {"clip": CLIP, "device": device_name(), "peers": [], "sizes": {}}
     if path.exists() and not arguments.smoke:
         older = json.loads(path.read_text())
         result |= {name: older[name] for name in ("peers", "sizes")}
@@ -177,10 +180,12 @@ def main() -> None:
             ]
             for name, counts in (
                 (SOLVER, solver_counts),
-                *((m, network_counts) for m in arguments.models[:1]),
+                *((model, network_counts) for model in arguments.models[:1]),
             )
         }
         result["sizes"][size] = {
+            "garments": garments,
+            "frames": frames,
             "methods": measured,
             "costs": [
                 {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
