@@ -119,8 +119,23 @@ def pose_body(
         )
     if arm_abduction:
         rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
+    positions, transforms = turn_joints(body, rotations, translations)
+    return body_motion(body, positions, transforms, fps=fps)
+
+
+def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """Return the vertices of a body whose joints are turned [m], and the map of every joint.
+
+    Args:
+        body: A rigged body.
+        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
+        translations: Root positions [m], shape [frames, 3].
+
+    Returns:
+        Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4].
+    """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    return body_motion(body, _skin_body(body, rotations, transforms), transforms, fps=fps)
+    return _skin_body(body, rotations, transforms), transforms
 
 
 def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:

@@ -13,17 +13,23 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.motion import Motion
-from eslr_jax.body.retarget import blend_rotations, count_resampled
+from eslr_jax.body.motion import Motion, turn_joints
+from eslr_jax.body.retarget import blend_rotations, count_resampled, local_rotations
 from eslr_jax.errors import MotionError
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.skeleton import SkeletonMotion
-from eslr_jax.types import BodyMotion
+from eslr_jax.types import Body, BodyMotion
 
 _START_SECONDS = 1.0  # in which a pose that does not belong to the motion is looked for
 _JUMP = 0.08  # of the skeleton's size: least step of a joint that counts as a jump
 _FAR_MORE = 3.0  # times any other step
 _STEPS_AFTER = 5  # of a motion, by which a jump is judged
+_HELD = 10  # frames of settling that hold the first pose
+_FEWEST_MOVING = (
+    15  # frames in which limbs may come from the rest pose: an arm falls by 8 degrees in one at most
+)
+# Vertices [m] and map of every joint, by frames.
+_Track = tuple[Float[Array, "frames vertices 3"], Float[Array, "frames joints 3 4"]]
 _BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
 
 
@@ -134,15 +140,20 @@ def check_length(poses: BodyMotion) -> None:
         )
 
 
-def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
+def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) -> BodyMotion:
     """Return a moving body with frames before its first, in which a garment comes to rest on it.
 
-    The body holds its first pose. It glides over the floor at the speed of the motion's first step, so that
-    cloth which has settled is as fast as the body when the motion begins.
+    The limbs come from the rest pose of the body, for which its garments are made, and the last frames hold the
+    first pose. A garment that begins on the first pose has its sleeves in its trunk where arms hang down. All
+    the while the body glides over the floor at the speed of the motion's first step, so that cloth which has
+    settled is as fast as the body when the motion begins.
 
     Args:
         poses: The body in motion.
-        num_frames: Number of frames to put before it; drop as many from the result.
+        num_frames: Number of frames to put before it; drop as many from the result. With fewer than 25 there is
+            no time for the limbs, and all hold the first pose.
+        body: Whose motion it is. Without it, and for a mesh in motion, which has no skeleton, all hold the first
+            pose.
 
     Raises:
         MotionError: The number is negative, or the motion has fewer than two frames.
@@ -150,23 +161,46 @@ def with_settling(poses: BodyMotion, num_frames: int) -> BodyMotion:
     check_length(poses)
     if num_frames < 0:
         raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
-    positions, transforms = _glide(poses.positions, poses.joint_transforms, num_frames)
+    num_moving, limbs = num_frames - _HELD, None
+    if num_moving >= _FEWEST_MOVING and body is not None and body.parents.count(-1) == 1:
+        limbs = _limbs_from_rest(body, np.asarray(poses.joint_transforms[0], np.float64), num_moving)
+    positions, transforms = _glide((poses.positions, poses.joint_transforms), limbs, num_frames)
     return poses.replace(positions=positions, joint_transforms=transforms)
 
 
+def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
+    """Return frames in which limbs come from the rest pose of a body to a pose; they start and end slowly.
+
+    Args:
+        body: A rigged body.
+        pose: Map of every joint, shape [joints, 3, 4].
+        num_frames: Number of frames.
+    """
+    root = body.parents.index(-1)
+    last = local_rotations(pose[None, :, :, :3], body.parents)
+    time = np.arange(num_frames)[:, None, None] / num_frames
+    rotations = time * time * (3 - 2 * time) * last
+    rotations[:, root] = last[:, root]
+    place = pose[root] @ [*np.asarray(body.joint_rest_positions)[root], 1.0]
+    return turn_joints(body, rotations, np.tile(place, (num_frames, 1)))
+
+
 @partial(jax.jit, static_argnames="num_frames")  # outside jit, every operation is a program of its own
-def _glide(
-    positions: Float[Array, "frames vertices 3"],
-    transforms: Float[Array, "frames joints 3 4"],
-    num_frames: int,
-) -> tuple[Float[Array, "more vertices 3"], Float[Array, "more joints 3 4"]]:
-    """Return vertices [m] and joints of a body that glides up to its first frame, and goes on from there."""
-    step = (positions[1] - positions[0]).mean(axis=0)
+def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
+    """Return a body that glides up to its first frame, in the first of limbs and then in that frame's pose.
+
+    Where a limb would be below the lowest point of that pose, the body is lifted.
+    """
+    before = tuple(jnp.repeat(track[:1], num_frames, axis=0) for track in motion)
+    if limbs is not None:
+        before = tuple(held.at[: len(moved)].set(moved) for held, moved in zip(before, limbs, strict=True))
+    step = (motion[0][1] - motion[0][0]).mean(axis=0)
     shifts = jnp.arange(-num_frames, 0, dtype=step.dtype)[:, None] * (step * jnp.array([1.0, 0.0, 1.0]))[None]
-    held = jnp.repeat(transforms[:1], num_frames, axis=0)
+    lift = jnp.maximum(motion[0][0, :, 1].min() - before[0][:, :, 1].min(axis=1, initial=jnp.inf), 0.0)
+    shifts = shifts.at[:, 1].set(lift)[:, None]
     return (
-        jnp.concatenate([positions[:1] + shifts[:, None], positions]),
-        jnp.concatenate([held.at[..., 3].add(shifts[:, None]), transforms]),
+        jnp.concatenate([before[0] + shifts, motion[0]]),
+        jnp.concatenate([before[1].at[..., 3].add(shifts), motion[1]]),
     )
 
 

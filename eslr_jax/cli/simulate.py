@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
-_SETTLE = 15  # frames: a T-shirt's start is stretched by 1.87 at an armpit, and by 1.2 after these
+_SETTLE = 35  # frames, in 25 of which the limbs come from the rest pose
 _LONG = 5.0  # [s] of waiting for the compiler, from which on it is told
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
@@ -111,8 +111,8 @@ def simulate(
         betas: Shape of a SMPL body, in standard deviations.
         start: Where to begin in the motion: a frame, such as 375, or a time, such as 12.5s.
         loop: How long to repeat the motion: frames or a time, such as 30s.
-        settle: Frames in which the garment settles on the first pose before frame 0; they are not kept. By
-            default 15, and 0 for a network alone.
+        settle: Frames before frame 0 in which the garment is put on: limbs come from the body's rest pose, and
+            the last 10 hold the first pose. They are not kept. By default 35, and 0 for a network alone.
         integrator: How time is stepped: bdf2 keeps swinging cloth in motion; euler, the paper's, loses two thirds
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
         substeps: Shorter steps in which every frame is simulated; 2 keeps layers apart that swing fast against
@@ -222,7 +222,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         material = garment_material(options.fabric, cloth, stored)
         check_skin(label, cloth, rig)
         settle = (_SETTLE if method.config.iterations else 0) if options.settle is None else options.settle
-        settling = with_settling(poses, settle)
+        settling = with_settling(poses, settle, rig)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
         modelled = SceneOptions(
             self_contact=wanted_self_contact(options),

@@ -113,6 +113,26 @@ def test_settling_holds_the_first_pose_at_the_speed_of_the_first_step(walk):
         with_settling(walk, -1)
 
 
+def test_limbs_come_from_the_rest_pose_while_a_garment_settles(body, walk):
+    settled = with_settling(walk, 30, body)
+    np.testing.assert_array_equal(settled.positions[30:], walk.positions)
+    # The last third holds the first pose, as without a body.
+    np.testing.assert_allclose(settled.positions[20:], with_settling(walk, 30).positions[20:], atol=1e-6)
+
+    def shape(positions):
+        """Return lengths between vertices, which no motion of the whole body changes."""
+        picked = np.asarray(positions)[:: len(positions) // 40]
+        return np.linalg.norm(picked[:, None] - picked[None], axis=-1)
+
+    np.testing.assert_allclose(shape(settled.positions[0]), shape(body.rest_positions), atol=1e-4)
+    steps = np.linalg.norm(np.diff(settled.positions, axis=0), axis=-1).max(axis=1)
+    assert steps[:30].max() < 0.1, "limbs jump"
+    lowest = np.asarray(settled.positions[:31, :, 1].min(axis=1))
+    assert lowest.min() >= lowest[30] - 1e-6, "a foot dips into the ground"
+    # Too few frames for the limbs.
+    np.testing.assert_array_equal(with_settling(walk, 24, body).positions, with_settling(walk, 24).positions)
+
+
 def test_a_body_that_is_too_fast_is_named_with_its_frame(walk):
     assert find_fast_frame(walk, 0.3) is None
     check_speed(walk, 0.3)
