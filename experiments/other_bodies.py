@@ -23,7 +23,7 @@ from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.joints import find_parts
 from eslr_jax.body.motion import Motion, obstacle_surface, pose_body, shape_body, still_motion
 from eslr_jax.body.rig import body_skeleton, make_body
-from eslr_jax.body.timing import with_settling
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.body.units import UnitsWarning
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.metrics import measure_frames
@@ -297,7 +297,6 @@ GARMENTS = (
 )  # fmt: skip
 CLIP = "cmu_016_32"  # a walk
 FRAMES = 100  # of it
-SETTLE = 15  # frames on the walk's first pose, as `eslr simulate` has them
 STILL, RAISE = 50, 25  # frames that the body stands, and in which it lifts its arms to its own rest pose
 STANDING = 45.0  # [degrees] of the arms below the horizontal, as garments are cut
 SMOKE_FRAMES = STILL  # of the walk
@@ -322,7 +321,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
     surface = obstacle_surface(body)  # bodies of one topology then share a program
     options = SceneOptions(has_skin=True, integrator="bdf2", ground="off")
-    still = pose_body(body, standing_motion(body, SETTLE + frames), arm_abduction=0.0)
+    still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames), arm_abduction=0.0)
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
     for name, cloth in zip(garments, cloths, strict=True):
         is_real = np.asarray(cloth.vertex_mask)
@@ -333,7 +332,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
                 config=SimConfig(iterations=ITERATIONS),
                 raises=False,
             )
-            for poses in (still, with_settling(walk, SETTLE))
+            for poses in (still, with_settling(walk, SETTLE_FRAMES, body))
         ]
         at_rest = jax.device_get(measure_frames(runs[0].trajectory.positions, runs[0].scene))
         trajectory, scene = last_frames(runs[1].trajectory, runs[1].scene, frames)

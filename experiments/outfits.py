@@ -17,7 +17,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.motion import pose_body
-from eslr_jax.body.timing import with_settling
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.evaluation.report import environment
@@ -33,7 +33,6 @@ RESULTS = Path(__file__).parent / "results"
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
 CLIP = "cmu_016_32"  # of the test split
 FRAMES = 100
-SETTLE = 15  # frames
 EVERY = 5  # frames between those that are judged
 CONFIG = SimConfig(iterations=300, tolerance=0.01)
 
@@ -65,11 +64,12 @@ def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1)
         substeps: Of every frame.
     """
     outfit = combine_garments([load(name) for name in names], names)
-    poses = with_settling(pose_body(load_body(), load_motion(CLIP), num_frames=frames), SETTLE)
+    body = load_body()
+    poses = with_settling(pose_body(body, load_motion(CLIP), num_frames=frames), SETTLE_FRAMES, body)
     options = SceneOptions(has_skin=True, integrator="bdf2", substeps=substeps)
     run = simulate(None, prepare_scene(prepare_stored(outfit), poses, options=options), config=CONFIG)
     garment = np.repeat([0, 1], list(outfit.metadata["outfit"].values()))[outfit.faces[:, 0]]
-    positions = np.asarray(run.trajectory.positions)[SETTLE:][::EVERY]
+    positions = np.asarray(run.trajectory.positions)[SETTLE_FRAMES:][::EVERY]
     counts = [
         int(np.sum(garment[pairs[:, 0]] != garment[pairs[:, 1]]))
         for pairs in (intersecting_pairs(position, outfit.faces) for position in positions)

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
-from eslr_jax.body.timing import with_settling
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.cli.console import use_compile_cache
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs, judge
@@ -45,7 +45,7 @@ RESULTS = Path(__file__).parent / "results"
 PARTS = ("skin", "time")
 GARMENTS = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
 INTEGRATORS: tuple[Integrator, ...] = ("bdf2", "euler")
-FPS, FRAMES, SETTLE = 30.0, 60, 15
+FPS, FRAMES = 30.0, 60
 EVERY = 5  # frames between those that are judged
 PINCH = 0.05  # [m] from the cloth, within which the body may not intersect itself
 DEFAULT = SimConfig(iterations=100, tolerance=0.01)  # of the command line
@@ -73,7 +73,7 @@ def measure_skin(garments: Sequence[str], vertices: Any, clips: Sequence[str], f
     """Yield a row for every garment, clip and integrator."""
     body = load_body()
     motions = [
-        with_settling(pose_body(body, load_motion(clip), fps=FPS, num_frames=frames), SETTLE)
+        with_settling(pose_body(body, load_motion(clip), fps=FPS, num_frames=frames), SETTLE_FRAMES, body)
         for clip in clips
     ]
     scenes = make_scenes([load_garment(name, vertices=vertices) for name in garments], motions)
@@ -96,7 +96,7 @@ def measure_skin(garments: Sequence[str], vertices: Any, clips: Sequence[str], f
 def _own_crossings(scene: Scene, frames: int) -> dict[int, np.ndarray]:
     """Return where the body intersects itself, centres of faces [m], by the frames that are judged."""
     found = {}
-    for frame in range(SETTLE, SETTLE + frames, EVERY):
+    for frame in range(SETTLE_FRAMES, SETTLE_FRAMES + frames, EVERY):
         body, faces = _body(scene, frame)
         found[frame] = body[faces[np.unique(intersecting_pairs(body, faces))]].mean(axis=1)
     return found
@@ -146,8 +146,8 @@ def measure_time(
         return make_scenes(cloths, motions)
 
     usual = [pose_body(body, load_motion(clip), fps=FPS, num_frames=frames) for clip in clips]
-    settling = make_scenes(cloths, [with_settling(poses, SETTLE) for poses in usual])
-    starts = [simulate(None, scene, config=FINE).trajectory.positions[SETTLE] for scene in settling]
+    settling = make_scenes(cloths, [with_settling(poses, SETTLE_FRAMES, body) for poses in usual])
+    starts = [simulate(None, scene, config=FINE).trajectory.positions[SETTLE_FRAMES] for scene in settling]
 
     def run(integrator: Integrator, steps: int) -> Iterator[tuple[np.ndarray, float]]:
         for scene, start in zip(posed(steps), starts, strict=True):

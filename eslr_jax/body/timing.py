@@ -24,6 +24,7 @@ _START_SECONDS = 1.0  # in which a pose that does not belong to the motion is lo
 _JUMP = 0.08  # of the skeleton's size: least step of a joint that counts as a jump
 _FAR_MORE = 3.0  # times any other step
 _STEPS_AFTER = 5  # of a motion, by which a jump is judged
+SETTLE_FRAMES = 35  # in which a garment is put on: 25 for the limbs, and those that hold the first pose
 _HELD = 10  # frames of settling that hold the first pose
 _FEWEST_MOVING = (
     15  # frames in which limbs may come from the rest pose: an arm falls by 8 degrees in one at most

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 _ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
 _BEHIND_NETWORK = 10  # likewise behind a network
-_SETTLE = 35  # frames, in 25 of which the limbs come from the rest pose
 _LONG = 5.0  # [s] of waiting for the compiler, from which on it is told
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
@@ -183,7 +182,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
 
     from eslr_jax.assets import load_garment_file, prepare_stored
     from eslr_jax.body.motion import first_poses
-    from eslr_jax.body.timing import check_speed, with_settling
+    from eslr_jax.body.timing import SETTLE_FRAMES, check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.evaluation.report import start_crossing
     from eslr_jax.evaluation.words import describe_start
@@ -221,7 +220,9 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         cloth = prepare_stored(stored, name=label, **method.garment_options)
         material = garment_material(options.fabric, cloth, stored)
         check_skin(label, cloth, rig)
-        settle = (_SETTLE if method.config.iterations else 0) if options.settle is None else options.settle
+        settle = options.settle
+        if settle is None:
+            settle = SETTLE_FRAMES if method.config.iterations else 0
         settling = with_settling(poses, settle, rig)
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
         modelled = SceneOptions(

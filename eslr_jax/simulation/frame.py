@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.contact.ground import ground_contacts
-from eslr_jax.contact.nearest import find_both_sides
+from eslr_jax.contact.nearest import are_pinched, find_both_sides
 from eslr_jax.contact.self_contact import FacePairs, find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
 from eslr_jax.physics.air import air_flow
@@ -116,6 +116,8 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         pairs = find_self_contacts(
             state.position, guess, scene.garment, scene.self_contact, pieces=scene.pieces
         )
+        if problem.body is not None:
+            pairs = _without_pinched(pairs, problem.body)
         problem = problem.replace(layers=_layers(problem, pairs))
     return problem
 
@@ -162,6 +164,9 @@ def _body_contact(
     if body.has_skin:
         cloth = (problem.position, problem.inertial_guess)
         skin = find_skin_contacts(cloth, (step.start, step.end), nearest, body.surface, garment)
+        # Between two limbs nobody sees skin, and rows of both would pull the cloth to both sides.
+        pinched = are_pinched(nearest, opposing)
+        skin = skin.replace(is_near=skin.is_near & ~jnp.any(pinched[skin.corners], axis=1))
     if body.is_sharp:
         pairs = find_tip_contacts(
             problem.position, problem.inertial_guess, *step, body.surface.patch_vertices, garment
@@ -187,6 +192,16 @@ def _layers(problem: FrameProblem, pairs: FacePairs) -> SelfContact:
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
     height, _ = pair_heights(problem.position, pairs)
     return SelfContact(pairs, thickness + jnp.minimum(height, 0.0))
+
+
+def _without_pinched(pairs: FacePairs, body: BodyContact) -> FacePairs:
+    """Return pairs of layers without those where the body leaves them no room.
+
+    Thighs of a body pass through each other. Layers between them can't keep apart, and would tear.
+    """
+    pinched = are_pinched(body.nearest, body.opposing)
+    is_free = ~(pinched[pairs.vertices] | jnp.any(pinched[pairs.corners], axis=1))
+    return pairs.replace(side=jnp.where(is_free, pairs.side, 0.0))
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:
