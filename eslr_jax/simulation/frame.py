@@ -116,8 +116,6 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         pairs = find_self_contacts(
             state.position, guess, scene.garment, scene.self_contact, pieces=scene.pieces
         )
-        if problem.body is not None:
-            pairs = _without_pinched(pairs, problem.body)
         problem = problem.replace(layers=_layers(problem, pairs))
     return problem
 
@@ -192,16 +190,6 @@ def _layers(problem: FrameProblem, pairs: FacePairs) -> SelfContact:
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
     height, _ = pair_heights(problem.position, pairs)
     return SelfContact(pairs, thickness + jnp.minimum(height, 0.0))
-
-
-def _without_pinched(pairs: FacePairs, body: BodyContact) -> FacePairs:
-    """Return pairs of layers without those where the body leaves them no room.
-
-    Thighs of a body pass through each other. Layers between them can't keep apart, and would tear.
-    """
-    pinched = are_pinched(body.nearest, body.opposing)
-    is_free = ~(pinched[pairs.vertices] | jnp.any(pinched[pairs.corners], axis=1))
-    return pairs.replace(side=jnp.where(is_free, pairs.side, 0.0))
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:

@@ -13,6 +13,7 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.collision import skin_diagonal, skin_energy
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
 
 STIFFNESS, THICKNESS = 3.5e7, 2e-3  # [J/m^5], [m]
@@ -24,6 +25,23 @@ def scene_of(*, has_skin, num_frames):
     small = positions * 0.2 + np.array([0.0, 0.8 * RADIUS, 0.0]), faces
     options = SceneOptions(has_skin=has_skin)
     return prepare_scene(square(side=6), drifting_ball(num_frames, speed=0.0, mesh=small), options=options)
+
+
+@pytest.mark.parametrize(("room", "is_skin"), [(0.004, False), (0.03, True)])
+def test_cloth_that_limbs_pinch_has_no_rows_of_skin(room, is_skin):
+    """Rows of both limbs would pull it to both sides, and stretch what is beside them."""
+    positions, faces = ball(15, 24)
+    upper = positions + np.array([0.0, 2 * RADIUS + room, 0.0])
+    both = np.concatenate([positions, upper]), np.concatenate([faces, faces + len(positions)])
+    scene = prepare_scene(
+        square(side=9), drifting_ball(2, speed=0.0, mesh=both), options=SceneOptions(has_skin=True)
+    )
+    between = scene.garment.rest_positions.at[:, 1].set(RADIUS + room / 2)
+    scene = scene.replace(initial_state=scene.initial_state.replace(position=between))
+    skin = first_problem(scene).body.skin
+    middle = 4 * 9 + 4
+    rows = jnp.any((skin.corners == middle) & (skin.weights > 0.2), axis=1)
+    assert bool(jnp.any(rows & skin.is_near)) == is_skin
 
 
 def height_over_top(position):
