@@ -16,6 +16,7 @@ import numpy as np
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.extras import require
 from eslr_jax.fit.outfit import wear_together
@@ -172,7 +173,7 @@ def one_frame(live: Live) -> bool:
     live.asked.clear()
     if live.state is None:
         live.state, live.step = cast.stage.scene.initial_state, 0
-    frames = there_and_back(live.step, cast.stage.scene.num_frames)
+    frames = _frames_of(live.step, cast)
     fabric = read_fabric(live.controls)
     with (
         contextlib.nullcontext()
@@ -235,12 +236,17 @@ def _busy(live: Live, text: str) -> Iterator[None]:
         thread.join()
 
 
+def _frames_of(step: int, cast: Cast) -> tuple[int, int]:
+    """Return the two frames of a step; the garment is put on once."""
+    return there_and_back(step, cast.stage.scene.num_frames, SETTLE_FRAMES)
+
+
 def _load(live: Live, choice: Choice) -> None:
     """Put what is chosen on stage."""
     live.refused = choice  # until it is there
     with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
         rig = load_body(choice.body, betas=choice.betas)
-        poses = pose_body(rig, load_motion(choice.motion, body=rig))
+        poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
         if live.cast is None:
             _draw_body(live, poses, rig)
         # A shape of the body is tried once: its garments are not kept on disk.
@@ -336,7 +342,7 @@ def _take_hold(live: Live, origin: Any, direction: Any) -> None:
     """Take the vertex that was clicked on, with a handle to drag it by."""
     if live.cast is None or live.state is None:
         return
-    _, frame = there_and_back(live.step - 1, live.cast.stage.scene.num_frames)
+    _, frame = _frames_of(live.step - 1, live.cast)
     positions = np.asarray(live.state.position) - live.cast.spots[frame]
     live.held = nearest_vertex(positions, origin, direction)
     handle = live.server.scene.add_transform_controls(
@@ -360,7 +366,7 @@ def _hand(live: Live) -> Hand:
     handle, held, cast = live.controls.get("hand"), live.held, live.cast
     if handle is None or held is None or cast is None:
         return no_hand()
-    _, frame = there_and_back(live.step, cast.stage.scene.num_frames)
+    _, frame = _frames_of(live.step, cast)
     return grasp(held, np.asarray(handle.position) + cast.spots[frame])
 
 

@@ -37,6 +37,8 @@ def played(stage, count, tolerance=0.01):
 def test_a_motion_is_played_forth_and_back():
     frames = [there_and_back(step, 4) for step in range(8)]
     assert frames == [(0, 1), (1, 2), (2, 3), (3, 2), (2, 1), (1, 0), (0, 1), (1, 2)]
+    after_two = [there_and_back(step, 5, 2) for step in range(7)]
+    assert after_two == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 3), (3, 2), (2, 3)]
 
 
 def test_the_body_carries_pins_forth_and_back(stage):
