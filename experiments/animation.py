@@ -2,7 +2,8 @@
 
     python experiments/animation.py [--smoke] [--out DIR]
 
-Each garment is simulated by the solver with BDF2, faces kept off the skin, every frame within 1 % of its optimum.
+Each garment is put on over the rest pose and simulated by the solver with BDF2, faces kept off the skin, every
+frame within 1 % of its optimum.
 Writes animation.webp.
 """
 
@@ -16,6 +17,7 @@ from PIL import Image
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import fabric_material
@@ -46,18 +48,18 @@ def main() -> None:
     worn, frames, vertices = (WORN[:1], 5, "1k") if chosen.smoke else (WORN, _FRAMES, "4k")
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
-    strips = []
+    moving, strips = with_settling(poses, SETTLE_FRAMES, body), []
     for name, fabric, color in worn:
         options = SceneOptions(has_skin=True, integrator="bdf2")
         scene = prepare_scene(
-            load_garment(name, vertices=vertices), poses, material=fabric_material(fabric), options=options
+            load_garment(name, vertices=vertices), moving, material=fabric_material(fabric), options=options
         )
         trajectory = simulate(None, scene, config=_CONFIG).trajectory
         print(f"{name}: {float(np.mean(trajectory.iterations[1:])):.0f} iterations a frame", flush=True)
         pictures = render_frames(
             np.asarray(poses.positions),
             np.asarray(poses.faces),
-            np.asarray(trajectory.positions),
+            np.asarray(trajectory.positions)[SETTLE_FRAMES:],
             np.asarray(scene.garment.faces),
             frame_indices=range(0, frames, _EVERY),
             rest_positions=np.asarray(poses.rest_positions),
