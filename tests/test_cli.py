@@ -51,7 +51,17 @@ def test_simulate_writes_everything(tmp_path):
 @pytest.mark.slow
 def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled there yet
-    words = ("simulate", "--simulator", "physics", "--iterations", 20, "--frames", 4, "--no-pictures", "--json")
+    words = (
+        "simulate",
+        "--simulator",
+        "physics",
+        "--iterations",
+        20,
+        "--frames",
+        4,
+        "--no-pictures",
+        "--json",
+    )
     reports = []
     for _ in range(2):
         result = eslr(*words, "--out", tmp_path / "run")
