@@ -51,7 +51,7 @@ from eslr_jax.simulation.simulate import simulate
 RESULTS = Path(__file__).parent / "results"
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",
-    "train": RESULTS / "eslr_small_curves.png",
+    "train": RESULTS / "hood_5_curves.png",  # `eslr train` wrote it
     "gradients": RESULTS / "inverse" / "fabric.png",
 }
 MOST_BYTES = 150_000
