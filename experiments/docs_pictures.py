@@ -22,10 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 from known_answers.drape import hang
+from other_bodies import child
 from PIL import Image
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.motion import pose_body
+from eslr_jax.body.rig import make_body
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.fields import Field, run_field
 from eslr_jax.evaluation.foreign import foreign_trajectory
@@ -49,7 +51,7 @@ from eslr_jax.simulation.simulate import simulate
 RESULTS = Path(__file__).parent / "results"
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",
-    "train": RESULTS / "eslr_small_curves.png",
+    "train": RESULTS / "hood_5_curves.png",  # `eslr train` wrote it
     "gradients": RESULTS / "inverse" / "fabric.png",
 }
 MOST_BYTES = 150_000
@@ -188,15 +190,15 @@ def own_garment(_: int) -> np.ndarray:
 
 
 def own_body(_: int) -> np.ndarray:
-    """A dress on bodies of four shapes."""
-    shapes = {"average": (), "tall": (2.0,), "short": (-2.0,), "heavy": (0.0, 0.0, 0.0, 2.5)}
-    bodies = [load_body(betas=betas) for betas in shapes.values()]
-    heights = np.array([np.ptp(np.asarray(body.rest_positions)[:, 1]) for body in bodies])
+    """A dress on three shapes of the bundled body, and on a child."""
+    shapes = {"average": (), "tall": (2.0,), "short": (-2.0,)}
+    bodies = {name: load_body(betas=betas) for name, betas in shapes.items()} | {"child": make_body(child())}
+    heights = np.array([np.ptp(np.asarray(body.rest_positions)[:, 1]) for body in bodies.values()])
     pictures = [
         worn(load_garment_file("dress", body=body), body, zoom=float(size))
-        for body, size in zip(bodies, heights / heights.max(), strict=True)
+        for body, size in zip(bodies.values(), heights / heights.max(), strict=True)
     ]
-    return side_by_side(pictures, list(shapes))
+    return side_by_side(pictures, list(bodies))
 
 
 def outfits(frames: int) -> np.ndarray:

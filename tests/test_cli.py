@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -48,6 +49,32 @@ def test_simulate_writes_everything(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_first_run_tells_how_long_it_compiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled there yet
+    words = (
+        "simulate",
+        "--simulator",
+        "physics",
+        "--iterations",
+        20,
+        "--frames",
+        4,
+        "--no-pictures",
+        "--json",
+    )
+    reports = []
+    for _ in range(2):
+        result = eslr(*words, "--out", tmp_path / "run")
+        assert result.returncode == 0, result.stderr
+        reports.append((json.loads(result.stdout)["compile_s"], result.stderr))
+    (first, told), (second, untold) = reports
+    assert first > 5
+    assert f"waited {first:.0f} s for the compiler" in told
+    assert second < 0.5 * first
+    assert ("for the compiler" in untold) == (second > 5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("iterations", "integrator"), [(0, "euler"), (5, "bdf2")])
 def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
     tmp_path, iterations, integrator
@@ -67,6 +94,22 @@ def test_garments_may_be_given_again(command):
     _refuse_repetition([command, "--garment", "pants", "--garment", "tshirt"])
     with pytest.raises(ConfigError, match="--motion is given twice"):
         _refuse_repetition([command, "--motion", "turn", "--motion=jump"])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
+def test_waiting_counts_its_seconds_on_a_terminal():
+    import pty
+
+    code = "import time; from eslr_jax.cli.console import waiting\nwith waiting('thinking'): time.sleep(1.5)"
+    command = [sys.executable, "-c", code]
+    assert not subprocess.run(command, check=True, stderr=subprocess.PIPE).stderr  # a file gets nothing
+    ours, terminal = pty.openpty()
+    subprocess.run(command, check=True, stderr=terminal, env=os.environ | {"TERM": "xterm", "COLUMNS": "80"})
+    os.close(terminal)
+    shown = os.read(ours, 1 << 20).decode()
+    os.close(ours)
+    for clock in ("0:00:00", "0:00:01"):
+        assert f"thinking {clock}" in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")

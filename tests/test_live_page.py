@@ -156,6 +156,23 @@ def test_what_does_not_load_is_said_and_the_choice_before_plays_on(player):
     player.wait(2)
 
 
+@pytest.mark.parametrize("number", range(4))
+def test_every_shape_of_the_body_cuts_the_cloth_anew(player, number):
+    def worn():
+        return np.asarray(player.live.cast.stage.scene.initial_state.position)
+
+    sliders = player.live.controls["betas"]
+    assert len(sliders) == 4
+    plain = worn()
+    sliders[number].value = 2.0
+    player.until(lambda: np.count_nonzero(player.live.cast.choice.betas) == 1)
+    player.wait(1)
+    assert np.abs(worn() - plain).max() > 5e-3
+    sliders[number].value = 0.0
+    player.until(lambda: player.live.cast.choice.betas == ())
+    player.wait(1)
+
+
 @pytest.fixture(scope="module")
 def page(player):
     if CHROMIUM is None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.cli.actor import FPS
-from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.cli.console import app, use_compile_cache, waiting
 from eslr_jax.errors import AssetError
 
 
@@ -183,7 +183,7 @@ def _show_scene(
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
     config = SimConfig(model=architecture)
     options = SceneOptions(self_contact=self_contact or None)
-    with stderr.status("measuring"):
+    with waiting("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))
         scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses, options=options)

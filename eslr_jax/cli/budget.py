@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from eslr_jax.cli.console import app, stderr, use_compile_cache
+from eslr_jax.cli.console import app, use_compile_cache, waiting
 from eslr_jax.errors import ConfigError
 
 # Peak memory of whole runs of 1,920 and 31,200 vertices over 6 and 60 frames, of the solver and smooth-small.
@@ -109,7 +109,7 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
     from eslr_jax.simulation.budget import cache_path, write_calibration
 
     use_compile_cache()
-    with stderr.status("measuring"):
+    with waiting("measuring"):
         measured = run(models or (START_MODEL, default_model()))
     path = out or cache_path()
     write_calibration(measured, path, environment())

@@ -15,6 +15,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
 )
@@ -54,6 +55,15 @@ def progress(label: str, total: int) -> Iterator[Any]:
             bars.update(task, completed=done, total=total, description=now)
 
         yield advance
+
+
+@contextlib.contextmanager
+def waiting(text: str) -> Iterator[None]:
+    """Show on stderr what is done and for how long already, where a person sits at a terminal."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=stderr, transient=True, disable=not stderr.is_interactive) as bars:
+        bars.add_task(text, total=None)
+        yield
 
 
 def use_compile_cache() -> None:

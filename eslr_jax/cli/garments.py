@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from eslr_jax.cli.console import app, say, stderr, use_compile_cache
+from eslr_jax.cli.console import app, say, use_compile_cache, waiting
 from eslr_jax.errors import AssetError, MissingExtraError
 from eslr_jax.fit.options import FitOptions
 
@@ -60,7 +60,7 @@ def fit(
         if text and options.edge_length is None:  # else it is remeshed, and its size is chosen
             say(text)
 
-    with stderr.status("fitting"):
+    with waiting("fitting"):
         rig = load_body(body)
         if made_for is None:
             stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
@@ -113,7 +113,7 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
 
     body = np.asarray(rig.rest_positions), np.asarray(rig.faces)
     try:
-        with stderr.status("rendering"):
+        with waiting("rendering"):
             pictures = [
                 render_frame(
                     *body,

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from eslr_jax.cli.actor import check_skin, load_actor
-from eslr_jax.cli.console import app, print_report, say, stderr, use_compile_cache
+from eslr_jax.cli.console import app, print_report, say, use_compile_cache, waiting
 from eslr_jax.cli.options import DEFAULT_GARMENT, Options
 from eslr_jax.errors import ConfigError, MeshError, MotionError
 
@@ -67,7 +67,7 @@ def score(
     use_compile_cache()
     names = {"garment": garment, "motion": motion, "body": body, "vertices": vertices, "fabric": fabric}
     given = {name: value for name, value in names.items() if value}
-    with stderr.status("reading"):
+    with waiting("reading"):
         is_own = is_run(file)
         if given and (is_own or run is not None):
             raise ConfigError(f"{run or file} tells its own scene; leave out --{', --'.join(given)}")
@@ -78,7 +78,7 @@ def score(
         else:
             sequences = read_mesh_sequences(file)
             task = _named_task(sequences, given) if run is None else _run_task(sequences, read_run(run))
-    with stderr.status("scoring"):
+    with waiting("scoring"):
         stored = task.stored
         result = score_trajectory(
             task.trajectory,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -13,7 +14,7 @@ import tyro
 
 from eslr_jax.cli.actor import check_skin, load_actor
 from eslr_jax.cli.budget import describe_load, parse_request
-from eslr_jax.cli.console import app, print_report, progress, say, stderr, use_compile_cache
+from eslr_jax.cli.console import app, print_report, progress, say, use_compile_cache, waiting
 from eslr_jax.cli.interrupt import EXIT_CODE
 from eslr_jax.cli.options import (
     DEFAULT_GARMENT,
@@ -203,7 +204,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     request = _read_request(options)
     names = options.garment or (DEFAULT_GARMENT,)
     label = "+".join(names)
-    with stderr.status("loading garment, body and motion"):
+    with waiting("preparing garment, body and motion"):
         rig, poses, motion = load_actor(options)
         garments = [
             load_garment_file(
@@ -243,7 +244,6 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         if done is not None:
             check_same_scene(done, scene, out)
             scene = scene.replace(self_contact=capacity)
-        _begin_measuring(scene, poses.positions.shape[0])
     out = ensure_output_dir(out)
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
     if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
@@ -256,7 +256,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
     if num_vertices >= LARGE:
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
-    whole, timing, scene = _run(method, scene, done)
+    whole, timing, scene = _run(method, scene, done, poses.positions.shape[0])
     if timing.compile_s > _LONG:
         say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not")
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
@@ -280,7 +280,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             f"missed --budget {options.budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells "
             "what the scene costs, eslr calibrate what this machine can do"
         )
-    with stderr.status("measuring"):
+    with waiting("measuring"):
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
             "garment": label,
@@ -299,7 +299,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "error": error,
             **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
         }
-    with stderr.status("writing files"):
+    with waiting("writing files"):
         track = ClothTrack(trajectory.positions, trajectory.velocities, trajectory.friction_loads)
         write_run(out, track, scene, (rig, poses, stored), report=report)
         if not is_unfinished:
@@ -348,8 +348,15 @@ def _choose_method(
     return _Method(simulator, model, params, config, choice, budget_ms, tolerance)
 
 
-def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
-    """Simulate with progress; Ctrl-C ends it after the frames in work."""
+def _run(method: _Method, scene: Scene, done: Trajectory | None, num_frames: int) -> Simulation:
+    """Compile and simulate with progress; Ctrl-C ends it after the frames in work.
+
+    Args:
+        method: How to simulate.
+        scene: With the frames in which the garment settles.
+        done: First frames of the scene, simulated before.
+        num_frames: Of the run, whose measures are compiled while its frames are.
+    """
     from eslr_jax.simulation.budget import keep_budget
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import simulate as run
@@ -368,7 +375,10 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
             advance(count, total, "simulating")
             stop.begin()  # before the first frames are done there is nothing to keep
 
-        return run(
+        began = time.perf_counter()
+        _compile_measures(scene, num_frames)
+        waited = time.perf_counter() - began
+        simulation = run(
             method.params,
             scene,
             config=method.config,
@@ -378,10 +388,12 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None) -> Simulation:
             done=done,
             raises=False,
         )
+    timing = simulation.timing
+    return simulation._replace(timing=timing._replace(compile_s=waited + timing.compile_s))
 
 
-def _begin_measuring(scene: Scene, num_frames: int) -> None:
-    """Compile the measures of a trajectory of so many frames while its rollout is compiled in a thread."""
+def _compile_measures(scene: Scene, num_frames: int) -> None:
+    """Compile the measures of a trajectory of so many frames, while its rollout is compiled in a thread."""
     import jax
 
     from eslr_jax.evaluation.metrics import measure_frames
@@ -471,6 +483,6 @@ def _write_sheet(out: Path, positions, stored: GarmentFile, actor) -> None:
 
 def _print_report(report: dict[str, Any], out: Path) -> None:
     """Print what a person wants to know, and where the files are."""
-    time = f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation"
+    spent = f"{report['frame_ms']:.1f} ms a frame, after {report['compile_s']:.1f} s of compilation"
     files = ", ".join(str(path) for path in sorted(out.iterdir()) if path.is_file())
-    print_report(report, {"time": time, "files": files})
+    print_report(report, {"time": spent, "files": files})
