@@ -243,6 +243,7 @@ def test_a_resumed_training_takes_no_other_configuration(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("option", ["gap-frames", "every", "rollout-frames"])
-def test_an_evaluation_of_nothing_is_refused(option):
-    refused(eslr("evaluate", "--model", "eslr-small", f"--{option}", 0), option.replace("-", "_"), "or more")
+@pytest.mark.parametrize(("option", "value"), [("gap-frames", 2), ("every", 0), ("rollout-frames", 0)])
+def test_an_evaluation_of_nothing_is_refused(option, value):
+    result = eslr("evaluate", "--model", "eslr-small", f"--{option}", value)
+    refused(result, option.replace("-", "_"), "or more")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -35,7 +35,8 @@ def evaluate(
         garments: Only these; the training garments if not given.
         clips: Only these; all of the split if not given.
         iterations: Solver iterations behind the network.
-        gap_frames: Frames of each clip from which the gap is measured.
+        gap_frames: Frames of each clip from which the gap is measured; 0 leaves the gap out, which is most of the
+            time.
         every: Of those, measure one in so many.
         rollout_frames: Length of the free rollouts; clips are played back and forth.
         control: Take something away, to see what it does: weights that were never trained, a decoder of zeros,
@@ -71,6 +72,13 @@ def evaluate(
     if json_:
         print(json.dumps(result, indent=2))
         return
+    if "on_policy" in result:
+        _print_gaps(model, result)
+    print(json.dumps(result["rollout"], indent=2))
+
+
+def _print_gaps(model: str, result: dict[str, Any]) -> None:
+    """Print the gaps of a network beside those of the solver."""
     table = Table(
         "", "gap, median [mJ]", "relative to the initial gap", "on the model's own states [mJ]", box=None
     )
@@ -85,4 +93,3 @@ def evaluate(
             f"{policy['gap_median_j'] * 1e3:.3f}",
         )
     Console().print(table, markup=False)
-    print(json.dumps(result["rollout"], indent=2))

@@ -37,7 +37,7 @@ class EvaluationOptions:
     garments: tuple[str, ...] = ()  # empty: the training garments
     clips: tuple[str, ...] = ()  # empty: all of the split
     vertices: str = "1k"
-    gap_frames: int = 40  # frames of each clip for the gap
+    gap_frames: int = 40  # frames of each clip for the gap; 0: it is not measured
     every: int = 4  # of those, measure one in so many
     rollout_frames: int = 300  # of the free rollout; clips are played back and forth
     control: Control | None = None  # what the network is deprived of; see `controls`
@@ -49,7 +49,7 @@ class EvaluationOptions:
             ConfigError: Names the field and the least value.
         """
         for name, least in (("gap_frames", 3), ("every", 1), ("rollout_frames", 4)):
-            if getattr(self, name) < least:
+            if getattr(self, name) < least and (name, getattr(self, name)) != ("gap_frames", 0):
                 raise ConfigError(
                     f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
                 )
@@ -99,9 +99,10 @@ def evaluate(
                 poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
                 return prepare_scene(cloth, poses, surface=surface)
 
-            on_truth, on_policy = _gaps(params, scene_of(options.gap_frames), config, options.every)
-            forced.append(on_truth)
-            policy.append(on_policy)
+            if options.gap_frames:
+                on_truth, on_policy = _gaps(params, scene_of(options.gap_frames), config, options.every)
+                forced.append(on_truth)
+                policy.append(on_policy)
             free = _free_rollout(params, scene_of(options.rollout_frames), config)
             scenes.append({"garment": garment, "clip": clip, **free})
             on_scene(len(scenes), total, f"{garment} {clip}")
@@ -113,8 +114,7 @@ def evaluate(
         "vertices": options.vertices,
         "garments": list(garments),
         "clips": list(clips),
-        **_summarize(forced),
-        "on_policy": _summarize(policy),
+        **({**_summarize(forced), "on_policy": _summarize(policy)} if forced else {}),
         "rollout": _pool_rollouts(scenes) | {"drift_mm_s": max(drifts.values()), "drift_mm_s_of": drifts},
         "scenes": scenes,
     }

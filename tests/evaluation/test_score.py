@@ -122,3 +122,13 @@ def test_a_network_s_rollout_scores_as_evaluate_says():
     assert score["gap_frames"] == expected["frames"]
     assert score["gap_relative_median"] == pytest.approx(expected["gap_relative_median"], rel=0.02)
     assert score["gap_median_j"] == pytest.approx(expected["gap_median_j"], rel=0.02)
+
+
+@pytest.mark.slow
+def test_an_evaluation_without_the_gap_has_the_rollouts():
+    model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
+    options = EvaluationOptions(garments=("tshirt",), clips=("cmu_016_32",), gap_frames=0, rollout_frames=4)
+    result = evaluate(init_model(model), model, options)
+    assert not {"gap_median_j", "on_policy"} & set(result)
+    assert [(row["garment"], row["clip"]) for row in result["scenes"]] == [("tshirt", "cmu_016_32")]
+    assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}
