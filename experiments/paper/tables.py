@@ -54,7 +54,7 @@ from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 
 # Trained alike, applied once a frame (configs/paper/1k.toml); the rest have recipes of their own.
-DEEP = tuple(f"{name}-5={name}-5-correction" for name in ("mgn", "lsdmp", "gsa", "eslr"))
+DEEP = tuple(f"{name}-5={name}-5-correction" for name in ("mgn", "hood", "lsdmp", "gsa", "eslr"))
 CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
 RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
 BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20")
