@@ -26,9 +26,7 @@ _FAR_MORE = 3.0  # times any other step
 _STEPS_AFTER = 5  # of a motion, by which a jump is judged
 SETTLE_FRAMES = 35  # in which a garment is put on: 25 for the limbs, and those that hold the first pose
 _HELD = 10  # frames of settling that hold the first pose
-_FEWEST_MOVING = (
-    15  # frames in which limbs may come from the rest pose: an arm falls by 8 degrees in one at most
-)
+_FEWEST_MOVING = 15  # frames in which limbs may come from the rest pose; fewer would be a jerk
 # Vertices [m] and map of every joint, by frames.
 _Track = tuple[Float[Array, "frames vertices 3"], Float[Array, "frames joints 3 4"]]
 _BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
