@@ -19,6 +19,7 @@ CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for th
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
+_ROOM = 2 * CLEARANCE  # [m] that cloth needs between two parts of the body
 _ROOM = (
     0.01  # [m] between two parts of the body that cloth needs: a clearance of 2 mm to either side, and slack
 )
@@ -151,7 +152,7 @@ def find_both_sides(
 
 
 def are_pinched(nearest: Contacts, opposing: Contacts) -> Bool[Array, " vertices"]:
-    """Return which vertices are where two parts of the body leave less than a centimetre, at t or at t + 1.
+    """Return which vertices are where two parts of the body leave no room for cloth, at t or at t + 1.
 
     Args:
         nearest: Contacts with the nearest part.
