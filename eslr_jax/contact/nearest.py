@@ -19,10 +19,7 @@ CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for th
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
-_ROOM = 2 * CLEARANCE  # [m] that cloth needs between two parts of the body
-_ROOM = (
-    0.01  # [m] between two parts of the body that cloth needs: a clearance of 2 mm to either side, and slack
-)
+_ROOM = 0.01  # [m] that cloth needs between two parts of the body: a clearance to either side, and slack
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 _IMPACT = 0.02  # [m] before the body, where the path of thrown cloth ends
 _SEARCHES = 8  # along such a path, at most; straight at a wall, two
