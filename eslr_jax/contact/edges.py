@@ -7,14 +7,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.search import following_vertices
-from eslr_jax.numerics import dot3, safe_normalize, sub3
-from eslr_jax.types import BodySurface
+from eslr_jax.numerics import Vector3, dot3, safe_normalize, sub3
+from eslr_jax.types import BodySurface, Contacts, Garment
 
 _BESIDE = 0.01  # [m] beside a place of the body, up to which cloth is over it; time_and_skin.py chose it
 _UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
+_LOOKED_AT = 4  # edges of the cloth for every crossing that is kept
 _LEAST_SINE = 0.1  # of the angle between two edges, below which they are parallel and cross nowhere
 
 
@@ -63,52 +64,87 @@ def clearance_over(
 def find_crossings(
     cloth: Cloth,
     skin: Skin,
-    vertices: Int[Array, " starts"],
-    corners: Int[Array, "starts 3"],
+    over: tuple[Int[Array, " starts"], Int[Array, "starts 3"]],
+    nearest: Contacts,
+    garment: Garment,
     surface: BodySurface,
     count: int,
 ) -> Crossings:
     """Return where edges of the body leave the cloth faces over their ends, and the cloth is lower than there.
 
-    The nearest face over one end of an edge says which edges of the cloth it may cross: three. Every edge is
-    looked at from both ends. Edges of the cloth that cross more than one edge of the body are found from each.
+    The nearest face over an end of an edge says which edges of the other mesh it may cross: three. Edges of the
+    body find the cloth's, and edges of the cloth the body's; where one mesh is finer, the middle of the other's
+    edges is found from it alone. Every edge is looked at from both ends.
 
     Args:
         cloth: Vertices of the garment.
         skin: Vertices of the body.
-        vertices: Those of the body where edges start.
-        corners: Of the cloth face that is nearest to each.
+        over: Vertices of the body where edges start, and the corners of the cloth face that is nearest to each.
+        nearest: The nearest body point of every cloth vertex.
+        garment: Edges of the cloth.
         surface: Edges of the body.
         count: Rows to return, those with the least clearance.
     """
-    slots = surface.face_incidence[vertices]  # [starts, degree]
-    other = following_vertices(slots, surface.faces)
-    sides = jnp.stack([corners, jnp.roll(corners, -1, axis=1)], axis=2)  # [starts, 3, 2]
+    found = [_from_body(over, surface), _from_cloth(nearest, garment, surface, _LOOKED_AT * count)]
 
-    def cross(first: Array, second: Array, here: Array, there: Array) -> _Crossing:
+    def cross(pair: _Edges) -> _Crossing:
         return _cross(
-            [_gathered(cloth, end) for end in (first, second)],
-            [_gathered(skin, end) for end in (here, there)],
+            [_gathered(cloth, end) for end in (pair.first, pair.second)],
+            [_gathered(skin, end) for end in (pair.here, pair.there)],
         )
 
-    # Every end is read once, and meets the others by broadcasting: [starts, degree, 3].
-    clearance = cross(
-        sides[:, None, :, 0], sides[:, None, :, 1], vertices[:, None, None], other[:, :, None]
-    ).clearance
-    clearance = jnp.where((slots < surface.faces.size)[:, :, None], clearance, jnp.inf)
-    _, lowest = jax.lax.top_k(-clearance.ravel(), count)
-    start, slot, side = jnp.unravel_index(lowest, clearance.shape)
-    ends = sides[start, side]
-    here, there = vertices[start], other[start, slot]
-    found = cross(ends[:, 0], ends[:, 1], here, there)
+    clearance = jnp.concatenate(
+        [jnp.where(edges.is_real, cross(edges).clearance, jnp.inf).ravel() for edges in found]
+    )
+    clearance, lowest = jax.lax.top_k(-clearance, count)
+    first, second, here, there = (
+        jnp.concatenate([x.ravel() for x in ends])[lowest]
+        for ends in zip(*(jnp.broadcast_arrays(*edges[:4]) for edges in found), strict=True)
+    )
+    lowest_ones = cross(_Edges(first, second, here, there, jnp.ones_like(first, bool)))
     return Crossings(
-        ends=ends,
-        weights=jnp.stack([1.0 - found.share, found.share], axis=1),
-        next_points=found.next_point.T,
-        next_normals=found.next_normal.T,
-        clearance=clearance.ravel()[lowest],
+        ends=jnp.stack([first, second], axis=1),
+        weights=jnp.stack([1.0 - lowest_ones.share, lowest_ones.share], axis=1),
+        next_points=lowest_ones.next_point.T,
+        next_normals=lowest_ones.next_normal.T,
+        clearance=-clearance,
         areas=0.5 * (surface.vertex_areas[here] + surface.vertex_areas[there]),
     )
+
+
+class _Edges(NamedTuple):
+    """Edges of the cloth beside edges of the body, by their ends, which broadcast: each is read once."""
+
+    first: Int[Array, ...]  # of the cloth
+    second: Int[Array, ...]
+    here: Int[Array, ...]  # of the body
+    there: Int[Array, ...]
+    is_real: Bool[Array, ...]
+
+
+def _from_body(over: tuple[Int[Array, " starts"], Int[Array, "starts 3"]], surface: BodySurface) -> _Edges:
+    """Return the edges around vertices of the body, and the three of the cloth face over each."""
+    vertices, corners = over
+    slots = surface.face_incidence[vertices]  # [starts, degree]
+    first, second = corners[:, None, :], jnp.roll(corners, -1, axis=1)[:, None, :]
+    is_real = (slots < surface.faces.size)[:, :, None]
+    other = following_vertices(slots, surface.faces)[:, :, None]
+    return _Edges(first, second, vertices[:, None, None], other, is_real)
+
+
+def _from_cloth(nearest: Contacts, garment: Garment, surface: BodySurface, count: int) -> _Edges:
+    """Return the lowest edges of the cloth, and the three of the body face under either end.
+
+    An edge whose ends are over one face crosses nothing.
+    """
+    ends = jnp.stack([garment.senders, garment.receivers], axis=1)
+    under = nearest.faces[ends]
+    is_across = (ends[:, 0] < ends[:, 1]) & garment.edge_mask & (under[:, 0] != under[:, 1])
+    height = jnp.where(nearest.is_near, nearest.distances, jnp.inf)[ends].min(axis=1)
+    height, lowest = jax.lax.top_k(-jnp.where(is_across, height, jnp.inf), min(count, len(ends)))
+    corners = surface.faces[under[lowest]]  # [edges, 2, 3]
+    first, second = ends[lowest, 0, None, None], ends[lowest, 1, None, None]
+    return _Edges(first, second, corners, jnp.roll(corners, -1, axis=2), jnp.isfinite(height)[:, None, None])
 
 
 def _gathered(
@@ -116,6 +152,29 @@ def _gathered(
 ) -> Float[Array, "columns ..."]:
     """Return rows of several arrays, columns first: one read for all of them."""
     return jnp.moveaxis(jnp.concatenate(parts, axis=1)[vertices], -1, 0)
+
+
+def cross_lines(
+    one: tuple[Vector3, Vector3], other: tuple[Vector3, Vector3]
+) -> tuple[Float[Array, ...], Float[Array, ...], Bool[Array, ...]]:
+    """Return where the lines through two edges are nearest, as shares of the edges, and whether within both.
+
+    Edges that are nearly parallel cross nowhere.
+
+    Args:
+        one: Both ends of edges, by components.
+        other: Of edges of their own; shapes broadcast.
+    """
+    along, across, offset = sub3(one[1], one[0]), sub3(other[1], other[0]), sub3(one[0], other[0])
+    a, b, c = dot3(along, along), dot3(along, across), dot3(across, across)
+    d, e = dot3(along, offset), dot3(across, offset)
+    determinant = a * c - b * b
+    is_crossing = determinant > _LEAST_SINE**2 * a * c
+    inverse = 1.0 / jnp.where(is_crossing, determinant, 1.0)
+    at_one, at_other = (b * e - c * d) * inverse, (a * e - b * d) * inverse
+    for share in (at_one, at_other):
+        is_crossing = is_crossing & (share > 0.0) & (share < 1.0)
+    return at_one, at_other, is_crossing
 
 
 class _Crossing(NamedTuple):
@@ -131,15 +190,9 @@ def _cross(cloth: Sequence[Float[Array, "6 ..."]], body: Sequence[Float[Array, "
     """Return how edges of the cloth lie over edges of the body, both by their two ends, which may broadcast."""
     first, second = (end.reshape(2, 3, *end.shape[1:]) for end in cloth)
     start, end = (end[:12].reshape(4, 3, *end.shape[1:]) for end in body)
-    side, along, offset = (tuple(x) for x in (end[0] - start[0], second[0] - first[0], start[0] - first[0]))
-    a, b, c = dot3(side, side), dot3(side, along), dot3(along, along)  # type: ignore[arg-type]
-    d, e = dot3(side, offset), dot3(along, offset)  # type: ignore[arg-type]
-    determinant = a * c - b * b
-    is_crossing = determinant > _LEAST_SINE**2 * a * c
-    inverse = 1.0 / jnp.where(is_crossing, determinant, 1.0)
-    at_body, at_cloth = (b * e - c * d) * inverse, (a * e - b * d) * inverse
-    for share in (at_body, at_cloth):
-        is_crossing = is_crossing & (share > 0.0) & (share < 1.0)
+    at_body, at_cloth, is_crossing = cross_lines(
+        (tuple(start[0]), tuple(end[0])), (tuple(first[0]), tuple(second[0]))
+    )
     here, ahead, normal, next_normal = start + at_body[None, None] * (end - start)
     normal, next_normal = safe_normalize(normal, axis=0), safe_normalize(next_normal, axis=0)
     place, next_place = first + at_cloth[None, None] * (second - first)

@@ -159,7 +159,9 @@ def energy_shares(
             pairs = problem.layers.pairs
             on_pairs = 0.25 * (factors[pairs.vertices] + factors[pairs.corners].sum(axis=1))
             pairs = pairs.replace(areas=pairs.areas * on_pairs)
-            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs))
+            edges = problem.layers.edges
+            edges = edges.replace(areas=edges.areas * factors[edges.ends].mean(axis=1))
+            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs, edges=edges))
         return getattr(potential_terms(position, scaled), term)
 
     return jax.grad(total)(jnp.ones_like(garment.vertex_areas))

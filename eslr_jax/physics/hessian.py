@@ -13,9 +13,11 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
+from eslr_jax.contact.layer_edges import EdgePairs
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.physics.repulsion import Pairs
 from eslr_jax.types import Contacts, Garment, Material, Threads
 
 
@@ -257,16 +259,23 @@ def _friction_blocks(
     return (load / length)[:, None, None] * curvature
 
 
-def layer_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
-    """Return the Hessian of the repulsion between layers per pair [N/m], shape [pairs, 12, 12]."""
+def layer_blocks(
+    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
+) -> tuple[Float[np.ndarray, "rows 12 12"], ...]:
+    """Return the Hessian of the repulsion per pair in use [N/m]: of vertices and faces, and of edges."""
     if problem.layers is None:
-        return np.zeros((0, 12, 12))
-    layers = problem.layers
-    stiffness, thickness = (
-        float(problem.constants.repulsion_stiffness),
-        np.asarray(layers.thickness, np.float64),
+        return ()
+    stiffness = float(problem.constants.repulsion_stiffness)
+    (faces, kept), (edges, kept_edges) = problem.layers.kinds
+    return (
+        pair_blocks(position, faces, stiffness, np.asarray(kept, np.float64)),
+        edge_blocks(position, edges, stiffness, np.asarray(kept_edges, np.float64)),
     )
-    return pair_blocks(position, layers.pairs, stiffness, thickness)
+
+
+def layer_tables(problem: FrameProblem) -> tuple[Int[np.ndarray, "rows 4"], ...]:
+    """Return the vertices of the pairs that `layer_blocks` has."""
+    return () if problem.layers is None else tuple(pair_table(pairs) for pairs, _ in problem.layers.kinds)
 
 
 def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
@@ -278,13 +287,16 @@ def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem)
     return pair_blocks(position, tips.pairs, stiffness, thickness, np.asarray(tips.next_body))
 
 
-def pair_table(pairs: FacePairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
-    """Return the vertices of every pair in use: of the point, where it is of the cloth, and of the face."""
+def pair_table(pairs: Pairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
+    """Return the vertices of cloth in every pair in use."""
     if pairs is None:
         return np.zeros((0, 3 + is_cloth), np.int64)
-    corners, is_used = np.asarray(pairs.corners), np.asarray(pairs.side) != 0
-    table = np.concatenate([np.asarray(pairs.vertices)[:, None], corners], axis=1) if is_cloth else corners
-    return table[is_used]
+    is_used = np.asarray(pairs.side) != 0
+    if isinstance(pairs, EdgePairs):
+        return np.asarray(pairs.ends)[is_used]
+    corners = np.asarray(pairs.corners)[is_used]
+    vertices = np.asarray(pairs.vertices)[is_used, None]
+    return np.concatenate([vertices, corners], axis=1) if is_cloth else corners
 
 
 def pair_blocks(
@@ -304,28 +316,61 @@ def pair_blocks(
         next_body: Body vertices at t + 1 [m], where the points are the body's and don't move.
     """
     is_cloth = next_body is None
-    side = np.asarray(pairs.side, np.float64)
-    is_used = side != 0
+    is_used = np.asarray(pairs.side) != 0
     points = (position if next_body is None else np.asarray(next_body, np.float64))[
         np.asarray(pairs.vertices)
     ]
-    point, weights, side = points[is_used], np.asarray(pairs.weights, np.float64)[is_used], side[is_used]
+    point, weights = points[is_used], np.asarray(pairs.weights, np.float64)[is_used]
     corners = position[np.asarray(pairs.corners)[is_used]]
-    edges = corners[:, 1:] - corners[:, :1]
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    size = np.linalg.norm(normal, axis=1)[:, None]
-    size = np.where(size > 0, size, 1.0)
-    normal = normal * (side[:, None] / size)
     offset = point - np.einsum("pk,pka->pa", weights, corners)
-    height = np.sum(offset * normal, axis=1)
-    # The plane turns with its corners; that moves the height by what of the offset lies within the plane.
-    tangential = (offset - height[:, None] * normal) * (side[:, None] / size)
-    turn = np.stack([np.cross(edges[:, 1], tangential), np.cross(tangential, edges[:, 0])], axis=1)
-    turn = np.concatenate([-turn.sum(axis=1, keepdims=True), turn], axis=1)
+    edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    height, normal, first, second = _turning_height(offset, *edges, np.asarray(pairs.side)[is_used])
+    turn = np.stack([-first - second, first, second], axis=1)
     gradient = turn - weights[:, :, None] * normal[:, None]
     if is_cloth:
         gradient = np.concatenate([normal[:, None], gradient], axis=1)
-    gradient = gradient.reshape(len(side), -1)
+    return _barrier_blocks(gradient, height, pairs, stiffness, thickness)
+
+
+def edge_blocks(
+    position: Float[np.ndarray, "vertices 3"],
+    edges: EdgePairs,
+    stiffness: float,
+    thickness: Float[np.ndarray, " rows"] | float,
+) -> Float[np.ndarray, "pairs 12 12"]:
+    """Return the Gauss-Newton Hessian of the repulsion per pair of edges in use; see `pair_blocks`."""
+    is_used = np.asarray(edges.side) != 0
+    weights = np.asarray(edges.weights, np.float64)[is_used]
+    ends = position[np.asarray(edges.ends)[is_used]]
+    offset = np.einsum("pk,pka->pa", weights, ends)
+    sides = ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]
+    height, normal, first, second = _turning_height(offset, *sides, np.asarray(edges.side)[is_used])
+    turn = np.stack([-first, first, -second, second], axis=1)
+    return _barrier_blocks(turn + weights[:, :, None] * normal[:, None], height, edges, stiffness, thickness)
+
+
+def _turning_height(
+    offset: np.ndarray, first: np.ndarray, second: np.ndarray, side: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights along the normal across two edges [m], it, and what the edges' turning adds to the height.
+
+    That is by each of the edges: what of the offset lies within the plane of both.
+    """
+    normal = np.cross(first, second)
+    size = np.linalg.norm(normal, axis=1)[:, None]
+    size = np.where(size > 0, size, 1.0)
+    normal = normal * (side[:, None] / size)
+    height = np.sum(offset * normal, axis=1)
+    tangential = (offset - height[:, None] * normal) * (side[:, None] / size)
+    return height, normal, np.cross(second, tangential), np.cross(tangential, first)
+
+
+def _barrier_blocks(
+    gradient: np.ndarray, height: np.ndarray, pairs: Pairs, stiffness: float, thickness: np.ndarray | float
+) -> np.ndarray:
+    """Return 6 k a depth g g^T for pairs in use, from the gradient of their height and the height [m]."""
+    is_used = np.asarray(pairs.side) != 0
+    gradient = gradient.reshape(len(height), -1)
     curvature = 6.0 * stiffness * np.asarray(pairs.areas, np.float64)[is_used]
     kept = np.broadcast_to(thickness, is_used.shape)[is_used]
     curvature = curvature * np.maximum(kept - height, 0.0)

@@ -1,4 +1,4 @@
-"""Repulsion: a one-sided cubic barrier between a point and the plane of a face of cloth.
+"""Repulsion: a one-sided cubic barrier between a point and the plane of a face of cloth, or between two edges.
 
 The points are vertices of the same cloth (self-contact), or of the body (`next_body`, which does not give way).
 """
@@ -7,25 +7,30 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from eslr_jax.contact.layer_edges import EdgePairs, edge_heights
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3, take3
 
+Pairs = FacePairs | EdgePairs
 _SWEEPS = 4  # of `push_apart`
 
 
 def pair_heights(
     position: Float[Array, "vertices 3"] | Vector3,
-    pairs: FacePairs,
+    pairs: Pairs,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> tuple[Float[Array, " pairs"], Vector3]:
     """Return every point's height over its face's plane, on the side it is kept on [m], and that direction.
 
     d = side (x_p - sum_k w_k x_k) . n, with the face's unit normal n at `position`; so the energy of d turns
-    with the cloth, and its four forces have no resultant and no moment. Unused rows give zero.
+    with the cloth, and its four forces have no resultant and no moment. For edges it is the height of a place
+    on one over a place on the other, see `edge_heights`. Unused rows give zero.
     """
     x = components(position)
+    if isinstance(pairs, EdgePairs):
+        return edge_heights(x, pairs)
     if next_body is None:  # all four places in one read
         places = take3(x, jnp.concatenate([pairs.vertices[None], pairs.corners.T]))
         point, *corners = (tuple(c[k] for c in places) for k in range(4))
@@ -42,7 +47,7 @@ def pair_heights(
 
 def overlaps(
     position: Float[Array, "vertices 3"] | Vector3,
-    pairs: FacePairs,
+    pairs: Pairs,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " pairs"]:
@@ -53,7 +58,7 @@ def overlaps(
 
 def repulsion_energy(
     position: Float[Array, "vertices 3"] | Vector3,
-    pairs: FacePairs,
+    pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
@@ -76,7 +81,7 @@ def repulsion_energy(
 
 def repulsion_diagonal(
     position: Float[Array, "vertices 3"],
-    pairs: FacePairs,
+    pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
@@ -84,13 +89,13 @@ def repulsion_diagonal(
     """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal."""
     depth = overlaps(position, pairs, thickness, next_body)
     curvature = 2.0 * stiffness * pairs.areas * depth
-    at_point = curvature if next_body is None else None
-    return _scatter(pairs, at_point, pairs.weights**2 * curvature[:, None], position.shape[0])
+    ids, weights = _stencil(pairs, next_body is None)
+    return segment_sum((weights**2 * curvature[None]).ravel(), ids.ravel(), position.shape[0])
 
 
 def push_apart(
     position: Float[Array, "vertices 3"],
-    pairs: FacePairs,
+    pairs: Pairs,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, "vertices 3"]:
@@ -101,31 +106,34 @@ def push_apart(
     """
     num_vertices = position.shape[0]
     share = 0.5 if next_body is None else 1.0
+    ids, weights = _stencil(pairs, next_body is None)
+    # A place moves by one if corner k of it moves by w_k / |w|^2; weights of the two places differ in sign.
+    is_first = weights > 0
+    squared = weights**2
+    first, second = (jnp.sum(jnp.where(own, squared, 0.0), axis=0) for own in (is_first, ~is_first))
+    size = jnp.where(is_first, first, second)
+    scale = share * weights / jnp.where(size > 0, size, 1.0)
 
     def sweep(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
         height, direction = pair_heights(position, pairs, next_body)
         depth = jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
-        is_deep = (depth > 0).astype(position.dtype)
-        # Moving corner k by w_k / |w|^2 moves the foot by one.
-        scale = share * pairs.weights / jnp.sum(pairs.weights**2, axis=1, keepdims=True)
-        touched = jnp.where(pairs.weights > 0, is_deep[:, None], 0.0)
+        touched = ((weights != 0) & (depth > 0)[None]).astype(position.dtype)
         lift = depth[:, None] * jnp.stack(direction, axis=-1)
-        at_corners = jnp.concatenate([-scale[:, :, None] * lift[:, None], touched[:, :, None]], axis=2)
-        at_point = jnp.concatenate([share * lift, is_deep[:, None]], axis=1) if next_body is None else None
-        moved = _scatter(pairs, at_point, at_corners, num_vertices)
+        moves = jnp.concatenate([scale[:, :, None] * lift[None], touched[:, :, None]], axis=2)
+        moved = segment_sum(moves.reshape(-1, 4), ids.ravel(), num_vertices)
         return position + moved[:, :3] / jnp.maximum(moved[:, 3:], 1.0)
 
     return jax.lax.fori_loop(0, _SWEEPS, sweep, position)  # a loop: unrolled, every sweep is compiled anew
 
 
-def _scatter(
-    pairs: FacePairs,
-    at_point: Float[Array, "pairs ..."] | None,
-    at_corners: Float[Array, "pairs 3 ..."],
-    num_vertices: int,
-) -> Float[Array, "vertices ..."]:
-    """Sum what pairs give to their three corners and, where it is of the cloth, to their point."""
-    values, ids = jnp.concatenate(jnp.moveaxis(at_corners, 1, 0)), pairs.corners.T.ravel()
-    if at_point is not None:
-        values, ids = jnp.concatenate([at_point, values]), jnp.concatenate([pairs.vertices, ids])
-    return segment_sum(values, ids, num_vertices)
+def _stencil(
+    pairs: Pairs, has_points: bool
+) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
+    """Return the vertices of cloth in every pair, and their weights in the offset between both of its places."""
+    if isinstance(pairs, EdgePairs):
+        return pairs.ends.T, pairs.weights.T
+    ids, weights = pairs.corners.T, -pairs.weights.T
+    if has_points:
+        ids = jnp.concatenate([pairs.vertices[None], ids])
+        weights = jnp.concatenate([jnp.ones_like(weights[:1]), weights])
+    return ids, weights

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.contact.ground import ground_contacts
+from eslr_jax.contact.layer_edges import EdgePairs, find_edge_pairs
 from eslr_jax.contact.nearest import are_pinched, find_both_sides
 from eslr_jax.contact.self_contact import FacePairs, find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
@@ -24,7 +25,7 @@ from eslr_jax.physics.problem import (
     TipContact,
     contact_thickness,
 )
-from eslr_jax.physics.repulsion import pair_heights
+from eslr_jax.physics.repulsion import Pairs, pair_heights
 from eslr_jax.scene.build import slice_tracks
 from eslr_jax.types import ClothState, PastState, Scene, SceneBody
 
@@ -112,11 +113,10 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         strain = past_strain(scene.damping, scene.timestep, state.position, scene.garment)
         problem = problem.replace(strain=strain)
     if scene.self_contact is not None:
-        guess = problem.inertial_guess
-        pairs = find_self_contacts(
-            state.position, guess, scene.garment, scene.self_contact, pieces=scene.pieces
-        )
-        problem = problem.replace(layers=_layers(problem, pairs))
+        cloth = (state.position, problem.inertial_guess, scene.garment)
+        pairs = find_self_contacts(*cloth, scene.self_contact, pieces=scene.pieces)
+        edges = find_edge_pairs(*cloth[:2], pairs, scene.garment)
+        problem = problem.replace(layers=_layers(problem, pairs, edges))
     return problem
 
 
@@ -180,7 +180,7 @@ def _body_contact(
     )
 
 
-def _layers(problem: FrameProblem, pairs: FacePairs) -> SelfContact:
+def _layers(problem: FrameProblem, pairs: FacePairs, edges: EdgePairs) -> SelfContact:
     """Return the contact of a frame between layers of the cloth.
 
     A vertex on the wrong side of a face is asked back by one thickness a frame. Asked back at once, from
@@ -188,8 +188,12 @@ def _layers(problem: FrameProblem, pairs: FacePairs) -> SelfContact:
     of weights.
     """
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
-    height, _ = pair_heights(problem.position, pairs)
-    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0))
+
+    def kept(rows: Pairs) -> Float[Array, " rows"]:
+        height, _ = pair_heights(problem.position, rows)
+        return thickness + jnp.minimum(height, 0.0)
+
+    return SelfContact(pairs, kept(pairs), edges, kept(edges))
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import grid_faces, make_garment
 
 from eslr_jax.contact.edges import clearance_over
 from eslr_jax.contact.nearest import find_contacts
@@ -52,6 +53,21 @@ def test_a_fold_crosses_a_ridge_between_vertices(height):
     heights = np.asarray(skin_heights(here, skin))[is_fold]
     np.testing.assert_allclose(heights, height, atol=1e-6)
     np.testing.assert_allclose(np.asarray(skin.next_points)[is_fold], 0.0, atol=1e-6)
+
+
+def test_fine_cloth_finds_the_middle_of_a_long_edge_of_the_body():
+    """No face over an end of the ridge holds the edge that crosses it, thirty millimetres away."""
+    height = -0.0005
+    x, z = np.meshgrid(6e-3 * np.arange(-5, 6), np.array([-9e-3, -3e-3, 3e-3, 9e-3]))
+    strip = np.stack([x, height + 0.5 * np.abs(x), z], axis=-1).reshape(-1, 3)
+    garment = make_garment(strip, grid_faces(4, 11))
+    roof, surface = jnp.asarray(ROOF, jnp.float32), prepare_surface(ROOF, ROOF_FACES)
+    here = jnp.asarray(strip, jnp.float32)
+    nearest = find_contacts(here, roof, roof, surface)
+    skin = find_skin_contacts((here, here), (roof, roof), nearest, surface, garment)
+    is_fold = np.asarray(skin.is_near) & (np.sort(skin.corners, axis=1)[:, (0, 2)] == [16, 27]).all(axis=1)
+    assert is_fold.any()
+    np.testing.assert_allclose(np.asarray(skin_heights(here, skin))[is_fold], height, atol=1e-6)
 
 
 def test_a_fold_in_the_ridge_is_pushed_out():

@@ -9,6 +9,7 @@ import pytest
 from cloth import make_garment, make_sheet
 from physics_cases import make_case
 
+from eslr_jax.contact.layer_edges import EdgePairs
 from eslr_jax.contact.self_contact import FacePairs, default_capacity
 from eslr_jax.physics import hessian
 from eslr_jax.physics.bending import bending_energy
@@ -114,6 +115,26 @@ def one_pair(case):
         count=np.int32(1),
         status=np.int32(0),
     )
+
+
+@pytest.mark.numerics
+def test_edge_blocks_are_the_outer_product_of_the_gradient(case64):
+    """As for faces; the two edges are far apart and not perpendicular, so their turning counts."""
+    position, thickness = case64.position, 0.5  # [m]; any depth will do
+    edges = EdgePairs(
+        ends=np.array([[0, 1, 20, 14], [5, 5, 5, 5]], np.int32),
+        weights=np.array([[0.3, 0.7, -0.4, -0.6], [0.0, 0.0, 0.0, 0.0]]),
+        side=np.array([-1.0, 0.0]),
+        areas=np.array([2e-3, 0.0]),
+    )
+    with jax.enable_x64(True):
+        force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, edges, 3.5e7, thickness))
+        height = float(jax.jit(pair_heights)(position, edges)[0][0])
+    (table,) = hessian.pair_table(edges)
+    (block,) = hessian.edge_blocks(position, edges, 3.5e7, thickness)
+    slope = force[table].ravel()
+    expected = np.outer(slope, slope) * 6 / (9 * 3.5e7 * 2e-3 * (thickness - height) ** 3)
+    np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.fixture(scope="module")

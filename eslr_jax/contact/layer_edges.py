@@ -1,0 +1,163 @@
+"""Edges of one layer of cloth over edges of another, where both may cross between vertices that keep apart."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from eslr_jax.contact.edges import cross_lines
+from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, take3
+from eslr_jax.types import Garment
+
+# [m] between two edges at t or at t + 1, within which they are paired: three times the thickness of repulsion.
+_NEAR = 0.01
+_LEAST_COSINE = 0.5  # between the common normal of two edges and the normal of the face that told their side
+
+
+@struct.dataclass
+class EdgePairs:
+    """Pairs of edges of cloth that cross each other and are close; a row that is not used has `side` zero."""
+
+    ends: Int[Array, "rows 4"]  # both of one edge, then both of the other
+    # Of the ends, in the offset between the two nearest places at t: positive on the first edge, whose weights
+    # add up to one, and negative on the second.
+    weights: Float[Array, "rows 4"]
+    side: Float[
+        Array, " rows"
+    ]  # 1 where the first edge is kept along the cross product of both, -1 against it
+    areas: Float[Array, " rows"]  # of cloth that a pair stands for [m^2]
+
+
+def find_edge_pairs(
+    position: Float[Array, "vertices 3"],
+    predicted: Float[Array, "vertices 3"],
+    faces: FacePairs,
+    garment: Garment,
+) -> EdgePairs:
+    """Pair edges of cloth that cross, with the side that the vertices around them have.
+
+    Vertices that keep off faces don't keep two edges from each other. The edges around a vertex may cross the
+    three of a face that it is paired with; on which side of them they belong is the pair's. The rows are the
+    lowest, half as many as there are of vertices and faces: there is no buffer that could run over.
+
+    Args:
+        position: Vertices at t [m], shape [vertices, 3].
+        predicted: A guess of the vertices at t + 1 [m], shape [vertices, 3].
+        faces: Pairs of vertices and faces.
+        garment: Rest mesh.
+    """
+    count = faces.side.shape[0] // 2
+    now, ahead = jax.lax.stop_gradient((position.T, predicted.T))
+    vertices, corners, side = _lowest(now, faces, count)
+    others = garment.neighbors[vertices]  # [starts, degree]
+    is_apart = garment.neighbor_mask[vertices][:, :, None] & ~jnp.any(
+        others[:, :, None] == corners[:, None, :], axis=2, keepdims=True
+    )
+    ends = (
+        vertices[:, None, None],
+        others[:, :, None],
+        corners[:, None, :],
+        jnp.roll(corners, -1, axis=1)[:, None, :],
+    )
+    up = side[None] * jnp.stack(_normal(now, corners))
+    clearance, _, _ = _over(now, ahead, ends, up[:, :, None, None])
+    clearance = jnp.where(is_apart, clearance, jnp.inf)
+    lowest_clearance, lowest = jax.lax.top_k(-clearance.ravel(), count)
+    rows = jnp.stack([jnp.broadcast_to(end, clearance.shape).ravel()[lowest] for end in ends])
+    start = lowest // (clearance.shape[1] * clearance.shape[2])
+    _, weights, sign = _over(position.T, predicted.T, tuple(rows), up[:, start])
+    is_used = (-lowest_clearance < _NEAR) & ~_are_repeated(rows)
+    return EdgePairs(
+        ends=jnp.where(is_used, rows, position.shape[0] - 1).T,
+        weights=jnp.where(is_used, weights, 0.0).T,
+        side=jnp.where(is_used, sign, 0.0),
+        areas=jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0),
+    )
+
+
+def edge_heights(position: Vector3, pairs: EdgePairs) -> tuple[Float[Array, " rows"], Vector3]:
+    """Return how high places of edges are over those of others [m], and the direction that it is measured in.
+
+    d = side sum_k w_k x_k . n, with the unit normal n across both edges at `position`.
+
+    Args:
+        position: Vertices [m], by components.
+        pairs: Edges and places on them.
+    """
+    read = take3(position, pairs.ends.T)
+    ends = tuple(tuple(axis[k] for axis in read) for k in range(4))
+    direction = tuple(pairs.side * axis for axis in _common_normal(*ends))  # type: ignore[arg-type]
+    return dot3(_offset(ends, pairs.weights.T), direction), direction  # type: ignore[arg-type,return-value]
+
+
+def _lowest(
+    now: Float[Array, "3 vertices"], faces: FacePairs, count: int
+) -> tuple[Int[Array, " starts"], Int[Array, "starts 3"], Float[Array, " starts"]]:
+    """Return vertices, corners and sides of the pairs of a vertex and a face that are closest at t."""
+    place = jnp.einsum("pk,xpk->xp", jax.lax.stop_gradient(faces.weights), now[:, faces.corners])
+    squared = jnp.sum(jnp.square(now[:, faces.vertices] - place), axis=0)
+    _, lowest = jax.lax.top_k(-jnp.where(faces.side != 0, squared, jnp.inf), count)
+    return faces.vertices[lowest], faces.corners[lowest], faces.side[lowest]
+
+
+def _normal(now: Float[Array, "3 vertices"], corners: Int[Array, "rows 3"]) -> Vector3:
+    """Return unit normals of faces."""
+    a, b, c = (tuple(now[:, corners[:, k]]) for k in range(3))
+    return tuple(safe_normalize(jnp.stack(cross3(sub3(b, a), sub3(c, a))), axis=0))  # type: ignore[arg-type,return-value]
+
+
+def _over(
+    now: Float[Array, "3 vertices"],
+    ahead: Float[Array, "3 vertices"],
+    ends: tuple[Int[Array, ...], ...],
+    up: Float[Array, "3 ..."],
+) -> tuple[Float[Array, ...], Float[Array, "4 ..."], Float[Array, ...]]:
+    """Return how high edges are over others, at t or t + 1, the lower one [m], weights of the ends, and the side.
+
+    The height is infinite where two edges don't cross, or cross steeply to the layers, or are far from each
+    other.
+
+    Args:
+        now: Vertices at t [m], by components.
+        ahead: At t + 1.
+        ends: Vertices: the ends of the one, and of the other.
+        up: Direction in which the one belongs from the other; zero where nobody knows.
+    """
+    a, b, c, d = (tuple(now[:, end]) for end in ends)
+    first, second, is_crossing = cross_lines((a, b), (c, d))
+    weights = jnp.stack(jnp.broadcast_arrays(1.0 - first, first, second - 1.0, -second))
+    normal = _common_normal(a, b, c, d)
+    along = dot3(normal, tuple(up))  # type: ignore[arg-type]
+    side = jnp.where(along < 0, -1.0, 1.0).astype(now.dtype)
+    over = side * dot3(_offset((a, b, c, d), weights), normal)
+    moved = tuple(tuple(ahead[:, end]) for end in ends)
+    next_over = side * dot3(_offset(moved, weights), _common_normal(*moved))
+    is_pair = is_crossing & (jnp.abs(along) > _LEAST_COSINE) & (jnp.abs(over) < 2.0 * _NEAR)
+    return jnp.where(is_pair, jnp.minimum(over, next_over), jnp.inf), weights, side
+
+
+def _common_normal(a: Vector3, b: Vector3, c: Vector3, d: Vector3) -> Vector3:
+    """Return the unit vectors across two edges."""
+    across = jnp.broadcast_arrays(*cross3(sub3(b, a), sub3(d, c)))
+    return tuple(safe_normalize(jnp.stack(across), axis=0))  # type: ignore[return-value]
+
+
+def _offset(places: tuple[Vector3, ...], weights: Float[Array, "4 ..."]) -> Vector3:
+    """Return the sum of places with weights."""
+    return tuple(
+        sum(weight * place[axis] for weight, place in zip(weights, places, strict=True)) for axis in range(3)
+    )  # type: ignore[return-value]
+
+
+def _are_repeated(rows: Int[Array, "4 rows"]) -> Bool[Array, " rows"]:
+    """Return which pairs were found before, from another of their ends."""
+    low = jnp.minimum(rows[(0, 2), :], rows[(1, 3), :])
+    high = jnp.maximum(rows[(0, 2), :], rows[(1, 3), :])
+    is_turned = low[0] > low[1]
+    keys = [jnp.where(is_turned, x[1 - k], x[k]) for k in range(2) for x in (low, high)]
+    order = jnp.lexsort(keys)
+    is_same = jnp.all(jnp.stack([key[order][1:] == key[order][:-1] for key in keys]), axis=0)
+    return jnp.zeros(rows.shape[1], bool).at[order[1:]].set(is_same)
