@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from eslr_jax.assets import load_garment, load_motion
+from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
@@ -113,3 +113,27 @@ def test_two_pieces_that_meet_are_kept_apart(small_poses):
         assert (prepare_scene(garment, small_poses, options=options).self_contact is not None) == meets
         off = SceneOptions(has_body=False, self_contact=False)
         assert prepare_scene(garment, small_poses, options=off).self_contact is None
+
+
+def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garment, small_poses):
+    """A tight sleeve has no room to fold; a sheet that hangs ten centimetres off the limb has."""
+    from cloth import make_garment, make_sheet
+
+    positions, faces = make_sheet(6, 6, 0.02, jitter=0)
+    loose = make_garment(positions + np.array([0.16, 0.0, 0.0]), faces)
+    folds = SceneOptions(has_folds=True)
+    assert prepare_scene(small_garment, small_poses, options=folds).self_contact is None
+    assert prepare_scene(loose, small_poses).self_contact is None
+    scene = prepare_scene(loose, small_poses, options=folds)
+    assert scene.self_contact is not None
+    assert scene.pieces is None
+    off = SceneOptions(has_folds=True, self_contact=False)
+    assert prepare_scene(loose, small_poses, options=off).self_contact is None
+
+
+def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
+    """Arms that hang bring a sleeve to the trunk, half a garment away at rest."""
+    body = load_body()
+    poses = pose_body(body, load_motion("cmu_016_29"), num_frames=6)
+    shirt = load_garment("tshirt")
+    assert prepare_scene(shirt, poses, options=SceneOptions(has_folds=True)).self_contact is not None

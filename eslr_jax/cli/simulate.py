@@ -117,8 +117,8 @@ def simulate(
             of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
         substeps: Shorter steps in which every frame is simulated; 2 keeps layers apart that swing fast against
             each other. Iterations count for each of them.
-        self_contact: Keep layers of cloth apart, also within one piece; two pieces that can meet are kept apart
-            anyway.
+        self_contact: Keep all layers of cloth apart, also within each garment of an outfit. By default layers of
+            one garment are kept apart where they can meet, and the garments of an outfit from each other.
         no_self_contact: Let layers of cloth pass through each other.
         ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
         wind: Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
@@ -228,6 +228,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
         modelled = SceneOptions(
             self_contact=wanted_self_contact(options),
+            has_folds=method.config.iterations > 0,
             ground=options.ground,
             has_skin=method.config.iterations > 0,
             integrator=integrator,

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.contact.lines import cross_lines
 from eslr_jax.contact.search import following_vertices
-from eslr_jax.numerics import Vector3, dot3, safe_normalize, sub3
+from eslr_jax.numerics import dot3, safe_normalize, sub3
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _BESIDE = 0.01  # [m] beside a place of the body, up to which cloth is over it; time_and_skin.py chose it
 _UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
 _LOOKED_AT = 4  # edges of the cloth for every crossing that is kept
-_LEAST_SINE = 0.1  # of the angle between two edges, below which they are parallel and cross nowhere
 
 
 class Cloth(NamedTuple):
@@ -68,7 +68,6 @@ def find_crossings(
     nearest: Contacts,
     garment: Garment,
     surface: BodySurface,
-    count: int,
 ) -> Crossings:
     """Return where edges of the body leave the cloth faces over their ends, and the cloth is lower than there.
 
@@ -83,8 +82,11 @@ def find_crossings(
         nearest: The nearest body point of every cloth vertex.
         garment: Edges of the cloth.
         surface: Edges of the body.
-        count: Rows to return, those with the least clearance.
+
+    Returns:
+        A third as many rows as there are vertices to start from, those with the least clearance.
     """
+    count = -(-over[0].shape[0] // 3)
     found = [_from_body(over, surface), _from_cloth(nearest, garment, surface, _LOOKED_AT * count)]
 
     def cross(pair: _Edges) -> _Crossing:
@@ -101,12 +103,12 @@ def find_crossings(
         jnp.concatenate([x.ravel() for x in ends])[lowest]
         for ends in zip(*(jnp.broadcast_arrays(*edges[:4]) for edges in found), strict=True)
     )
-    lowest_ones = cross(_Edges(first, second, here, there, jnp.ones_like(first, bool)))
+    kept = cross(_Edges(first, second, here, there, jnp.ones_like(first, bool)))
     return Crossings(
         ends=jnp.stack([first, second], axis=1),
-        weights=jnp.stack([1.0 - lowest_ones.share, lowest_ones.share], axis=1),
-        next_points=lowest_ones.next_point.T,
-        next_normals=lowest_ones.next_normal.T,
+        weights=jnp.stack([1.0 - kept.share, kept.share], axis=1),
+        next_points=kept.next_point.T,
+        next_normals=kept.next_normal.T,
         clearance=-clearance,
         areas=0.5 * (surface.vertex_areas[here] + surface.vertex_areas[there]),
     )
@@ -152,29 +154,6 @@ def _gathered(
 ) -> Float[Array, "columns ..."]:
     """Return rows of several arrays, columns first: one read for all of them."""
     return jnp.moveaxis(jnp.concatenate(parts, axis=1)[vertices], -1, 0)
-
-
-def cross_lines(
-    one: tuple[Vector3, Vector3], other: tuple[Vector3, Vector3]
-) -> tuple[Float[Array, ...], Float[Array, ...], Bool[Array, ...]]:
-    """Return where the lines through two edges are nearest, as shares of the edges, and whether within both.
-
-    Edges that are nearly parallel cross nowhere.
-
-    Args:
-        one: Both ends of edges, by components.
-        other: Of edges of their own; shapes broadcast.
-    """
-    along, across, offset = sub3(one[1], one[0]), sub3(other[1], other[0]), sub3(one[0], other[0])
-    a, b, c = dot3(along, along), dot3(along, across), dot3(across, across)
-    d, e = dot3(along, offset), dot3(across, offset)
-    determinant = a * c - b * b
-    is_crossing = determinant > _LEAST_SINE**2 * a * c
-    inverse = 1.0 / jnp.where(is_crossing, determinant, 1.0)
-    at_one, at_other = (b * e - c * d) * inverse, (a * e - b * d) * inverse
-    for share in (at_one, at_other):
-        is_crossing = is_crossing & (share > 0.0) & (share < 1.0)
-    return at_one, at_other, is_crossing
 
 
 class _Crossing(NamedTuple):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.edges import cross_lines
+from eslr_jax.contact.lines import cross_lines
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, take3
 from eslr_jax.types import Garment

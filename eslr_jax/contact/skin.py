@@ -60,7 +60,7 @@ def find_skin_contacts(
     covered, rows = jax.lax.top_k(-clearance, count)
     corners, weights = corners[rows], weights[rows]
     skin = Skin(*bodies, *normals, clearance[:, None])
-    crossings = find_crossings(moving, skin, (rows, corners), nearest, garment, surface, -(-count // 3))
+    crossings = find_crossings(moving, skin, (rows, corners), nearest, garment, surface)
     areas = jnp.concatenate([surface.vertex_areas[rows], crossings.areas])
     return SkinContacts(
         corners=jnp.concatenate([corners, crossings.ends[:, (0, 1, 1)]]),

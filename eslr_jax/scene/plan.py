@@ -28,6 +28,9 @@ from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material
 # [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
 REACH = 0.08
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
+_FAR_AT_REST = (
+    2.0 * SEARCH_RADIUS
+)  # [m] between places of one piece that may come close; nearer ones bend towards
 _SAMPLED_FRAMES = 12  # frames in which reachable faces, and pieces that meet, are looked for
 _build = jax.jit(build_scene)
 _skin = jax.jit(skin_garment)
@@ -41,6 +44,7 @@ class SceneOptions:
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
     self_contact: bool | None = None  # keep layers of cloth apart; None: where two pieces can meet
+    has_folds: bool = False  # None decides about one piece as well: whether it can meet itself
     has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
     integrator: Integrator = "euler"
     substeps: int = 1  # in which a frame is simulated
@@ -64,7 +68,7 @@ def plan_scene(
     """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
     Self-contact is modelled between two pieces that come close to each other; within one piece it has to be asked
-    for: limbs of the body press cloth into itself, such as trousers at the crotch.
+    for, by `self_contact` or, where it can meet itself, by `has_folds`. Networks are trained without it.
     Its buffer starts small, since `simulate` enlarges it. A pure `rollout` needs `default_capacity` in its place,
     or a look at the trajectory's status.
 
@@ -84,7 +88,7 @@ def plan_scene(
     skinned, radii = np.empty(0), np.empty(0)
     piece, has_layers = piece_of_vertices(garment), options.self_contact
     num_pieces = int(piece.max()) + 1
-    is_undecided = has_layers is None and num_pieces > 1
+    is_undecided = has_layers is None and (num_pieces > 1 or options.has_folds)
     needs_surface = options.has_body and surface is None
     needs_ground = options.has_body and options.ground == "auto"
     if is_undecided or needs_surface or needs_ground:
@@ -92,7 +96,11 @@ def plan_scene(
         radii = options.reach + _looseness(garment, poses)
     if is_undecided:
         is_real = np.asarray(garment.vertex_mask)
-        has_layers = _pieces_meet(piece[is_real], skinned[:, is_real])
+        has_layers = (
+            _pieces_meet(piece[is_real], skinned[:, is_real])
+            if num_pieces > 1
+            else _meets_itself(garment, poses, skinned[:, is_real])
+        )
     if not options.has_body:
         surface = None
     elif surface is None:
@@ -106,7 +114,7 @@ def plan_scene(
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=starting_capacity(len(piece), num_pieces) if has_layers else None,
-        pieces=jnp.asarray(piece) if has_layers and is_undecided else None,
+        pieces=jnp.asarray(piece) if has_layers and is_undecided and num_pieces > 1 else None,
         has_skin=options.has_skin,
         integrator=options.integrator,
         substeps=validate_substeps(options.substeps),
@@ -187,10 +195,11 @@ def prepare_scenes(
         plans = [
             plan.replace(ground=ground_height(motion)) for plan, motion in zip(plans, poses, strict=True)
         ]
+    has_one_piece = any(plan.self_contact is not None and plan.pieces is None for plan in plans)
     capacities = [plan.self_contact for plan in plans if plan.self_contact is not None]
     layers = max(capacities, key=lambda capacity: capacity.pairs, default=None)
     plans = [plan.replace(has_pins=has_pins, self_contact=layers) for plan in plans]
-    if layers is not None and options.self_contact is None:
+    if layers is not None and not has_one_piece:
         plans = [
             plan.replace(pieces=jnp.asarray(piece_of_vertices(garment)))
             for garment, plan in zip(padded, plans, strict=True)
@@ -257,6 +266,27 @@ def _pieces_meet(piece: np.ndarray, skinned: np.ndarray) -> bool:
             one, others = skinned[frame][piece == number], skinned[frame][piece < number]
             if np.isfinite(cKDTree(others).query(one, distance_upper_bound=SEARCH_RADIUS)[0]).any():
                 return True
+    return False
+
+
+def _meets_itself(garment: Garment, poses: BodyMotion, skinned: np.ndarray) -> bool:
+    """Return whether cloth of one piece can touch itself.
+
+    It hangs so far off the body that it can fold, or two places that are far apart at rest come close in a sample
+    of skinned frames, such as a sleeve and the trunk.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion.
+        skinned: Positions of its real vertices [m], shape [frames, vertices, 3].
+    """
+    if np.max(_looseness(garment, poses), initial=0.0) > SEARCH_RADIUS:
+        return True
+    rest = np.asarray(garment.rest_positions)[np.asarray(garment.vertex_mask)]
+    for frame in _sampled(len(skinned)):
+        pairs = cKDTree(skinned[frame]).query_pairs(SEARCH_RADIUS, output_type="ndarray")
+        if np.any(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > _FAR_AT_REST):
+            return True
     return False
 
 

@@ -11,7 +11,7 @@ import pytest
 from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact import crossing, edges, ground, self_contact, skin
+from eslr_jax.contact import crossing, edges, ground, layer_edges, self_contact, skin
 from eslr_jax.fabric import Described, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import air, bending, damping, membrane, repulsion
@@ -26,7 +26,7 @@ SOURCES = {
     "air": (air,),
     "damping": (damping,),
     "skin": (skin, edges),
-    "self-contact": (self_contact, crossing, repulsion),
+    "self-contact": (self_contact, crossing, layer_edges, repulsion),
     "ground": (ground,),
     "bdf2": (frame._second_order,),
     "threads": (membrane.thread_strains,),
