@@ -136,7 +136,7 @@ def info(
         motion: Motion of the scene.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         simulator: Simulator of the scene; the network is the default one.
-        self_contact: Keep layers of cloth apart, also within one piece.
+        self_contact: Keep all layers of cloth apart, also where they don't seem to meet.
         json_: Print as JSON.
     """
     if scene is not None:
@@ -182,7 +182,7 @@ def _show_scene(
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
     config = SimConfig(model=architecture)
-    options = SceneOptions(self_contact=self_contact or None)
+    options = SceneOptions(self_contact=self_contact or None, has_folds=simulator != "network")
     with waiting("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))

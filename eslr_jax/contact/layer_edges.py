@@ -18,30 +18,36 @@ _LEAST_COSINE = 0.5  # between the common normal of two edges and the normal of 
 
 
 @struct.dataclass
-class EdgePairs:
-    """Pairs of edges of cloth that cross each other and are close; a row that is not used has `side` zero."""
+class LayerPairs:
+    """Pairs of places of the cloth that are close at t: a vertex and a face, or two edges that cross.
 
-    ends: Int[Array, "rows 4"]  # both of one edge, then both of the other
-    # Of the ends, in the offset between the two nearest places at t: positive on the first edge, whose weights
-    # add up to one, and negative on the second.
-    weights: Float[Array, "rows 4"]
-    side: Float[
-        Array, " rows"
-    ]  # 1 where the first edge is kept along the cross product of both, -1 against it
-    areas: Float[Array, " rows"]  # of cloth that a pair stands for [m^2]
+    A row that is not used has `side` zero.
+    """
+
+    corners: Int[Array, "pairs 4"]  # a vertex and the face's three, or both ends of one edge and of the other
+    # Of the corners, in the offset between the two nearest places at t: positive on the vertex or the first edge,
+    # where they add up to one, and negative on the face or the second edge.
+    weights: Float[Array, "pairs 4"]
+    side: Float[Array, " pairs"]  # 1 where the first place is kept along the normal, -1 against it
+    areas: Float[Array, " pairs"]  # of cloth that a pair stands for [m^2]
+    is_edge: Bool[Array, " pairs"]
+    count: Int[
+        Array, ""
+    ]  # pairs of a vertex and a face that were found, which may be more than there are rows
+    status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
-def find_edge_pairs(
+def with_edges(
     position: Float[Array, "vertices 3"],
     predicted: Float[Array, "vertices 3"],
     faces: FacePairs,
     garment: Garment,
-) -> EdgePairs:
-    """Pair edges of cloth that cross, with the side that the vertices around them have.
+) -> LayerPairs:
+    """Return pairs of vertices and faces, with those of edges that cross behind them.
 
     Vertices that keep off faces don't keep two edges from each other. The edges around a vertex may cross the
-    three of a face that it is paired with; on which side of them they belong is the pair's. The rows are the
-    lowest, half as many as there are of vertices and faces: there is no buffer that could run over.
+    three of a face that it is paired with; on which side of them they belong is the pair's. The rows of edges are
+    the lowest, half as many as there are of vertices and faces: there is no buffer that could run over.
 
     Args:
         position: Vertices at t [m], shape [vertices, 3].
@@ -70,27 +76,47 @@ def find_edge_pairs(
     start = lowest // (clearance.shape[1] * clearance.shape[2])
     _, weights, sign = _over(position.T, predicted.T, tuple(rows), up[:, start])
     is_used = (-lowest_clearance < _NEAR) & ~_are_repeated(rows)
-    return EdgePairs(
-        ends=jnp.where(is_used, rows, position.shape[0] - 1).T,
-        weights=jnp.where(is_used, weights, 0.0).T,
-        side=jnp.where(is_used, sign, 0.0),
-        areas=jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0),
+    return LayerPairs(
+        corners=jnp.concatenate(
+            [
+                jnp.concatenate([faces.vertices[:, None], faces.corners], axis=1),
+                jnp.where(is_used, rows, position.shape[0] - 1).T,
+            ]
+        ),
+        weights=jnp.concatenate(
+            [
+                jnp.pad(-faces.weights, ((0, 0), (1, 0)), constant_values=1.0),
+                jnp.where(is_used, weights, 0.0).T,
+            ]
+        ),
+        side=jnp.concatenate([faces.side, jnp.where(is_used, sign, 0.0)]),
+        areas=jnp.concatenate([faces.areas, jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0)]),
+        is_edge=jnp.concatenate([jnp.zeros(faces.side.shape, bool), jnp.ones(count, bool)]),
+        count=faces.count,
+        status=faces.status,
     )
 
 
-def edge_heights(position: Vector3, pairs: EdgePairs) -> tuple[Float[Array, " rows"], Vector3]:
-    """Return how high places of edges are over those of others [m], and the direction that it is measured in.
+def layer_heights(position: Vector3, pairs: LayerPairs) -> tuple[Float[Array, " pairs"], Vector3]:
+    """Return how high first places are over second ones [m], and the direction that it is measured in.
 
-    d = side sum_k w_k x_k . n, with the unit normal n across both edges at `position`.
+    d = side sum_k w_k x_k . n, with n the unit normal of the face, or across both edges, at `position`.
 
     Args:
         position: Vertices [m], by components.
-        pairs: Edges and places on them.
+        pairs: Corners, and places on them.
     """
-    read = take3(position, pairs.ends.T)
-    ends = tuple(tuple(axis[k] for axis in read) for k in range(4))
-    direction = tuple(pairs.side * axis for axis in _common_normal(*ends))  # type: ignore[arg-type]
-    return dot3(_offset(ends, pairs.weights.T), direction), direction  # type: ignore[arg-type,return-value]
+    read = take3(position, pairs.corners.T)
+    a, b, c, d = (tuple(axis[k] for axis in read) for k in range(4))
+
+    def choose(edge: Vector3, face: Vector3) -> Vector3:
+        return tuple(jnp.where(pairs.is_edge, x, y) for x, y in zip(edge, face, strict=True))  # type: ignore[return-value]
+
+    # One edge and the other, or the face's sides from its first corner.
+    across = cross3(choose(sub3(b, a), sub3(c, b)), choose(sub3(d, c), sub3(d, b)))  # type: ignore[arg-type]
+    unit = safe_normalize(jnp.stack(across), axis=0)
+    direction = (pairs.side * unit[0], pairs.side * unit[1], pairs.side * unit[2])
+    return dot3(_offset((a, b, c, d), pairs.weights.T), direction), direction  # type: ignore[arg-type]
 
 
 def _lowest(

@@ -67,7 +67,7 @@ def run_field(run: Run, name: str) -> Field:
     if name in _BODY_FIELDS and run.trajectory.body is None:
         raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
     if name == "repulsion-energy" and not run.report.get("self_contact"):
-        raise AssetError(f"{run.name} has no {name}: it was simulated without --self-contact")
+        raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
         return _distances(run)
     garment, material = run_garment(run)
@@ -157,11 +157,8 @@ def energy_shares(
             scaled = scaled.replace(ground=problem.ground.replace(friction_load=load))
         if problem.layers is not None:
             pairs = problem.layers.pairs
-            on_pairs = 0.25 * (factors[pairs.vertices] + factors[pairs.corners].sum(axis=1))
-            pairs = pairs.replace(areas=pairs.areas * on_pairs)
-            edges = problem.layers.edges
-            edges = edges.replace(areas=edges.areas * factors[edges.ends].mean(axis=1))
-            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs, edges=edges))
+            pairs = pairs.replace(areas=pairs.areas * factors[pairs.corners].mean(axis=1))
+            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs))
         return getattr(potential_terms(position, scaled), term)
 
     return jax.grad(total)(jnp.ones_like(garment.vertex_areas))

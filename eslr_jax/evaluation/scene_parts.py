@@ -73,7 +73,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         "self-contact",
         scene.self_contact is not None,
         "layers of cloth keep apart",
-        "one piece, or pieces that don't meet; see --self-contact",
+        "no layers that can meet; see --self-contact",
     )
     varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from eslr_jax.contact.layer_edges import EdgePairs
+from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
@@ -261,21 +261,27 @@ def _friction_blocks(
 
 def layer_blocks(
     position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
-) -> tuple[Float[np.ndarray, "rows 12 12"], ...]:
-    """Return the Hessian of the repulsion per pair in use [N/m]: of vertices and faces, and of edges."""
+) -> Float[np.ndarray, "pairs 12 12"]:
+    """Return the Hessian of the repulsion between layers per pair in use [N/m]; see `pair_blocks`."""
     if problem.layers is None:
-        return ()
-    stiffness = float(problem.constants.repulsion_stiffness)
-    (faces, kept), (edges, kept_edges) = problem.layers.kinds
-    return (
-        pair_blocks(position, faces, stiffness, np.asarray(kept, np.float64)),
-        edge_blocks(position, edges, stiffness, np.asarray(kept_edges, np.float64)),
+        return np.zeros((0, 12, 12))
+    pairs, stiffness = problem.layers.pairs, float(problem.constants.repulsion_stiffness)
+    is_used = np.asarray(pairs.side) != 0
+    weights, is_edge = (np.asarray(x)[is_used] for x in (pairs.weights, pairs.is_edge))
+    corners = position[np.asarray(pairs.corners)[is_used]]
+    offset = np.einsum("pk,pka->pa", np.asarray(weights, np.float64), corners)
+    # From which corner to which the two edges go that the normal is across; see `layer_heights`.
+    ends = np.where(is_edge[:, None], [0, 1, 2, 3], [1, 2, 1, 3])
+    rows = np.arange(len(ends))
+    start, end, other_start, other_end = (corners[rows, ends[:, k]] for k in range(4))
+    sides = end - start, other_end - other_start
+    height, normal, first, second = _turning_height(offset, *sides, np.asarray(pairs.side)[is_used])
+    gradient = weights[:, :, None] * normal[:, None]
+    for corner, turn in zip(ends.T, (-first, first, -second, second), strict=True):
+        gradient[rows, corner] += turn
+    return _barrier_blocks(
+        gradient, height, pairs, stiffness, np.asarray(problem.layers.thickness, np.float64)
     )
-
-
-def layer_tables(problem: FrameProblem) -> tuple[Int[np.ndarray, "rows 4"], ...]:
-    """Return the vertices of the pairs that `layer_blocks` has."""
-    return () if problem.layers is None else tuple(pair_table(pairs) for pairs, _ in problem.layers.kinds)
 
 
 def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
@@ -292,8 +298,8 @@ def pair_table(pairs: Pairs | None, *, is_cloth: bool = True) -> Int[np.ndarray,
     if pairs is None:
         return np.zeros((0, 3 + is_cloth), np.int64)
     is_used = np.asarray(pairs.side) != 0
-    if isinstance(pairs, EdgePairs):
-        return np.asarray(pairs.ends)[is_used]
+    if isinstance(pairs, LayerPairs):
+        return np.asarray(pairs.corners)[is_used]
     corners = np.asarray(pairs.corners)[is_used]
     vertices = np.asarray(pairs.vertices)[is_used, None]
     return np.concatenate([vertices, corners], axis=1) if is_cloth else corners
@@ -330,23 +336,6 @@ def pair_blocks(
     if is_cloth:
         gradient = np.concatenate([normal[:, None], gradient], axis=1)
     return _barrier_blocks(gradient, height, pairs, stiffness, thickness)
-
-
-def edge_blocks(
-    position: Float[np.ndarray, "vertices 3"],
-    edges: EdgePairs,
-    stiffness: float,
-    thickness: Float[np.ndarray, " rows"] | float,
-) -> Float[np.ndarray, "pairs 12 12"]:
-    """Return the Gauss-Newton Hessian of the repulsion per pair of edges in use; see `pair_blocks`."""
-    is_used = np.asarray(edges.side) != 0
-    weights = np.asarray(edges.weights, np.float64)[is_used]
-    ends = position[np.asarray(edges.ends)[is_used]]
-    offset = np.einsum("pk,pka->pa", weights, ends)
-    sides = ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]
-    height, normal, first, second = _turning_height(offset, *sides, np.asarray(edges.side)[is_used])
-    turn = np.stack([-first, first, -second, second], axis=1)
-    return _barrier_blocks(turn + weights[:, :, None] * normal[:, None], height, edges, stiffness, thickness)
 
 
 def _turning_height(

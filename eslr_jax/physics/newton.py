@@ -131,7 +131,7 @@ def _find_bands(problem: FrameProblem) -> _Bands:
     tables = (
         np.asarray(problem.garment.faces),
         np.asarray(problem.garment.hinges),
-        *hessian.layer_tables(problem),
+        hessian.pair_table(None if problem.layers is None else problem.layers.pairs),
         hessian.pair_table(tips, is_cloth=False),
         np.arange(count)[:, None],
     )
@@ -190,7 +190,7 @@ def _newton_direction(
     blocks = (
         hessian.stretch_blocks(x, problem.garment, problem.material),
         hessian.bending_blocks(x, problem.garment, problem.material),
-        *hessian.layer_blocks(x, problem),
+        hessian.layer_blocks(x, problem),
         hessian.tip_blocks(x, problem),
         hessian.vertex_blocks(x, problem),
     )

@@ -136,8 +136,7 @@ def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array
         if body.tips is not None:
             on_body += repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)
     if layers is not None:
-        for pairs, thickness in layers.kinds:
-            repulsion += repulsion_energy(position, pairs, constants.repulsion_stiffness, thickness)
+        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
     return on_body, repulsion
 
 

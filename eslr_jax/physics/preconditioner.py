@@ -97,8 +97,8 @@ def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -
         if tips is not None:
             diagonal += repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
     if problem.layers is not None:
-        for pairs, thickness in problem.layers.kinds:
-            diagonal += repulsion_diagonal(position, pairs, constants.repulsion_stiffness, thickness)
+        stiffness, thickness = constants.repulsion_stiffness, problem.layers.thickness
+        diagonal = diagonal + repulsion_diagonal(position, problem.layers.pairs, stiffness, thickness)
     return diagonal
 
 

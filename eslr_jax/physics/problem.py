@@ -9,7 +9,7 @@ from flax import struct
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
-from eslr_jax.contact.layer_edges import EdgePairs
+from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
@@ -17,7 +17,7 @@ from eslr_jax.physics.air import AirFlow
 from eslr_jax.physics.collision import penetration
 from eslr_jax.physics.damping import PastStrain
 from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.repulsion import Pairs, push_apart
+from eslr_jax.physics.repulsion import push_apart
 from eslr_jax.types import Air, Contacts, Garment, Material, PhysicsConstants
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
@@ -56,15 +56,8 @@ class GroundContact:
 class SelfContact:
     """Contact between layers of the cloth."""
 
-    pairs: FacePairs
+    pairs: LayerPairs
     thickness: Float[Array, " pairs"]  # distance kept [m], see `simulation.frame`
-    edges: EdgePairs
-    edge_thickness: Float[Array, " rows"]  # likewise
-
-    @property
-    def kinds(self) -> tuple[tuple[Pairs, Any], ...]:  # NumPy in float64 references
-        """Pairs and the distances that they keep [m]: of vertices and faces, and of edges."""
-        return (self.pairs, self.thickness), (self.edges, self.edge_thickness)
 
 
 class SecondOrder(NamedTuple):
@@ -167,8 +160,7 @@ def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Flo
         position = push_apart(position, tips.pairs, problem.constants.collision_thickness, tips.next_body)
         position = push_out(problem, position)
     if problem.layers is not None:
-        for pairs, thickness in problem.layers.kinds:
-            position = push_apart(position, pairs, thickness)
+        position = push_apart(position, problem.layers.pairs, problem.layers.thickness)
         position = push_out(problem, position)
     return position
 

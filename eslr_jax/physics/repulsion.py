@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.contact.layer_edges import EdgePairs, edge_heights
+from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
 from eslr_jax.contact.self_contact import FacePairs
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3, take3
 
-Pairs = FacePairs | EdgePairs
+Pairs = FacePairs | LayerPairs
 _SWEEPS = 4  # of `push_apart`
 
 
@@ -25,12 +25,12 @@ def pair_heights(
     """Return every point's height over its face's plane, on the side it is kept on [m], and that direction.
 
     d = side (x_p - sum_k w_k x_k) . n, with the face's unit normal n at `position`; so the energy of d turns
-    with the cloth, and its four forces have no resultant and no moment. For edges it is the height of a place
-    on one over a place on the other, see `edge_heights`. Unused rows give zero.
+    with the cloth, and its four forces have no resultant and no moment. For edges see `layer_heights`. Unused
+    rows give zero.
     """
     x = components(position)
-    if isinstance(pairs, EdgePairs):
-        return edge_heights(x, pairs)
+    if isinstance(pairs, LayerPairs):
+        return layer_heights(x, pairs)
     if next_body is None:  # all four places in one read
         places = take3(x, jnp.concatenate([pairs.vertices[None], pairs.corners.T]))
         point, *corners = (tuple(c[k] for c in places) for k in range(4))
@@ -130,8 +130,8 @@ def _stencil(
     pairs: Pairs, has_points: bool
 ) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
     """Return the vertices of cloth in every pair, and their weights in the offset between both of its places."""
-    if isinstance(pairs, EdgePairs):
-        return pairs.ends.T, pairs.weights.T
+    if isinstance(pairs, LayerPairs):
+        return pairs.corners.T, pairs.weights.T
     ids, weights = pairs.corners.T, -pairs.weights.T
     if has_points:
         ids = jnp.concatenate([pairs.vertices[None], ids])

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.contact.ground import ground_contacts
-from eslr_jax.contact.layer_edges import EdgePairs, find_edge_pairs
+from eslr_jax.contact.layer_edges import LayerPairs, with_edges
 from eslr_jax.contact.nearest import are_pinched, find_both_sides
-from eslr_jax.contact.self_contact import FacePairs, find_self_contacts, find_tip_contacts
+from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
 from eslr_jax.physics.air import air_flow
 from eslr_jax.physics.collision import contact_forces
@@ -25,7 +25,7 @@ from eslr_jax.physics.problem import (
     TipContact,
     contact_thickness,
 )
-from eslr_jax.physics.repulsion import Pairs, pair_heights
+from eslr_jax.physics.repulsion import pair_heights
 from eslr_jax.scene.build import slice_tracks
 from eslr_jax.types import ClothState, PastState, Scene, SceneBody
 
@@ -115,8 +115,8 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
     if scene.self_contact is not None:
         cloth = (state.position, problem.inertial_guess, scene.garment)
         pairs = find_self_contacts(*cloth, scene.self_contact, pieces=scene.pieces)
-        edges = find_edge_pairs(*cloth[:2], pairs, scene.garment)
-        problem = problem.replace(layers=_layers(problem, pairs, edges))
+        pairs = with_edges(*cloth[:2], pairs, scene.garment)
+        problem = problem.replace(layers=_layers(problem, pairs))
     return problem
 
 
@@ -180,7 +180,7 @@ def _body_contact(
     )
 
 
-def _layers(problem: FrameProblem, pairs: FacePairs, edges: EdgePairs) -> SelfContact:
+def _layers(problem: FrameProblem, pairs: LayerPairs) -> SelfContact:
     """Return the contact of a frame between layers of the cloth.
 
     A vertex on the wrong side of a face is asked back by one thickness a frame. Asked back at once, from
@@ -188,12 +188,8 @@ def _layers(problem: FrameProblem, pairs: FacePairs, edges: EdgePairs) -> SelfCo
     of weights.
     """
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
-
-    def kept(rows: Pairs) -> Float[Array, " rows"]:
-        height, _ = pair_heights(problem.position, rows)
-        return thickness + jnp.minimum(height, 0.0)
-
-    return SelfContact(pairs, kept(pairs), edges, kept(edges))
+    height, _ = pair_heights(problem.position, pairs)
+    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0))
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:

@@ -104,7 +104,7 @@ def test_a_run_without_a_body_has_no_field_of_it(runs, name):
 
 
 def test_a_run_without_self_contact_has_no_repulsion(runs):
-    with pytest.raises(AssetError, match="without --self-contact"):
+    with pytest.raises(AssetError, match="without self-contact"):
         run_field(dataclasses.replace(runs[0], report={}), "repulsion-energy")
 
 

@@ -9,7 +9,7 @@ import pytest
 from cloth import make_garment, make_sheet
 from physics_cases import make_case
 
-from eslr_jax.contact.layer_edges import EdgePairs
+from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import FacePairs, default_capacity
 from eslr_jax.physics import hessian
 from eslr_jax.physics.bending import bending_energy
@@ -19,6 +19,7 @@ from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.physics.newton import minimize_newton, potential_float64
 from eslr_jax.physics.potential import evaluate, potential, potential_terms
 from eslr_jax.physics.preconditioner import stiffness
+from eslr_jax.physics.problem import SelfContact
 from eslr_jax.physics.repulsion import pair_heights, repulsion_energy
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_problem
@@ -118,23 +119,32 @@ def one_pair(case):
 
 
 @pytest.mark.numerics
-def test_edge_blocks_are_the_outer_product_of_the_gradient(case64):
-    """As for faces; the two edges are far apart and not perpendicular, so their turning counts."""
+def test_blocks_of_layers_are_the_outer_product_of_the_gradient(case64):
+    """As for tips: a vertex and a face, two edges that are neither near nor perpendicular, and an unused row."""
     position, thickness = case64.position, 0.5  # [m]; any depth will do
-    edges = EdgePairs(
-        ends=np.array([[0, 1, 20, 14], [5, 5, 5, 5]], np.int32),
-        weights=np.array([[0.3, 0.7, -0.4, -0.6], [0.0, 0.0, 0.0, 0.0]]),
-        side=np.array([-1.0, 0.0]),
-        areas=np.array([2e-3, 0.0]),
+    pairs = LayerPairs(
+        corners=np.array([[0, 1, 20, 14], [0, 1, 20, 14], [5, 5, 5, 5]], np.int32),
+        weights=np.array([[1.0, -0.2, -0.3, -0.5], [0.3, 0.7, -0.4, -0.6], [0.0, 0.0, 0.0, 0.0]]),
+        side=np.array([1.0, -1.0, 0.0]),
+        areas=np.array([2e-3, 2e-3, 0.0]),
+        is_edge=np.array([False, True, True]),
+        count=np.int32(1),
+        status=np.int32(0),
     )
-    with jax.enable_x64(True):
-        force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, edges, 3.5e7, thickness))
-        height = float(jax.jit(pair_heights)(position, edges)[0][0])
-    (table,) = hessian.pair_table(edges)
-    (block,) = hessian.edge_blocks(position, edges, 3.5e7, thickness)
-    slope = force[table].ravel()
-    expected = np.outer(slope, slope) * 6 / (9 * 3.5e7 * 2e-3 * (thickness - height) ** 3)
-    np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())
+    layers = SelfContact(pairs, np.full(3, thickness))
+    problem = case64.problem.replace(layers=layers)
+    blocks = hessian.layer_blocks(position, problem)
+    stiffness = float(problem.constants.repulsion_stiffness)
+    for row, block in enumerate(blocks):
+        one = jax.tree.map(lambda leaf, row=row: leaf[row : row + 1] if leaf.ndim else leaf, pairs)
+        with jax.enable_x64(True):
+            force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, one, stiffness, thickness))
+            height = float(jax.jit(pair_heights)(position, one)[0][0])
+        (table,) = hessian.pair_table(one)
+        slope = force[table].ravel()
+        expected = np.outer(slope, slope) * 6 / (9 * stiffness * 2e-3 * (thickness - height) ** 3)
+        np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())
+    assert len(blocks) == 2
 
 
 @pytest.fixture(scope="module")
