@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
 from eslr_jax.contact.self_contact import FacePairs
@@ -107,10 +107,10 @@ def push_apart(
     num_vertices = position.shape[0]
     share = 0.5 if next_body is None else 1.0
     ids, weights = _stencil(pairs, next_body is None)
-    # A place moves by one if corner k of it moves by w_k / |w|^2; weights of the two places differ in sign.
-    is_first = weights > 0
-    squared = weights**2
-    first, second = (jnp.sum(jnp.where(own, squared, 0.0), axis=0) for own in (is_first, ~is_first))
+    # A place moves by one if corner k of it moves by w_k / |w|^2. The sign of a weight doesn't say whose it is:
+    # rounding makes some of a face's a little negative.
+    is_first = _are_first(pairs, len(ids))
+    first, second = (jnp.sum(jnp.where(own, weights**2, 0.0), axis=0) for own in (is_first, ~is_first))
     size = jnp.where(is_first, first, second)
     scale = share * weights / jnp.where(size > 0, size, 1.0)
 
@@ -124,6 +124,14 @@ def push_apart(
         return position + moved[:, :3] / jnp.maximum(moved[:, 3:], 1.0)
 
     return jax.lax.fori_loop(0, _SWEEPS, sweep, position)  # a loop: unrolled, every sweep is compiled anew
+
+
+def _are_first(pairs: Pairs, corners: int) -> Bool[Array, "corners pairs"]:
+    """Return which corners belong to the first place of their pair: of vertices, not of faces."""
+    if isinstance(pairs, LayerPairs):
+        is_edge = pairs.is_edge
+        return jnp.stack([jnp.ones_like(is_edge), is_edge, jnp.zeros_like(is_edge), jnp.zeros_like(is_edge)])
+    return jnp.broadcast_to(jnp.arange(corners)[:, None] < corners - 3, (corners, pairs.side.shape[0]))
 
 
 def _stencil(

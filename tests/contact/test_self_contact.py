@@ -263,6 +263,14 @@ def test_push_apart_ends_the_overlap():
     assert float(height[0]) == pytest.approx(THICKNESS, abs=1e-4)
 
 
+def test_a_tip_over_an_edge_pushes_by_no_more_than_its_depth():
+    """Where a tip is over an edge, rounding may make the third weight negative."""
+    _, position, contacts = pair_of(0.0)
+    contacts = contacts.replace(vertices=jnp.array([0]), weights=jnp.array([[0.5, 0.5 + 6e-8, -6e-8]]))
+    moved = push_apart(position, contacts, THICKNESS, position[3:] - jnp.array([[0.0, 0.001, 0.0]]))
+    assert np.max(np.abs(moved - position)) < 0.02
+
+
 def test_push_apart_leaves_separate_layers_alone(cloth):
     position = jnp.asarray(roll_up(cloth, 0.012, noise=0), jnp.float32)
     contacts = find_self_contacts(position, position, cloth, AMPLE)
