@@ -31,9 +31,7 @@ class LayerPairs:
     side: Float[Array, " pairs"]  # 1 where the first place is kept along the normal, -1 against it
     areas: Float[Array, " pairs"]  # of cloth that a pair stands for [m^2]
     is_edge: Bool[Array, " pairs"]
-    count: Int[
-        Array, ""
-    ]  # pairs of a vertex and a face that were found, which may be more than there are rows
+    count: Int[Array, ""]  # pairs of a vertex and a face found, perhaps more than there are rows
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
