@@ -112,7 +112,7 @@ def test_a_field_is_plotted_over_time_and_leads_to_its_worst_frame(view):
     view.controls["color"].value = "repulsion-energy"
     show(view)
     view.runs[0].report["self_contact"] = True
-    assert "without --self-contact" in view.controls["legend"].content
+    assert "without self-contact" in view.controls["legend"].content
 
 
 @pytest.mark.slow
