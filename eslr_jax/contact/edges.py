@@ -89,21 +89,21 @@ def find_crossings(
     count = -(-over[0].shape[0] // 3)
     found = [_from_body(over, surface), _from_cloth(nearest, garment, surface, _LOOKED_AT * count)]
 
-    def cross(pair: _Edges) -> _Crossing:
+    def cross(first: Array, second: Array, here: Array, there: Array) -> _Crossing:
         return _cross(
-            [_gathered(cloth, end) for end in (pair.first, pair.second)],
-            [_gathered(skin, end) for end in (pair.here, pair.there)],
+            [_gathered(cloth, end) for end in (first, second)],
+            [_gathered(skin, end) for end in (here, there)],
         )
 
     clearance = jnp.concatenate(
-        [jnp.where(edges.is_real, cross(edges).clearance, jnp.inf).ravel() for edges in found]
+        [jnp.where(edges.is_real, cross(*edges[:4]).clearance, jnp.inf).ravel() for edges in found]
     )
     clearance, lowest = jax.lax.top_k(-clearance, count)
     first, second, here, there = (
         jnp.concatenate([x.ravel() for x in ends])[lowest]
         for ends in zip(*(jnp.broadcast_arrays(*edges[:4]) for edges in found), strict=True)
     )
-    kept = cross(_Edges(first, second, here, there, jnp.ones_like(first, bool)))
+    kept = cross(first, second, here, there)
     return Crossings(
         ends=jnp.stack([first, second], axis=1),
         weights=jnp.stack([1.0 - kept.share, kept.share], axis=1),

@@ -111,8 +111,7 @@ def layer_heights(position: Vector3, pairs: LayerPairs) -> tuple[Float[Array, " 
         return tuple(jnp.where(pairs.is_edge, x, y) for x, y in zip(edge, face, strict=True))  # type: ignore[return-value]
 
     # One edge and the other, or the face's sides from its first corner.
-    across = cross3(choose(sub3(b, a), sub3(c, b)), choose(sub3(d, c), sub3(d, b)))  # type: ignore[arg-type]
-    unit = safe_normalize(jnp.stack(across), axis=0)
+    unit = _across(choose(sub3(b, a), sub3(c, b)), choose(sub3(d, c), sub3(d, b)))  # type: ignore[arg-type]
     direction = (pairs.side * unit[0], pairs.side * unit[1], pairs.side * unit[2])
     return dot3(_offset((a, b, c, d), pairs.weights.T), direction), direction  # type: ignore[arg-type]
 
@@ -130,7 +129,7 @@ def _lowest(
 def _normal(now: Float[Array, "3 vertices"], corners: Int[Array, "rows 3"]) -> Vector3:
     """Return unit normals of faces."""
     a, b, c = (tuple(now[:, corners[:, k]]) for k in range(3))
-    return tuple(safe_normalize(jnp.stack(cross3(sub3(b, a), sub3(c, a))), axis=0))  # type: ignore[arg-type,return-value]
+    return _across(sub3(b, a), sub3(c, a))  # type: ignore[arg-type]
 
 
 def _over(
@@ -153,20 +152,19 @@ def _over(
     a, b, c, d = (tuple(now[:, end]) for end in ends)
     first, second, is_crossing = cross_lines((a, b), (c, d))
     weights = jnp.stack(jnp.broadcast_arrays(1.0 - first, first, second - 1.0, -second))
-    normal = _common_normal(a, b, c, d)
+    normal = _across(sub3(b, a), sub3(d, c))  # type: ignore[arg-type]
     along = dot3(normal, tuple(up))  # type: ignore[arg-type]
     side = jnp.where(along < 0, -1.0, 1.0).astype(now.dtype)
     over = side * dot3(_offset((a, b, c, d), weights), normal)
-    moved = tuple(tuple(ahead[:, end]) for end in ends)
-    next_over = side * dot3(_offset(moved, weights), _common_normal(*moved))
+    a, b, c, d = moved = tuple(tuple(ahead[:, end]) for end in ends)
+    next_over = side * dot3(_offset(moved, weights), _across(sub3(b, a), sub3(d, c)))  # type: ignore[arg-type]
     is_pair = is_crossing & (jnp.abs(along) > _LEAST_COSINE) & (jnp.abs(over) < 2.0 * _NEAR)
     return jnp.where(is_pair, jnp.minimum(over, next_over), jnp.inf), weights, side
 
 
-def _common_normal(a: Vector3, b: Vector3, c: Vector3, d: Vector3) -> Vector3:
-    """Return the unit vectors across two edges."""
-    across = jnp.broadcast_arrays(*cross3(sub3(b, a), sub3(d, c)))
-    return tuple(safe_normalize(jnp.stack(across), axis=0))  # type: ignore[return-value]
+def _across(first: Vector3, second: Vector3) -> Vector3:
+    """Return the unit vectors across two edges, which may broadcast."""
+    return tuple(safe_normalize(jnp.stack(cross3(first, second)), axis=0))  # type: ignore[return-value]
 
 
 def _offset(places: tuple[Vector3, ...], weights: Float[Array, "4 ..."]) -> Vector3:

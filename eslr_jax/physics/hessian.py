@@ -267,9 +267,9 @@ def layer_blocks(
         return np.zeros((0, 12, 12))
     pairs, stiffness = problem.layers.pairs, float(problem.constants.repulsion_stiffness)
     is_used = np.asarray(pairs.side) != 0
-    weights, is_edge = (np.asarray(x)[is_used] for x in (pairs.weights, pairs.is_edge))
+    weights, is_edge = np.asarray(pairs.weights, np.float64)[is_used], np.asarray(pairs.is_edge)[is_used]
     corners = position[np.asarray(pairs.corners)[is_used]]
-    offset = np.einsum("pk,pka->pa", np.asarray(weights, np.float64), corners)
+    offset = np.einsum("pk,pka->pa", weights, corners)
     # From which corner to which the two edges go that the normal is across; see `layer_heights`.
     ends = np.where(is_edge[:, None], [0, 1, 2, 3], [1, 2, 1, 3])
     rows = np.arange(len(ends))

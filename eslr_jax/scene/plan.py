@@ -85,7 +85,7 @@ def plan_scene(
     """
     options = options or SceneOptions()
     check_length(poses)
-    skinned, radii = np.empty(0), np.empty(0)
+    skinned, looseness = np.empty(0), np.empty(0)
     piece, has_layers = piece_of_vertices(garment), options.self_contact
     num_pieces = int(piece.max()) + 1
     is_undecided = has_layers is None and (num_pieces > 1 or options.has_folds)
@@ -93,13 +93,14 @@ def plan_scene(
     needs_ground = options.has_body and options.ground == "auto"
     if is_undecided or needs_surface or needs_ground:
         skinned = np.asarray(_skin(garment, poses.joint_transforms))
-        radii = options.reach + _looseness(garment, poses)
+        looseness = _looseness(garment, poses)
+    radii = options.reach + looseness
     if is_undecided:
         is_real = np.asarray(garment.vertex_mask)
         has_layers = (
             _pieces_meet(piece[is_real], skinned[:, is_real])
             if num_pieces > 1
-            else _meets_itself(garment, poses, skinned[:, is_real])
+            else _meets_itself(garment, looseness, skinned[:, is_real])
         )
     if not options.has_body:
         surface = None
@@ -269,7 +270,7 @@ def _pieces_meet(piece: np.ndarray, skinned: np.ndarray) -> bool:
     return False
 
 
-def _meets_itself(garment: Garment, poses: BodyMotion, skinned: np.ndarray) -> bool:
+def _meets_itself(garment: Garment, looseness: np.ndarray, skinned: np.ndarray) -> bool:
     """Return whether cloth of one piece can touch itself.
 
     It hangs so far off the body that it can fold, or two places that are far apart at rest come close in a sample
@@ -277,10 +278,10 @@ def _meets_itself(garment: Garment, poses: BodyMotion, skinned: np.ndarray) -> b
 
     Args:
         garment: A prepared garment.
-        poses: The body in motion.
+        looseness: How far its real vertices hang from the body at rest [m].
         skinned: Positions of its real vertices [m], shape [frames, vertices, 3].
     """
-    if np.max(_looseness(garment, poses), initial=0.0) > SEARCH_RADIUS:
+    if np.max(looseness, initial=0.0) > SEARCH_RADIUS:
         return True
     rest = np.asarray(garment.rest_positions)[np.asarray(garment.vertex_mask)]
     for frame in _sampled(len(skinned)):
