@@ -60,7 +60,7 @@ def make_scenes(garments: list[Any], motions: list[Any]) -> list[Scene]:
     """Return every garment on every motion: scenes of one shape, which share a program, garment by garment."""
     count = len(motions)
     cloths = [garment for garment in garments for _ in range(count)]
-    options = SceneOptions(has_skin=True)
+    options = SceneOptions(has_skin=True, has_folds=True)
     return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths), options=options)
 
 

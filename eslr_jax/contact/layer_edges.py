@@ -74,22 +74,28 @@ def with_edges(
     start = lowest // (clearance.shape[1] * clearance.shape[2])
     _, weights, sign = _over(position.T, predicted.T, tuple(rows), up[:, start])
     is_used = (-lowest_clearance < _NEAR) & ~_are_repeated(rows)
+    edges = LayerPairs(
+        corners=jnp.where(is_used, rows, position.shape[0] - 1).T,
+        weights=jnp.where(is_used, weights, 0.0).T,
+        side=jnp.where(is_used, sign, 0.0),
+        areas=jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0),
+        is_edge=jnp.ones(count, bool),
+        count=faces.count,
+        status=faces.status,
+    )
+    return jax.tree.map(
+        lambda face, edge: jnp.concatenate([face, edge]) if face.ndim else face, without_edges(faces), edges
+    )
+
+
+def without_edges(faces: FacePairs) -> LayerPairs:
+    """Return pairs of vertices and faces of the cloth as pairs of layers."""
     return LayerPairs(
-        corners=jnp.concatenate(
-            [
-                jnp.concatenate([faces.vertices[:, None], faces.corners], axis=1),
-                jnp.where(is_used, rows, position.shape[0] - 1).T,
-            ]
-        ),
-        weights=jnp.concatenate(
-            [
-                jnp.pad(-faces.weights, ((0, 0), (1, 0)), constant_values=1.0),
-                jnp.where(is_used, weights, 0.0).T,
-            ]
-        ),
-        side=jnp.concatenate([faces.side, jnp.where(is_used, sign, 0.0)]),
-        areas=jnp.concatenate([faces.areas, jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0)]),
-        is_edge=jnp.concatenate([jnp.zeros(faces.side.shape, bool), jnp.ones(count, bool)]),
+        corners=jnp.concatenate([faces.vertices[:, None], faces.corners], axis=1),
+        weights=jnp.pad(-faces.weights, ((0, 0), (1, 0)), constant_values=1.0),
+        side=faces.side,
+        areas=faces.areas,
+        is_edge=jnp.zeros(faces.side.shape, bool),
         count=faces.count,
         status=faces.status,
     )

@@ -64,6 +64,21 @@ class FacePairs:
     status: Int[Array, ""]  # Status.SELF_CONTACT_OVERFLOW if a capacity was too small
 
 
+@struct.dataclass
+class TipPairs:
+    """Pairs of a vertex of the body, a tip, and a face of the cloth that are close at t.
+
+    A row that is not used has `side` zero.
+    """
+
+    next_points: Float[Array, "pairs 3"]  # the tips at t + 1 [m]
+    corners: Int[Array, "pairs 3"]  # vertices of the face
+    weights: Float[Array, "pairs 3"]  # as of `FacePairs`, like what follows
+    side: Float[Array, " pairs"]
+    areas: Float[Array, " pairs"]  # [m^2]
+    status: Int[Array, ""]
+
+
 def default_capacity(num_vertices: int) -> PairCapacity:
     """Return the buffers that hold the self-contact of nearly any garment of so many vertices."""
     return PairCapacity(pairs=PAIRS_PER_VERTEX * num_vertices)
@@ -120,7 +135,7 @@ def find_tip_contacts(
     next_body: Float[Array, "surface_vertices 3"],
     blocks: Int[Array, "blocks rows"],
     garment: Garment,
-) -> FacePairs:
+) -> TipPairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 
     The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh. The body's
@@ -139,7 +154,9 @@ def find_tip_contacts(
     areas = jnp.full(count, garment.mean_vertex_area)
     points = _Points(_ends(body, next_body), jnp.ones(count, bool), areas, blocks)
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
-    return _find_pairs(points, cloth, TIP_RADIUS, capacity)
+    faces = _find_pairs(points, cloth, TIP_RADIUS, capacity)
+    next_points = next_body[faces.vertices]
+    return TipPairs(next_points, faces.corners, faces.weights, faces.side, faces.areas, faces.status)
 
 
 def _ends(

@@ -13,8 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from eslr_jax.contact.layer_edges import LayerPairs
-from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import Pairs
@@ -290,51 +289,38 @@ def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem)
         return np.zeros((0, 9, 9))
     constants, tips = problem.constants, problem.body.tips
     stiffness, thickness = float(constants.collision_stiffness), float(constants.collision_thickness)
-    return pair_blocks(position, tips.pairs, stiffness, thickness, np.asarray(tips.next_body))
+    return pair_blocks(position, tips, stiffness, thickness)
 
 
-def pair_table(pairs: Pairs | None, *, is_cloth: bool = True) -> Int[np.ndarray, "pairs corners"]:
-    """Return the vertices of cloth in every pair in use."""
+def pair_table(pairs: Pairs | None, num_corners: int) -> Int[np.ndarray, "pairs corners"]:
+    """Return the vertices of cloth in every pair in use: four of layers, three of tips."""
     if pairs is None:
-        return np.zeros((0, 3 + is_cloth), np.int64)
-    is_used = np.asarray(pairs.side) != 0
-    if isinstance(pairs, LayerPairs):
-        return np.asarray(pairs.corners)[is_used]
-    corners = np.asarray(pairs.corners)[is_used]
-    vertices = np.asarray(pairs.vertices)[is_used, None]
-    return np.concatenate([vertices, corners], axis=1) if is_cloth else corners
+        return np.zeros((0, num_corners), np.int64)
+    return np.asarray(pairs.corners)[np.asarray(pairs.side) != 0]
 
 
 def pair_blocks(
     position: Float[np.ndarray, "vertices 3"],
-    pairs: FacePairs,
+    pairs: TipPairs,
     stiffness: float,
-    thickness: Float[np.ndarray, " rows"] | float,
-    next_body: Float[np.ndarray, "surface_vertices 3"] | None = None,
-) -> Float[np.ndarray, "pairs size size"]:
-    """Return the Gauss-Newton Hessian of the repulsion per pair in use: 6 k a depth g g^T, g = dd/dx.
+    thickness: float,
+) -> Float[np.ndarray, "pairs 9 9"]:
+    """Return the Gauss-Newton Hessian of the repulsion of tips per pair in use: 6 k a depth g g^T, g = dd/dx.
 
     Args:
         position: Vertex positions [m].
-        pairs: Points and faces.
+        pairs: Tips of the body, which don't move, and faces of the cloth.
         stiffness: k [J/m^5].
         thickness: Distance kept [m].
-        next_body: Body vertices at t + 1 [m], where the points are the body's and don't move.
     """
-    is_cloth = next_body is None
     is_used = np.asarray(pairs.side) != 0
-    points = (position if next_body is None else np.asarray(next_body, np.float64))[
-        np.asarray(pairs.vertices)
-    ]
-    point, weights = points[is_used], np.asarray(pairs.weights, np.float64)[is_used]
+    point, weights = (np.asarray(one, np.float64)[is_used] for one in (pairs.next_points, pairs.weights))
     corners = position[np.asarray(pairs.corners)[is_used]]
     offset = point - np.einsum("pk,pka->pa", weights, corners)
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     height, normal, first, second = _turning_height(offset, *edges, np.asarray(pairs.side)[is_used])
     turn = np.stack([-first - second, first, second], axis=1)
     gradient = turn - weights[:, :, None] * normal[:, None]
-    if is_cloth:
-        gradient = np.concatenate([normal[:, None], gradient], axis=1)
     return _barrier_blocks(gradient, height, pairs, stiffness, thickness)
 
 

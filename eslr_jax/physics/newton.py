@@ -127,12 +127,11 @@ def _find_bands(problem: FrameProblem) -> _Bands:
     """Order the free vertices so that the matrix has a narrow band, and map the blocks' entries to it."""
     is_free = _free_vertices(problem)
     count = len(is_free)
-    tips = None if problem.body is None or problem.body.tips is None else problem.body.tips.pairs
     tables = (
         np.asarray(problem.garment.faces),
         np.asarray(problem.garment.hinges),
-        hessian.pair_table(None if problem.layers is None else problem.layers.pairs),
-        hessian.pair_table(tips, is_cloth=False),
+        hessian.pair_table(None if problem.layers is None else problem.layers.pairs, 4),
+        hessian.pair_table(None if problem.body is None else problem.body.tips, 3),
         np.arange(count)[:, None],
     )
     coupled = _plate_couples(problem)

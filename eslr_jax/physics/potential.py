@@ -134,7 +134,7 @@ def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array
         if body.skin is not None:
             on_body += skin_energy(position, body.skin, stiffness, thickness)
         if body.tips is not None:
-            on_body += repulsion_energy(position, body.tips.pairs, stiffness, thickness, body.tips.next_body)
+            on_body += repulsion_energy(position, body.tips, stiffness, thickness)
     if layers is not None:
         repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
     return on_body, repulsion

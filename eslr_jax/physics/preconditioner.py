@@ -95,7 +95,7 @@ def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -
         if skin is not None:
             diagonal += skin_diagonal(position, skin, stiffness, thickness)
         if tips is not None:
-            diagonal += repulsion_diagonal(position, tips.pairs, stiffness, thickness, tips.next_body)
+            diagonal += repulsion_diagonal(position, tips, stiffness, thickness)
     if problem.layers is not None:
         stiffness, thickness = constants.repulsion_stiffness, problem.layers.thickness
         diagonal = diagonal + repulsion_diagonal(position, problem.layers.pairs, stiffness, thickness)

@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.layer_edges import LayerPairs
-from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.air import AirFlow
@@ -24,14 +24,6 @@ _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that clo
 
 
 @struct.dataclass
-class TipContact:
-    """Contact of the body's own vertices with the faces of the cloth, for tips finer than its mesh."""
-
-    pairs: FacePairs
-    next_body: Float[Array, "surface_vertices 3"]  # at t + 1 [m]
-
-
-@struct.dataclass
 class BodyContact:
     """Contact of the cloth's vertices with the body."""
 
@@ -40,7 +32,7 @@ class BodyContact:
     friction_load: Float[Array, " vertices"]  # normal force at t [N]
     thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
     skin: SkinContacts | None = None  # None: skin may show between vertices
-    tips: TipContact | None = None  # None: a tip may pass between vertices
+    tips: TipPairs | None = None  # None: a tip may pass between vertices
 
 
 @struct.dataclass
@@ -156,8 +148,7 @@ def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Flo
     solver only halves the depth.
     """
     if problem.body is not None and problem.body.tips is not None:
-        tips = problem.body.tips
-        position = push_apart(position, tips.pairs, problem.constants.collision_thickness, tips.next_body)
+        position = push_apart(position, problem.body.tips, problem.constants.collision_thickness)
         position = push_out(problem, position)
     if problem.layers is not None:
         position = push_apart(position, problem.layers.pairs, problem.layers.thickness)

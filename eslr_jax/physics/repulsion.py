@@ -1,6 +1,7 @@
-"""Repulsion: a one-sided cubic barrier between a point and the plane of a face of cloth, or between two edges.
+"""Repulsion: a one-sided cubic barrier between layers of cloth, or between cloth and tips of the body.
 
-The points are vertices of the same cloth (self-contact), or of the body (`next_body`, which does not give way).
+Layers are vertices over faces and edges over edges (`LayerPairs`). Tips are vertices of the body over faces of
+the cloth (`TipPairs`); they don't give way.
 """
 
 from __future__ import annotations
@@ -10,33 +11,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
-from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3, take3
 
-Pairs = FacePairs | LayerPairs
+Pairs = LayerPairs | TipPairs
 _SWEEPS = 4  # of `push_apart`
 
 
 def pair_heights(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: Pairs,
-    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> tuple[Float[Array, " pairs"], Vector3]:
-    """Return every point's height over its face's plane, on the side it is kept on [m], and that direction.
+    """Return how high the first place of every pair is on the side it is kept on [m], and that direction.
 
     d = side (x_p - sum_k w_k x_k) . n, with the face's unit normal n at `position`; so the energy of d turns
-    with the cloth, and its four forces have no resultant and no moment. For edges see `layer_heights`. Unused
-    rows give zero.
+    with the cloth. The forces between layers have no resultant and no moment; see `layer_heights`. Unused rows
+    give zero.
     """
     x = components(position)
     if isinstance(pairs, LayerPairs):
         return layer_heights(x, pairs)
-    if next_body is None:  # all four places in one read
-        places = take3(x, jnp.concatenate([pairs.vertices[None], pairs.corners.T]))
-        point, *corners = (tuple(c[k] for c in places) for k in range(4))
-    else:
-        point, places = take3(components(next_body), pairs.vertices), take3(x, pairs.corners.T)
-        corners = [tuple(c[k] for c in places) for k in range(3)]
+    point, places = components(pairs.next_points), take3(x, pairs.corners.T)
+    corners = [tuple(c[k] for c in places) for k in range(3)]
     weights = [pairs.weights[:, k] for k in range(3)]
     foot = tuple(sum(weights[k] * corners[k][axis] for k in range(3)) for axis in range(3))
     normal = cross3(sub3(corners[1], corners[0]), sub3(corners[2], corners[0]))  # type: ignore[arg-type]
@@ -49,10 +45,9 @@ def overlaps(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: Pairs,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
-    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " pairs"]:
     """Return max(thickness - d, 0) per pair [m]; zero where a row is not used."""
-    height, _ = pair_heights(position, pairs, next_body)
+    height, _ = pair_heights(position, pairs)
     return jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
 
 
@@ -61,21 +56,19 @@ def repulsion_energy(
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
-    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, ""]:
     """Return stiffness sum_pairs a_p max(thickness - d, 0)^3 [J].
 
     Args:
         position: Cloth vertices at t + 1 [m].
-        pairs: Points and faces that are close at t, with the areas a_p.
+        pairs: Places that are close at t, with the areas a_p.
         stiffness: [J/m^5].
         thickness: Distance kept [m].
-        next_body: Body vertices at t + 1 [m], where the points are the body's.
 
     Source: ContourCraft (arXiv 2405.09522), its repulsion loss, with areas in place of its count of vertices
         and the nearest place on the face in place of a corner.
     """
-    depth = overlaps(position, pairs, thickness, next_body)
+    depth = overlaps(position, pairs, thickness)
     return stiffness * jnp.sum(pairs.areas * depth * depth * depth)
 
 
@@ -84,12 +77,11 @@ def repulsion_diagonal(
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
-    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, " vertices"]:
     """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal."""
-    depth = overlaps(position, pairs, thickness, next_body)
+    depth = overlaps(position, pairs, thickness)
     curvature = 2.0 * stiffness * pairs.areas * depth
-    ids, weights = _stencil(pairs, next_body is None)
+    ids, weights = _stencil(pairs)
     return segment_sum((weights**2 * curvature[None]).ravel(), ids.ravel(), position.shape[0])
 
 
@@ -97,7 +89,6 @@ def push_apart(
     position: Float[Array, "vertices 3"],
     pairs: Pairs,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
-    next_body: Float[Array, "surface_vertices 3"] | None = None,
 ) -> Float[Array, "vertices 3"]:
     """Move the sides of every overlapping pair apart, a few times: both by half, or the cloth by all of it.
 
@@ -105,8 +96,8 @@ def push_apart(
     of several pairs moves by the mean of what they ask for.
     """
     num_vertices = position.shape[0]
-    share = 0.5 if next_body is None else 1.0
-    ids, weights = _stencil(pairs, next_body is None)
+    share = 0.5 if isinstance(pairs, LayerPairs) else 1.0
+    ids, weights = _stencil(pairs)
     # A place moves by one if corner k of it moves by w_k / |w|^2. The sign of a weight doesn't say whose it is:
     # rounding makes some of a face's a little negative.
     is_first = _are_first(pairs, len(ids))
@@ -115,7 +106,7 @@ def push_apart(
     scale = share * weights / jnp.where(size > 0, size, 1.0)
 
     def sweep(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        height, direction = pair_heights(position, pairs, next_body)
+        height, direction = pair_heights(position, pairs)
         depth = jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
         touched = ((weights != 0) & (depth > 0)[None]).astype(position.dtype)
         lift = depth[:, None] * jnp.stack(direction, axis=-1)
@@ -127,21 +118,14 @@ def push_apart(
 
 
 def _are_first(pairs: Pairs, corners: int) -> Bool[Array, "corners pairs"]:
-    """Return which corners belong to the first place of their pair: of vertices, not of faces."""
+    """Return which corners belong to the first place of their pair; none where that is a tip of the body."""
     if isinstance(pairs, LayerPairs):
         is_edge = pairs.is_edge
         return jnp.stack([jnp.ones_like(is_edge), is_edge, jnp.zeros_like(is_edge), jnp.zeros_like(is_edge)])
-    return jnp.broadcast_to(jnp.arange(corners)[:, None] < corners - 3, (corners, pairs.side.shape[0]))
+    return jnp.zeros((corners, pairs.side.shape[0]), bool)
 
 
-def _stencil(
-    pairs: Pairs, has_points: bool
-) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
+def _stencil(pairs: Pairs) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
     """Return the vertices of cloth in every pair, and their weights in the offset between both of its places."""
-    if isinstance(pairs, LayerPairs):
-        return pairs.corners.T, pairs.weights.T
-    ids, weights = pairs.corners.T, -pairs.weights.T
-    if has_points:
-        ids = jnp.concatenate([pairs.vertices[None], ids])
-        weights = jnp.concatenate([jnp.ones_like(weights[:1]), weights])
-    return ids, weights
+    sign = 1.0 if isinstance(pairs, LayerPairs) else -1.0
+    return pairs.corners.T, sign * pairs.weights.T

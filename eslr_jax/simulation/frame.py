@@ -22,7 +22,6 @@ from eslr_jax.physics.problem import (
     GroundContact,
     SecondOrder,
     SelfContact,
-    TipContact,
     contact_thickness,
 )
 from eslr_jax.physics.repulsion import pair_heights
@@ -166,10 +165,9 @@ def _body_contact(
         pinched = are_pinched(nearest, opposing)
         skin = skin.replace(is_near=skin.is_near & ~jnp.any(pinched[skin.corners], axis=1))
     if body.is_sharp:
-        pairs = find_tip_contacts(
+        tips = find_tip_contacts(
             problem.position, problem.inertial_guess, *step, body.surface.patch_vertices, garment
         )
-        tips = TipContact(pairs, step.end)
     return BodyContact(
         nearest=nearest,
         opposing=opposing,

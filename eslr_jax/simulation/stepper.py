@@ -181,5 +181,5 @@ def problem_status(problem: FrameProblem) -> Int[Array, ""]:
         is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & problem.garment.vertex_mask)
         status = status | jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
         if problem.body.tips is not None:
-            status = status | problem.body.tips.pairs.status
+            status = status | problem.body.tips.status
     return status

@@ -7,7 +7,8 @@ import pytest
 from cloth import make_garment, make_sheet
 
 from eslr_jax.contact import self_contact
-from eslr_jax.contact.self_contact import FacePairs
+from eslr_jax.contact.layer_edges import LayerPairs, without_edges
+from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
@@ -180,20 +181,21 @@ def test_padding_changes_no_pair(cloth):
     plain = find_self_contacts(position, position, cloth, AMPLE)
     other = find_self_contacts(grown, grown, padded, AMPLE)
     assert found_pairs(cloth, plain) == found_pairs(padded, other)
-    energies = [repulsion(x, pairs, STIFFNESS, 0.02)[0] for x, pairs in ((position, plain), (grown, other))]
+    cloths = ((position, plain), (grown, other))
+    energies = [repulsion(x, without_edges(pairs), STIFFNESS, 0.02)[0] for x, pairs in cloths]
     np.testing.assert_allclose(*energies, rtol=1e-6)
 
 
-def pair_of(height, side=1.0, dtype=jnp.float32):
+def pair_of(height, dtype=jnp.float32):
     """One vertex over one triangle, in a garment of four vertices."""
     garment = make_cloth(2, 2, 0.1)
     position = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, -0.1], [0.03, height, -0.04]])
-    contacts = FacePairs(
-        vertices=jnp.array([3]),
-        corners=jnp.array([[0, 1, 2]]),
-        weights=jnp.array([[0.3, 0.3, 0.4]], dtype),
-        side=jnp.array([side], dtype),
+    contacts = LayerPairs(
+        corners=jnp.array([[3, 0, 1, 2]]),
+        weights=jnp.array([[1.0, -0.3, -0.3, -0.4]], dtype),
+        side=jnp.ones(1, dtype),
         areas=jnp.asarray(garment.vertex_areas[3:], dtype),
+        is_edge=jnp.zeros(1, bool),
         count=jnp.int32(1),
         status=jnp.int32(0),
     )
@@ -238,7 +240,7 @@ def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
         u, v = contacts.weights[:, 1], contacts.weights[:, 2]
         contacts = contacts.replace(weights=jnp.stack([1 - u - v, u, v], axis=-1))
         x = jnp.asarray(roll_up(cloth, seed=3), jnp.float64)
-        forces = -np.asarray(repulsion(x, contacts, STIFFNESS, 0.01)[1])
+        forces = -np.asarray(repulsion(x, without_edges(contacts), STIFFNESS, 0.01)[1])
         size = np.abs(forces).sum()
         assert size > 1.0, "a newton, and hundreds of pairs"
         np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-12 * size)
@@ -246,7 +248,7 @@ def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
 
 
 def test_energy_is_finite_on_degenerate_faces_and_coincident_vertices(cloth, spiral_contacts):
-    position, contacts = jnp.asarray(roll_up(cloth), jnp.float32), spiral_contacts
+    position, contacts = jnp.asarray(roll_up(cloth), jnp.float32), without_edges(spiral_contacts)
     flat = position * jnp.array([[1.0, 0.0, 0.0]])
     for x in (flat, jnp.zeros_like(position)):
         value, gradient = repulsion(x, contacts, STIFFNESS, THICKNESS)
@@ -265,16 +267,23 @@ def test_push_apart_ends_the_overlap():
 
 def test_a_tip_over_an_edge_pushes_by_no_more_than_its_depth():
     """Where a tip is over an edge, rounding may make the third weight negative."""
-    _, position, contacts = pair_of(0.0)
-    contacts = contacts.replace(vertices=jnp.array([0]), weights=jnp.array([[0.5, 0.5 + 6e-8, -6e-8]]))
-    moved = push_apart(position, contacts, THICKNESS, position[3:] - jnp.array([[0.0, 0.001, 0.0]]))
+    garment, position, _ = pair_of(0.0)
+    contacts = TipPairs(
+        next_points=jnp.array([[0.05, -0.001, 0.0]]),
+        corners=jnp.array([[0, 1, 2]]),
+        weights=jnp.array([[0.5, 0.5 + 6e-8, -6e-8]]),
+        side=jnp.ones(1),
+        areas=jnp.asarray(garment.vertex_areas[:1]),
+        status=jnp.int32(0),
+    )
+    moved = push_apart(position, contacts, THICKNESS)
     assert np.max(np.abs(moved - position)) < 0.02
 
 
 def test_push_apart_leaves_separate_layers_alone(cloth):
     position = jnp.asarray(roll_up(cloth, 0.012, noise=0), jnp.float32)
     contacts = find_self_contacts(position, position, cloth, AMPLE)
-    np.testing.assert_array_equal(push(position, contacts, THICKNESS), position)
+    np.testing.assert_array_equal(push(position, without_edges(contacts), THICKNESS), position)
 
 
 def test_diagonal_bounds_a_third_of_the_curvature():
@@ -294,10 +303,12 @@ def test_a_tip_between_vertices_meets_the_face_over_it():
     x = garment.rest_positions
     pairs = jax.jit(self_contact.find_tip_contacts)(x, x, body, body, jnp.array([[0], [1]]), garment)
     assert int(pairs.status) == Status.OK
-    assert found_pairs(garment, pairs)[0, face] == -1.0  # below a sheet that faces up
-    assert set(np.asarray(pairs.vertices)[np.asarray(pairs.side) != 0]) == {0}, "the other point is far"
-    height, _ = pair_heights(x, pairs, body)
-    np.testing.assert_allclose(height[0], 5e-3, rtol=1e-4)
+    is_used = np.asarray(pairs.side) != 0
+    assert np.all(np.asarray(pairs.next_points)[is_used] == np.asarray(body)[:1]), "the other point is far"
+    (row,) = np.flatnonzero(is_used & np.all(np.asarray(pairs.corners) == corners[None], axis=1))
+    assert pairs.side[row] == -1.0, "below a sheet that faces up"
+    height, _ = pair_heights(x, pairs)
+    np.testing.assert_allclose(height[row], 5e-3, rtol=1e-4)
 
 
 def test_the_place_on_the_face_has_the_derivative_that_central_differences_have():

@@ -10,7 +10,7 @@ from cloth import make_garment, make_sheet
 from physics_cases import make_case
 
 from eslr_jax.contact.layer_edges import LayerPairs
-from eslr_jax.contact.self_contact import FacePairs, default_capacity
+from eslr_jax.contact.self_contact import TipPairs, default_capacity
 from eslr_jax.physics import hessian
 from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
@@ -105,15 +105,14 @@ def test_vertex_blocks_equal_the_hessian(case64):
 
 
 def one_pair(case):
-    """The first vertex over the last face, and a row that is not used."""
+    """A tip beside the first vertex, the last face, and a row that is not used."""
     vertices, faces = np.array([0, 5], np.int32), np.asarray(case.problem.garment.faces)[[-1, 7]]
-    return FacePairs(
-        vertices=vertices,
+    return TipPairs(
+        next_points=np.asarray(case.position)[vertices] + 0.01,
         corners=faces,
         weights=np.array([[0.2, 0.3, 0.5], [1 / 3, 1 / 3, 1 / 3]]),
         side=np.array([-1.0, 0.0]),
         areas=np.asarray(case.problem.garment.vertex_areas)[vertices],
-        count=np.int32(1),
         status=np.int32(0),
     )
 
@@ -140,7 +139,7 @@ def test_blocks_of_layers_are_the_outer_product_of_the_gradient(case64):
         with jax.enable_x64(True):
             force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, one, stiffness, thickness))
             height = float(jax.jit(pair_heights)(position, one)[0][0])
-        (table,) = hessian.pair_table(one)
+        (table,) = hessian.pair_table(one, 4)
         slope = force[table].ravel()
         expected = np.outer(slope, slope) * 6 / (9 * stiffness * 2e-3 * (thickness - height) ** 3)
         np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())
@@ -172,18 +171,16 @@ def two_layers():
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("is_cloth", [True, False], ids=["layers", "tip"])
-def test_pair_blocks_are_the_outer_product_of_the_gradient(case64, is_cloth):
+def test_blocks_of_tips_are_the_outer_product_of_the_gradient(case64):
     """E = k a d^3: 6 k a d g g^T, and the energy's own gradient is -3 k a d^2 g. Unused rows give no block."""
     pairs, position, thickness = one_pair(case64), case64.position, 0.5  # [m]; any depth will do
-    body = None if is_cloth else position + 0.01
     with jax.enable_x64(True):
-        force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, pairs, 3.5e7, thickness, body))
-        height = float(jax.jit(pair_heights)(position, pairs, body)[0][0])
+        force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, pairs, 3.5e7, thickness))
+        height = float(jax.jit(pair_heights)(position, pairs)[0][0])
     depth = thickness - height
-    table = hessian.pair_table(pairs, is_cloth=is_cloth)
-    assert table.shape == (1, 3 + is_cloth)
-    (block,) = hessian.pair_blocks(position, pairs, 3.5e7, thickness, body)
+    table = hessian.pair_table(pairs, 3)
+    assert table.shape == (1, 3)
+    (block,) = hessian.pair_blocks(position, pairs, 3.5e7, thickness)
     slope = force[table[0]].ravel()
     expected = np.outer(slope, slope) * 6 / (9 * 3.5e7 * pairs.areas[0] * depth**3)
     np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())
