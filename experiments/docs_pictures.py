@@ -28,6 +28,7 @@ from PIL import Image
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.motion import pose_body
 from eslr_jax.body.rig import make_body
+from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.fields import Field, run_field
 from eslr_jax.evaluation.foreign import foreign_trajectory
@@ -46,7 +47,7 @@ from eslr_jax.physics.materials import WOVEN, fabric_names
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.simulate import simulate
+from eslr_jax.simulation.simulate import last_frames, simulate
 
 RESULTS = Path(__file__).parent / "results"
 COPIED = {
@@ -112,14 +113,17 @@ def shoot(
     vertices: Literal["1k", "4k", "10k"] = "1k",
     **options: Any,
 ) -> Shot:
-    """Simulate garments on a walk, as `eslr simulate` does."""
+    """Put garments on and simulate them on a walk, as `eslr simulate` does."""
     body = load_body()
     poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
     stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
     cloth = prepare_stored(stored, name="+".join(garments))
-    modelled = SceneOptions(has_skin=True, integrator="bdf2", **options)
-    scene = prepare_scene(cloth, poses, material=garment_material(fabric, cloth, stored), options=modelled)
-    return Shot(stored, body, poses, scene, simulate(None, scene, config=_CONFIG).trajectory)
+    modelled = SceneOptions(has_skin=True, has_folds=True, integrator="bdf2", **options)
+    moving = with_settling(poses, SETTLE_FRAMES, body)
+    scene = prepare_scene(cloth, moving, material=garment_material(fabric, cloth, stored), options=modelled)
+    run = simulate(None, scene, config=_CONFIG)
+    trajectory, scene = last_frames(run.trajectory, run.scene, frames)
+    return Shot(stored, body, poses, scene, trajectory)
 
 
 def figures(
@@ -215,7 +219,7 @@ def fabrics(frames: int) -> np.ndarray:
     pictures = []
     for name in names:
         end, _, faces, _ = hang(name, **size)
-        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(240, 180))
+        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(180, 110), zoom=1.3)
         pictures.append(next(picture))
     return side_by_side(pictures, names, columns=4)
 

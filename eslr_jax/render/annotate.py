@@ -12,6 +12,7 @@ from eslr_jax.render.colors import color_scale
 _INK = (60, 60, 66)  # sRGB bytes
 _PAPER = 255
 _GAP = 4  # [pixels] between pictures
+_LEAST_TEXT = 14  # [pixels] high; smaller is not read on a scaled sheet
 
 
 def write_label(picture: np.ndarray, text: str) -> np.ndarray:
@@ -22,7 +23,7 @@ def write_label(picture: np.ndarray, text: str) -> np.ndarray:
         text: One line.
     """
     image = require("PIL.Image").fromarray(picture)
-    height = max(9, picture.shape[0] // 26)
+    height = max(_LEAST_TEXT, picture.shape[0] // 26)
     _draw_text(image, (height // 2, height // 3), text, height)
     return np.asarray(image)
 

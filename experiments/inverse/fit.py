@@ -26,7 +26,7 @@ from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.render.pictures import render_frame
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Garment, Scene
+from eslr_jax.types import Body, Garment, Scene
 
 BAR = 1.08  # largest principal stretch
 TIGHT = -0.03  # [m], how far the shirt is taken in
@@ -54,9 +54,8 @@ def vertex_normals(garment: Garment) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def make_scene(num_frames: int) -> Scene:
+def make_scene(body: Body, num_frames: int) -> Scene:
     """Return the T-shirt as it is cut, on a body that stands still."""
-    body = load_body()
     scene = prepare_scene(load_garment("tshirt"), pose_body(body, still_motion(body, num_frames)))
     return scene.replace(timestep=jnp.float32(TIMESTEP))
 
@@ -66,7 +65,8 @@ def main() -> None:
     options = parse_options(__doc__)
     frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 9)
     config = SimConfig(iterations=20 if options.smoke else 100)
-    scene = make_scene(frames)
+    body = load_body()
+    scene = make_scene(body, frames)
     garment = scene.garment
     weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
     normals = jnp.asarray(vertex_normals(garment), jnp.float32)
@@ -112,7 +112,7 @@ def main() -> None:
         },
         "loss_1e-4": {"lbfgs": min(by_gradient.losses), "nelder_mead": min(simplex.losses)},
     }
-    figure = draw(scene, worn, by_gradient.losses, simplex.losses, cost)
+    figure = draw(body, scene, worn, by_gradient.losses, simplex.losses, cost)
     keep(options.out, Path(__file__).stem, result, figure)
 
 
@@ -123,19 +123,30 @@ def stretch_below(share: float, stretch: jax.Array, areas: np.ndarray) -> float:
     return float(np.asarray(stretch)[order][np.searchsorted(covered, share)])
 
 
-def draw(scene: Scene, worn: dict, losses: list[float], free: list[float], cost: float) -> plt.Figure:
+def draw(
+    body: Body, scene: Scene, worn: dict, losses: list[float], free: list[float], cost: float
+) -> plt.Figure:
     """Return the shirts, coloured by stretch, and both searches."""
     figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained")
-    body, faces = scene.body, np.asarray(scene.garment.faces)
-    for axis, name in zip(axes, ("tight", "lbfgs"), strict=False):
+    faces, standing = np.asarray(scene.garment.faces), pose_body(body, still_motion(body, 2))
+    names = {"tight": "as it is cut", "lbfgs": "let out by gradients"}
+    for axis, (name, title) in zip(axes, names.items(), strict=False):
         positions, stretch = (np.asarray(part) for part in worn[name])
         count = np.maximum(np.bincount(faces.ravel(), minlength=len(positions)), 1)
         mean = np.bincount(faces.ravel(), np.repeat(stretch, 3), minlength=len(positions)) / count
         colors = plt.get_cmap("coolwarm")(np.clip((mean - 1) / (2 * (BAR - 1)), 0, 1))[:, :3]
-        axis.imshow(
-            render_frame(body.positions[-1], body.surface.faces, positions, faces, vertex_colors=colors)
+        picture = render_frame(
+            standing.positions[-1],
+            body.faces,
+            positions,
+            faces,
+            vertex_colors=colors,
+            rest_positions=body.rest_positions,
+            rig=body,
+            zoom=1.6,
         )
-        axis.set(title=f"{name}\nstretch: blue 1, grey {BAR}, red {2 * BAR - 1:.2f}")
+        axis.imshow(picture)
+        axis.set(title=f"{title}\nstretch: blue 1, grey {BAR}, red {2 * BAR - 1:.2f}")
         axis.axis("off")
     curve = axes[2]
     curve.semilogy(cost * np.arange(1, len(losses) + 1), np.minimum.accumulate(losses), label="L-BFGS")

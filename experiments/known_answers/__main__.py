@@ -59,7 +59,7 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
 
     if drapes:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
-    figure, (left, others, right) = plt.subplots(1, 3, figsize=(16, 8), layout="constrained")
+    figure, (left, others, right) = plt.subplots(1, 3, figsize=(18, 10), layout="constrained")
     for axes, part, limit, title in (
         (left, "answers", 5, "ours"),
         (others, "peers", 60, "other simulators"),
@@ -67,10 +67,11 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
         _draw_errors(axes, result.get(part, []), limit)
         axes.set_title(title)
     walk = result.get("walk", [])
-    right.bar([f"{row['what']}: {row['setting']}" for row in walk], [row["rms_mm"] for row in walk])
-    right.set_yscale("log")
-    right.set_ylabel("distance from its refinement, rms [mm]")
-    right.tick_params(axis="x", rotation=90, labelsize=7)
+    right.barh([f"{row['what']}: {row['setting']}" for row in walk], [row["rms_mm"] for row in walk])
+    right.set_title("a walk: what its error comes from")
+    right.set_xlabel("distance from its refinement, rms [mm]")
+    right.tick_params(axis="y", labelsize=10)
+    right.invert_yaxis()
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
@@ -85,7 +86,7 @@ def _draw_drapes(drapes: list, path: Path) -> None:
         x, y = (place % 3) * columns, -(place // 3) * 1.25 * rows
         axes.imshow(~one.outline.T, extent=(x, x + columns, y, y + rows), cmap="gray")
         label = f"{one.fabric} {100 * one.coefficient:.0f} %"
-        axes.text(x + columns / 2, y - 0.1 * rows, label, ha="center", size=7)
+        axes.text(x + columns / 2, y - 0.1 * rows, label, ha="center", size=9)
     axes.autoscale()
     axes.set_axis_off()
     axes.set_title("Cusick's drape: shadows and coefficients")
@@ -108,11 +109,11 @@ def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
                 f"{error:.0f} %",
                 ha="right" if side > 0 else "left",
                 va="center",
-                size=6,
+                size=9,
             )
     axes.set_xlim(-limit, limit)
     axes.set_xlabel("error [%]")
-    axes.tick_params(axis="y", labelsize=6)
+    axes.tick_params(axis="y", labelsize=9)
     axes.invert_yaxis()
 
 
