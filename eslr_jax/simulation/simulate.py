@@ -22,7 +22,7 @@ from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
 
-_HEADROOM = 1.5  # of a buffer made larger: later frames may need more, and every size compiles anew
+_HEADROOM = 1.25  # of a buffer made larger: later frames may need more
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
 Pace = Callable[[int, float], int]
@@ -227,7 +227,8 @@ def _without_frames(scene: Scene) -> Scene:
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
     """Return the scene with larger buffers where a rollout had too little room for self-contact, else None.
 
-    The buffer gets what the fullest frame asked for and half as much again.
+    The buffer is doubled until it holds what the fullest frame asked for, and a quarter more. Every size is
+    compiled anew, so scenes of one shape share a few sizes.
 
     Args:
         scene: The scene that was simulated.
@@ -240,10 +241,11 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
         or scene.self_contact is None
     ):
         return None
-    pairs = int(np.max(np.asarray(trajectory.pair_demand)))
-    if pairs <= scene.self_contact.pairs:
+    pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
+    if pairs <= room:
         return None
-    return scene.replace(self_contact=PairCapacity(pairs=math.ceil(_HEADROOM * pairs)))
+    doublings = math.ceil(math.log2(_HEADROOM * pairs / room))
+    return scene.replace(self_contact=PairCapacity(pairs=room * 2**doublings))
 
 
 def good_frames(trajectory: Trajectory) -> Trajectory:
