@@ -219,7 +219,7 @@ def fabrics(frames: int) -> np.ndarray:
     pictures = []
     for name in names:
         end, _, faces, _ = hang(name, **size)
-        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(180, 110), zoom=1.3)
+        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(190, 110), zoom=1.1)
         pictures.append(next(picture))
     return side_by_side(pictures, names, columns=4)
 
