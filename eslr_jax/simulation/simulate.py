@@ -23,6 +23,9 @@ from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
 
 _HEADROOM = 1.25  # of a buffer made larger: later frames may need more
+# Sizes of buffers from one to twice as large. With doubled buffers, half of whose rows are pairs of edges, the
+# layers of a dress tore at each other: the fewer rows of edges beyond need, the better.
+_SIZES = 4
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
 Pace = Callable[[int, float], int]
@@ -227,8 +230,8 @@ def _without_frames(scene: Scene) -> Scene:
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
     """Return the scene with larger buffers where a rollout had too little room for self-contact, else None.
 
-    The buffer is doubled until it holds what the fullest frame asked for, and a quarter more. Every size is
-    compiled anew, so scenes of one shape share a few sizes.
+    The buffer holds what the fullest frame asked for and a quarter more, rounded up. Every size is compiled
+    anew, so scenes of one shape share a few sizes.
 
     Args:
         scene: The scene that was simulated.
@@ -244,8 +247,8 @@ def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
     pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
     if pairs <= room:
         return None
-    doublings = math.ceil(math.log2(_HEADROOM * pairs / room))
-    return scene.replace(self_contact=PairCapacity(pairs=room * 2**doublings))
+    steps = math.ceil(_SIZES * math.log2(_HEADROOM * pairs / room))
+    return scene.replace(self_contact=PairCapacity(pairs=round(room * 2 ** (steps / _SIZES))))
 
 
 def good_frames(trajectory: Trajectory) -> Trajectory:

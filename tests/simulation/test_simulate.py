@@ -185,9 +185,9 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     assert enlarge_buffers(found.scene, expected) is None
 
 
-def test_buffers_double_until_they_hold_the_fullest_frame_and_a_quarter_more(scene, whole):
+def test_buffers_grow_by_shared_sizes_until_they_hold_the_fullest_frame_and_a_quarter_more(scene, whole):
     tight = scene.replace(self_contact=PairCapacity(pairs=20))
-    for most, pairs in ((21, 40), (33, 80), (60, 80), (65, 160), (40, 80)):
+    for most, pairs in ((21, 28), (33, 48), (38, 48), (60, 80), (64, 80), (65, 95), (40, 57)):
         demand = jnp.array([0] * 5 + [most] + [10] * 8)
         full = whole.replace(pair_demand=demand, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
         assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=pairs)
