@@ -51,6 +51,7 @@ from eslr_jax.viewer.live_controls import (
 MOST_RECORDED = 1800  # frames: a minute
 _FEWEST = 15  # iterations: fewer save little time, and cloth lags behind the body
 _SHOWN = 10  # frames over which times are averaged
+_PAGE = 0.003  # [s] of a frame that the page's own thread gets; without it the page falls behind
 _PATIENCE = 0.4  # [s] for which a choice must stand before it is loaded: a slider passes many
 
 
@@ -138,8 +139,8 @@ def run_live(
         on_frame: Called after every frame.
     """
     until = until or threading.Event()
+    due = time.perf_counter()
     while not until.is_set():
-        began = time.perf_counter()
         try:
             is_moved = one_frame(live)
         except EslrError as error:
@@ -149,7 +150,10 @@ def run_live(
         if is_moved:
             on_frame()
         timestep = 1 / 30 if live.cast is None else float(live.cast.poses.timestep)
-        until.wait(max(timestep - (time.perf_counter() - began), 0.002))
+        # Due a timestep after the last frame was, not after it began: waits that last too long would add up.
+        now = time.perf_counter()
+        due = max(due + timestep, now)
+        until.wait(max(due - now, 0.5 * _PAGE))
 
 
 def one_frame(live: Live) -> bool:
@@ -173,6 +177,7 @@ def one_frame(live: Live) -> bool:
     live.asked.clear()
     if live.state is None:
         live.state, live.step = cast.stage.scene.initial_state, 0
+    began = time.perf_counter()
     frames = _frames_of(live.step, cast)
     fabric = read_fabric(live.controls)
     with (
@@ -180,11 +185,9 @@ def one_frame(live: Live) -> bool:
         if live.is_compiled
         else _busy(live, "compiling, which is kept for the next time")
     ):
-        began = time.perf_counter()
         stage = changed(cast.stage, fabric, read_wind(live.controls), _hand(live))
         tolerance = read_tolerance(live.controls)
         step = jax.block_until_ready(advance(stage, live.state, frames, live.iterations, tolerance))
-        took = time.perf_counter() - began
     if live.state is None:  # restarted meanwhile
         return False
     status = Status(int(step.state.status))
@@ -193,12 +196,12 @@ def one_frame(live: Live) -> bool:
         live.controls["status"].content = f"put on anew: {status.describe()}"
         return False
     live.state, live.step = step.state, live.step + 1
-    if live.is_compiled:
-        live.times = [*live.times[-_SHOWN + 1 :], took]
-    live.is_compiled = True
     if live.controls["record"].value:
         live.recorded.append((frames[1], jax.tree.map(np.asarray, step.state)))
     _show(live, cast, frames[1])
+    if live.is_compiled:
+        live.times = [*live.times[-_SHOWN + 1 :], time.perf_counter() - began]
+    live.is_compiled = True
     live.controls["constants"].content = describe_fabric(fabric)
     if live.times:
         _tell(live, cast, step.report, tolerance)
@@ -323,7 +326,7 @@ def _tell(live: Live, cast: Cast, report: FrameReport, tolerance: float) -> None
     iterations, bound = int(report.iterations), float(report.gap_bound)
     took, timestep = float(np.median(live.times)), float(cast.poses.timestep)
     if live.controls["keep_up"].value:
-        share = timestep / took
+        share = (timestep - _PAGE) / took
         wanted = 0.9 * share * live.iterations if share < 1.0 else 1.1 * live.iterations + 1.0
         live.iterations = int(np.clip(wanted, _FEWEST, MOST_ITERATIONS))
     else:
