@@ -100,7 +100,7 @@ def push_apart(
     ids, weights = _stencil(pairs)
     # A place moves by one if corner k of it moves by w_k / |w|^2. The sign of a weight doesn't say whose it is:
     # rounding makes some of a face's a little negative.
-    is_first = _are_first(pairs, len(ids))
+    is_first = _are_first(pairs)
     first, second = (jnp.sum(jnp.where(own, weights**2, 0.0), axis=0) for own in (is_first, ~is_first))
     size = jnp.where(is_first, first, second)
     scale = share * weights / jnp.where(size > 0, size, 1.0)
@@ -117,12 +117,12 @@ def push_apart(
     return jax.lax.fori_loop(0, _SWEEPS, sweep, position)  # a loop: unrolled, every sweep is compiled anew
 
 
-def _are_first(pairs: Pairs, corners: int) -> Bool[Array, "corners pairs"]:
+def _are_first(pairs: Pairs) -> Bool[Array, "corners pairs"]:
     """Return which corners belong to the first place of their pair; none where that is a tip of the body."""
     if isinstance(pairs, LayerPairs):
         is_edge = pairs.is_edge
         return jnp.stack([jnp.ones_like(is_edge), is_edge, jnp.zeros_like(is_edge), jnp.zeros_like(is_edge)])
-    return jnp.zeros((corners, pairs.side.shape[0]), bool)
+    return jnp.zeros(pairs.corners.T.shape, bool)
 
 
 def _stencil(pairs: Pairs) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
