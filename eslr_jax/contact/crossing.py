@@ -14,6 +14,10 @@ _LEAST_COSINE = 0.2
 # [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
 # around another one they are then on the other side than at rest.
 _NEXT_LAYER = 0.02
+# [m] between a vertex and a face at rest, beyond which the rest mesh says nothing: the walls of a pleat, far apart
+# around the body at rest, may meet with either side. With all pairs, a dress on a walk (`cmu_016_29`, eight starts
+# that differ by 1e-5 m) ended in 0 to 487 crossing pairs, a mean of 22 a frame; with 0.06 in 0 to 19, a mean of 3.
+_REST_REACH = 0.06
 
 
 def sides_where_crossed(
@@ -55,14 +59,16 @@ def _sides_at_rest(
     """
     rest = garment.rest_positions
     corner = rest[corners]  # [pairs, 3, 3]
-    line = safe_normalize(rest[vertices] - jnp.sum(weights[:, :, None] * corner, axis=1))
+    offset = rest[vertices] - jnp.sum(weights[:, :, None] * corner, axis=1)
+    is_within_reach = jnp.sum(jnp.square(offset), axis=1) < _REST_REACH**2
+    line = safe_normalize(offset)
     face = safe_normalize(jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     normals = vertex_normals(rest, garment.faces, garment.face_incidence)
     at_face = jnp.sum(line * face, axis=-1)
     at_vertex = jnp.sum(line * normals[vertices], axis=-1)
     is_stacked = at_face * at_vertex > _LEAST_COSINE**2
     clearness = jnp.where(is_stacked, at_face, at_face - at_vertex)
-    return jnp.where(jnp.abs(clearness) > _LEAST_COSINE, jnp.sign(clearness), 0.0)
+    return jnp.where(is_within_reach & (jnp.abs(clearness) > _LEAST_COSINE), jnp.sign(clearness), 0.0)
 
 
 def _are_crossed(

@@ -23,8 +23,7 @@ from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
 
 _HEADROOM = 1.25  # of a buffer made larger: later frames may need more
-# Sizes of buffers from one to twice as large. A buffer has half as many rows of edges besides: where buffers were
-# doubled, the layers of a dress tore at each other. The fewer rows of edges beyond need, the better.
+# Sizes of buffers from one to twice as large: few, since each is compiled, and close, since every row costs time.
 _SIZES = 4
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 

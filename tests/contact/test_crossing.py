@@ -48,7 +48,7 @@ def found(points, garment):
 @pytest.mark.parametrize("upwards", [1.0, -1.0])
 def test_a_valley_that_closes_too_far_opens_from_where_it_crosses(upwards):
     flat, faces = sheet()
-    garment = make_garment(opened(flat, 1.2 * upwards), faces)
+    garment = make_garment(opened(flat, 2.2 * upwards), faces)
     for crosses in (False, True):
         vertices, sides = found(folded(flat, crosses=crosses, upwards=upwards), garment)
         beyond = np.abs(flat[vertices, 0]) - CROSSING
@@ -58,6 +58,17 @@ def test_a_valley_that_closes_too_far_opens_from_where_it_crosses(upwards):
         assert (sides[is_far] == (-upwards if crosses else upwards)).all()
         if crosses:
             assert np.sum(sides[(beyond > 0) & ~is_far] == upwards) >= 12
+
+
+@pytest.mark.parametrize(("angle", "is_near"), [(2.2, True), (0.4, False)])
+def test_sides_far_apart_at_rest_are_left_out_where_they_cross(angle, is_near):
+    # The sides are 42 mm times 2 cos(angle / 2) apart at rest where they cross: 38 mm, or 82 mm.
+    flat, faces = sheet()
+    vertices, sides = found(folded(flat, crosses=True), make_garment(opened(flat, angle), faces))
+    beyond = np.abs(flat[vertices, 0]) - CROSSING
+    is_asked_back = (beyond > 0) & (beyond <= SPACING) & (sides == 1.0)
+    assert (is_asked_back.sum() >= 12) == is_near
+    assert is_near or not is_asked_back.any()
 
 
 def test_stacked_layers_that_cross_go_back_to_their_order_from_where_they_cross():
