@@ -14,9 +14,9 @@ _LEAST_COSINE = 0.2
 # [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
 # around another one they are then on the other side than at rest.
 _NEXT_LAYER = 0.02
-# [m] between a vertex and a face at rest, beyond which the rest mesh says nothing: the walls of a pleat, far apart
-# around the body at rest, may meet with either side. With all pairs, a dress on a walk (`cmu_016_29`, eight starts
-# that differ by 1e-5 m) ended in 0 to 487 crossing pairs, a mean of 22 a frame; with 0.06 in 0 to 19, a mean of 3.
+# [m] between a vertex and a face at rest. Beyond it the rest mesh says nothing: the walls of a pleat, far apart
+# around the body at rest, may meet with either side, and one that takes the wrong side tears its neighbours. See
+# `experiments/README.md`, what was tried.
 _REST_REACH = 0.06
 
 
@@ -29,8 +29,8 @@ def sides_where_crossed(
     """Return the sides of pairs; those that pass through each other, and are close, have the rest mesh's.
 
     All others stay as they are. Where a pair crosses, whatever keeps it so would lock it. Of those that are
-    farther apart, or that the rest mesh says nothing about, nobody knows the side: they are left out, and may
-    slide free.
+    farther apart, now or at rest, or that the rest mesh says nothing about, nobody knows the side: they are left
+    out, and may slide free.
 
     Args:
         position: Vertices [m].
