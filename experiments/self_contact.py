@@ -3,7 +3,7 @@
     python experiments/self_contact.py [--garments tshirt pants] [--starts 3] [--smoke] [--out DIR]
 
 Garments on the six test clips with what `eslr simulate` models: put on over the rest pose, BDF2, skin contacts, a
-tolerance of 1 %. The third row of every clip begins on the first pose instead. The referee of the hard cases
+tolerance of 1 %. The last row of every clip begins on the first pose instead. The referee of the hard cases
 counts intersecting pairs of faces of the cloth. Folds are chaotic: what the command models is also simulated from
 starts that differ by 1e-5 m. Writes self_contact_1k.json.
 """
@@ -42,15 +42,15 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
     poses = pose_body(body, load_motion(clip), num_frames=frames)
     surface = shared_surface([cloth], poses)  # all clips then share a program
     rows = []
-    kinds = [(True, False, 0), *((True, True, start) for start in range(starts)), (False, False, 0)]
-    for is_put_on, has_layers, start in kinds:
+    kinds = [(True, False, 0), *((True, True, number) for number in range(starts)), (False, False, 0)]
+    for is_put_on, has_layers, number in kinds:
         options = SceneOptions(self_contact=has_layers, has_skin=True, integrator="bdf2")
         moving = with_settling(poses, SETTLE_FRAMES, body if is_put_on else None)
-        scene = moved(prepare_scene(cloth, moving, surface=surface, options=options), start)
+        scene = moved(prepare_scene(cloth, moving, surface=surface, options=options), number)
         run = simulate(None, scene, config=CONFIG)
         positions = np.asarray(run.trajectory.positions)
         row: dict[str, Any] = {"garment": garment, "clip": clip, "vertices": vertices}
-        row |= {"put_on": is_put_on, "self_contact": has_layers, "number": start}
+        row |= {"put_on": is_put_on, "self_contact": has_layers, "number": number}
         row["start"] = judge(positions[0], np.asarray(cloth.faces)).cloth_cloth
         counts = [
             judge(position, np.asarray(cloth.faces)).cloth_cloth
@@ -69,12 +69,12 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
     return rows
 
 
-def moved(scene: Scene, start: int) -> Scene:
-    """Return a scene that begins a little elsewhere; start zero is where it is."""
-    if start == 0:
+def moved(scene: Scene, number: int) -> Scene:
+    """Return a scene that begins a little elsewhere; number zero is where it is."""
+    if number == 0:
         return scene
     state = scene.initial_state
-    noise = np.random.default_rng(start).normal(scale=_STARTS_APART, size=state.position.shape)
+    noise = np.random.default_rng(number).normal(scale=_STARTS_APART, size=state.position.shape)
     return scene.replace(initial_state=state.replace(position=state.position + noise.astype(np.float32)))
 
 

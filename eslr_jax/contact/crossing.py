@@ -39,8 +39,8 @@ def sides_where_crossed(
         garment: Rest mesh.
     """
     vertices, corners, weights = pairs
-    place = jnp.sum(weights[:, :, None] * position[corners], axis=1)
-    is_close = jnp.sum(jnp.square(position[vertices] - place), axis=1) < _NEXT_LAYER**2
+    offset = _offsets(position, vertices, corners, weights)
+    is_close = jnp.sum(jnp.square(offset), axis=1) < _NEXT_LAYER**2
     at_rest = jnp.where(is_close, _sides_at_rest(vertices, corners, weights, garment), 0.0)
     is_crossed = (side != 0) & _are_crossed(position, vertices, corners, garment)
     return jnp.where(is_crossed, at_rest, side)
@@ -59,7 +59,7 @@ def _sides_at_rest(
     """
     rest = garment.rest_positions
     corner = rest[corners]  # [pairs, 3, 3]
-    offset = rest[vertices] - jnp.sum(weights[:, :, None] * corner, axis=1)
+    offset = _offsets(rest, vertices, corners, weights)
     is_within_reach = jnp.sum(jnp.square(offset), axis=1) < _REST_REACH**2
     line = safe_normalize(offset)
     face = safe_normalize(jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
@@ -69,6 +69,16 @@ def _sides_at_rest(
     is_stacked = at_face * at_vertex > _LEAST_COSINE**2
     clearness = jnp.where(is_stacked, at_face, at_face - at_vertex)
     return jnp.where(is_within_reach & (jnp.abs(clearness) > _LEAST_COSINE), jnp.sign(clearness), 0.0)
+
+
+def _offsets(
+    places: Float[Array, "vertices 3"],
+    vertices: Int[Array, " pairs"],
+    corners: Int[Array, "pairs 3"],
+    weights: Float[Array, "pairs 3"],
+) -> Float[Array, "pairs 3"]:
+    """Return the way from the place on the face to the vertex [m]."""
+    return places[vertices] - jnp.sum(weights[:, :, None] * places[corners], axis=1)
 
 
 def _are_crossed(
