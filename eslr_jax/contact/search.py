@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -65,6 +66,7 @@ Exclusion = Callable[[_Groups, Vector3, Vector3], Bool[Array, "pairs rows"]]
 """From points, and one candidate with its normal for each group of them, to where it does not count."""
 
 
+@jax.jit
 def nearest_faces(
     query: Float[Array, "vertices 3"],
     positions: Float[Array, "surface_vertices 3"],
@@ -225,6 +227,7 @@ def _merge(a: _Nearest, b: _Nearest) -> _Nearest:
     return _Nearest(jnp.minimum(a.first, b.first), second)
 
 
+@partial(jax.jit, static_argnames="is_excluded")
 def _look(
     points: _Groups,
     patch: Int[Array, " pairs"],
@@ -304,6 +307,7 @@ def face_corners(
     return positions[faces].reshape(-1, 9)
 
 
+@jax.jit
 def nearest_face_around(
     points: Vector3,
     vertices: tuple[Int[Array, "*shape"], ...],

@@ -54,6 +54,7 @@ class Point(NamedTuple):
     gradient: Float[Array, "*shape"]  # [N]
 
 
+@jax.jit
 def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem) -> PotentialTerms:
     """Return every energy of the frame [J] (set `consistent`).
 
