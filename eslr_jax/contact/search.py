@@ -66,7 +66,7 @@ Exclusion = Callable[[_Groups, Vector3, Vector3], Bool[Array, "pairs rows"]]
 """From points, and one candidate with its normal for each group of them, to where it does not count."""
 
 
-@jax.jit
+@jax.jit  # traced once for the start of a scene and for its steps
 def nearest_faces(
     query: Float[Array, "vertices 3"],
     positions: Float[Array, "surface_vertices 3"],
@@ -227,7 +227,7 @@ def _merge(a: _Nearest, b: _Nearest) -> _Nearest:
     return _Nearest(jnp.minimum(a.first, b.first), second)
 
 
-@partial(jax.jit, static_argnames="is_excluded")
+@partial(jax.jit, static_argnames="is_excluded")  # traced once, where a search looks three times
 def _look(
     points: _Groups,
     patch: Int[Array, " pairs"],
@@ -307,7 +307,7 @@ def face_corners(
     return positions[faces].reshape(-1, 9)
 
 
-@jax.jit
+@jax.jit  # as `nearest_faces`
 def nearest_face_around(
     points: Vector3,
     vertices: tuple[Int[Array, "*shape"], ...],

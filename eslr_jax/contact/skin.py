@@ -33,7 +33,7 @@ class SkinContacts:
     areas: Float[Array, " rows"]  # that they stand for [m^2]
 
 
-@jax.jit
+@jax.jit  # traced once for the start of a scene and for its steps
 def find_skin_contacts(
     cloth: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
     bodies: tuple[Float[Array, "surface_vertices 3"], Float[Array, "surface_vertices 3"]],

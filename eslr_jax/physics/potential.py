@@ -54,7 +54,7 @@ class Point(NamedTuple):
     gradient: Float[Array, "*shape"]  # [N]
 
 
-@jax.jit
+@jax.jit  # so that it is traced once, where a step evaluates it four times
 def potential_terms(position: Float[Array, "vertices 3"], problem: FrameProblem) -> PotentialTerms:
     """Return every energy of the frame [J] (set `consistent`).
 
