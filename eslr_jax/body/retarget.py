@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.joints import Part, find_named_parts
@@ -166,8 +167,6 @@ def interpolate(
     before = np.clip(np.searchsorted(times, new_times, side="right") - 1, 0, len(times) - 2)
     fraction = np.clip((new_times - times[before]) / (times[before + 1] - times[before]), 0.0, 1.0)
     turned = blend_rotations(rotations[before], rotations[before + 1], fraction)
-    from scipy.interpolate import CubicSpline  # a tenth of a second, for a motion at another rate alone
-
     return turned, CubicSpline(times, translations)(new_times)
 
 

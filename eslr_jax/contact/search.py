@@ -227,7 +227,7 @@ def _merge(a: _Nearest, b: _Nearest) -> _Nearest:
     return _Nearest(jnp.minimum(a.first, b.first), second)
 
 
-@partial(jax.jit, static_argnames="is_excluded")  # traced once, where a search looks three times
+@partial(jax.jit, static_argnames="is_excluded")  # traced once for both first patches, and anew for a search
 def _look(
     points: _Groups,
     patch: Int[Array, " pairs"],
@@ -307,7 +307,6 @@ def face_corners(
     return positions[faces].reshape(-1, 9)
 
 
-@jax.jit  # as `nearest_faces`
 def nearest_face_around(
     points: Vector3,
     vertices: tuple[Int[Array, "*shape"], ...],
