@@ -169,6 +169,7 @@ class TrainConfig:
     slots_per_garment: int = 4  # trajectories kept alive per garment; more where a batch needs them
     horizon: int = 60  # longest trajectory [frames]
     horizon_growth: int = 60  # steps per frame of horizon; trajectories with the schedule "hood"
+    still_probability: float = 0.0  # share of trajectories on a body that stands still
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
     shape_range: float = 0.0  # [standard deviations] of its shape coefficients, drawn evenly (HOOD: 3)
@@ -210,8 +211,9 @@ class TrainConfig:
         for name in ("noise", "girth", "shape_range"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        if not 0 <= self.material_probability <= 1:
-            raise ValueError(f"material_probability must be between 0 and 1, got {self.material_probability}")
+        for name in ("material_probability", "still_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
 

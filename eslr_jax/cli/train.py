@@ -66,6 +66,7 @@ def train(
     from eslr_jax.training.checkpoint import read_run_config
     from eslr_jax.training.loop import is_first_process
     from eslr_jax.training.loop import train as run
+    from eslr_jax.training.memory import keep_memory
     from eslr_jax.training.plot import plot_curves
     from eslr_jax.training.recipe import load_recipe
 
@@ -81,6 +82,7 @@ def train(
         raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
     else:
         chosen = load_recipe(config, dict(parse_override(text) for text in set_))
+    keep_memory()
     use_compile_cache()
     if coordinator is not None:  # before anything is computed, as jax.distributed demands
         _join_processes(coordinator, num_processes, process_id)

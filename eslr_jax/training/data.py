@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
@@ -62,6 +62,15 @@ class TrainingData:
     def garment(self, index: Int[Array, ""]) -> Garment:
         """Return one of the garments."""
         return jax.tree.map(lambda leaf: leaf[index], self.garments)
+
+    def is_same_clip(self, frame: Int[Array, ""], other: Int[Array, ""]) -> Bool[Array, ""]:
+        """Tell whether two frames are of one clip; the first may lie outside all clips."""
+        return frame + self.frames_left[frame] == other + self.frames_left[other]
+
+    def next_frame(self, frame: Int[Array, ""], before: Int[Array, ""]) -> Int[Array, ""]:
+        """Return which frame follows `frame` after `before`: clips are played back and forth."""
+        onward = 2 * frame - before
+        return jnp.where(self.is_same_clip(onward, frame), onward, before)
 
     def transforms(
         self, frame: Int[Array, ""], yaw: Float[Array, ""], shape: Float[Array, " shapes"] | None = None

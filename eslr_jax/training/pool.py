@@ -25,6 +25,7 @@ class Slot:
 
     state: ClothState
     frame: Int[Array, ""]  # index into the joined clips
+    before: Int[Array, ""]  # of the frame before; the same one where the body stands still
     yaw: Float[Array, ""]  # turn of the whole scene [rad]
     girth: Float[Array, ""]  # by which the body is thicker than the bundled one [m]
     age: Int[Array, ""]  # frames since the start
@@ -49,6 +50,7 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
             first_bad_frame=jnp.full(count, -1, jnp.int32),
         ),
         frame=jnp.zeros(count, jnp.int32),
+        before=jnp.zeros(count, jnp.int32),
         yaw=jnp.zeros(count),
         girth=jnp.zeros(count),
         age=jnp.zeros(count, jnp.int32),
@@ -65,9 +67,9 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
         key: Random key.
         data: Garments, clips and body.
         index: Number of the garment.
-        config: Noise, girth, shapes and materials; static.
+        config: Noise, girth, shapes, materials and how often the body stands still; static.
     """
-    keys = jax.random.split(key, 6)
+    keys = jax.random.split(key, 7)
     garment = data.garment(index)
     frame = data.start_frames[jax.random.randint(keys[0], (), 0, data.start_frames.shape[0])]
     yaw = jax.random.uniform(keys[1], maxval=2 * jnp.pi)
@@ -75,7 +77,11 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
     if data.shapes is not None:
         bound = config.shape_range
         shape = jax.random.uniform(keys[5], (data.shapes.count,), minval=-bound, maxval=bound)
-    transforms, later = (data.transforms(frame + k, yaw, shape) for k in (0, 1))
+    is_still = jax.random.uniform(keys[6]) < config.still_probability
+    # A clip's first frame has none before it: there the clip turns round.
+    before = jnp.where(is_still, frame, jnp.where(data.is_same_clip(frame - 1, frame), frame - 1, frame + 1))
+    frames = (frame, data.next_frame(frame, before))
+    transforms, later = (data.transforms(k, yaw, shape) for k in frames)
     skinned = data.skinned(index, transforms, shape)
     velocity = (data.skinned(index, later, shape) - skinned) * FPS
     noise = config.noise * jax.random.normal(keys[2], skinned.shape)
@@ -85,9 +91,8 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
     position = clear_of_body(position, body, data.surface, garment)
     state = initial_state(position, velocity)
     material = sample_material(keys[3], config.material_probability)
-    return Slot(
-        state, frame.astype(jnp.int32), yaw, girth, jnp.int32(0), material, jnp.zeros((), bool), shape
-    )
+    frame, before = frame.astype(jnp.int32), before.astype(jnp.int32)
+    return Slot(state, frame, before, yaw, girth, jnp.int32(0), material, jnp.zeros((), bool), shape)
 
 
 def sample_material(key: Array, probability: float) -> Material:

@@ -249,7 +249,8 @@ def _sample_gradient(
 def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> FrameProblem:
     """Pose the body at both ends of the frame and state the frame's problem; `index` is the garment's."""
     garment = data.garment(index)
-    transforms, later = (data.transforms(slot.frame + k, slot.yaw, slot.shape) for k in (0, 1))
+    frames = (slot.frame, data.next_frame(slot.frame, slot.before))
+    transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
     scene = Scene(
         garment=garment,
@@ -270,10 +271,7 @@ def _hood_terms(
     slot: Slot, data: TrainingData, num_samples: Int[Array, ""], criterion: Criterion
 ) -> EnergyTerms:
     """Return HOOD's losses around this frame, with the collision weight of its ramp, or that of its tables."""
-    # Within a clip `frames_left` falls by one a frame; a clip's first frame has no frame before it.
-    last = jnp.maximum(slot.frame - 1, 0)
-    before = jnp.where(data.frames_left[last] > data.frames_left[slot.frame], last, slot.frame)
-    frames = (before, slot.frame, slot.frame + 1)
+    frames = (slot.before, slot.frame, data.next_frame(slot.frame, slot.before))
     bodies = BodyFrames(
         *(data.body(data.transforms(k, slot.yaw, slot.shape), slot.girth, slot.shape) for k in frames),
         data.surface.faces,
@@ -337,9 +335,9 @@ def _advance(
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
     moved = jnp.max(jnp.abs(report.onward - slot.state.position))
     is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
-    age, frame = slot.age + 1, slot.frame + 1
-    is_done = is_astray | (age >= horizon.frames) | (data.frames_left[frame] < 1)
-    return slot.replace(state=state, frame=frame, age=age, is_done=is_done)
+    age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
+    is_done = is_astray | (age >= horizon.frames)
+    return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done)
 
 
 def _statistics(params: Any, slot: Slot, problem: FrameProblem, config: TrainConfig) -> dict[str, Normalizer]:

@@ -22,22 +22,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(Path(__file__).resolve().parent)]
 
+from eslr_jax.training.memory import keep_memory  # noqa: E402
+
 SIZES = {"1k": (32, 32), "4k": (64, 64), "12k": (110, 110), "50k": (224, 224)}
 MODEL = "eslr-15"
-
-
-def keep_memory() -> None:
-    """Make glibc keep freed memory: one arena, no mapping per allocation, nothing given back.
-
-    Otherwise every call gets its temporary buffers from the kernel and spends up to a fifth of its time on page
-    faults. Call it before the first array. It needs Linux with glibc.
-    """
-    import ctypes
-
-    arena_max, mmap_max, trim_threshold, top_pad = -8, -4, -1, -2  # malloc.h
-    mallopt = ctypes.CDLL(None).mallopt
-    for option, value in ((arena_max, 1), (mmap_max, 0), (trim_threshold, 2**31 - 1), (top_pad, 2**28)):
-        mallopt(option, value)
 
 
 def take_turns(functions: dict, turns: int) -> dict[str, float]:

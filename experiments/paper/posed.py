@@ -226,7 +226,7 @@ def _train_step(params, moments, network, data: TrainingData, frames, key, *, mo
         (before, position, velocity), frame, material, is_last = sample
         zero = jnp.zeros(())
         state = initial_state(before, jnp.where(is_last, velocity, 0.0))
-        slot = Slot(state, frame - 1, zero, zero, jnp.int32(0), material, jnp.zeros((), bool))
+        slot = Slot(state, frame - 1, frame - 2, zero, zero, jnp.int32(0), material, jnp.zeros((), bool))
         problem = slot_problem(slot, data, jnp.int32(0), TrainConfig(model=ModelConfig()))
 
         def loss(position):

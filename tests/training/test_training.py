@@ -1,10 +1,13 @@
 """Training runs: what they leave, how they stop and resume, and what they learn from."""
 
+import ctypes
 import dataclasses
 import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +33,7 @@ from eslr_jax.training.loop import train
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.recipe import load_recipe
-from eslr_jax.training.step import curriculum, init_train_state, make_schedule, make_train_step
+from eslr_jax.training.step import curriculum, init_train_state, make_schedule, make_train_step, slot_problem
 
 RECIPES = Path(__file__).parents[2] / "experiments" / "configs"
 
@@ -187,6 +190,62 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(co
         np.testing.assert_allclose(np.linalg.norm(own - thin, axis=-1), abs(slot.girth), rtol=0.1)
         contacts = find_contacts(slot.state.position, own, own, small_data.surface)
         assert np.min(contacts.distances) > 0
+
+
+def test_clips_are_played_back_and_forth_and_never_into_each_other(small_garment):
+    from cloth import make_limb, swing_motion
+
+    body = make_limb()
+    data = build_training_data([small_garment], body, [swing_motion(body, 4), swing_motion(body, 3)])
+
+    def play(frame, before):
+        frames = [frame]
+        for _ in range(7):
+            frame, before = int(data.next_frame(jnp.int32(frame), jnp.int32(before))), frame
+            frames.append(frame)
+        return frames
+
+    assert play(1, 0) == [1, 2, 3, 2, 1, 0, 1, 2]
+    assert play(0, 1) == [0, 1, 2, 3, 2, 1, 0, 1]  # a clip's first frame has none before it
+    assert play(5, 4) == [5, 6, 5, 4, 5, 6, 5, 4]
+    assert play(2, 2) == [2] * 8  # stands still
+
+
+def test_a_body_stands_still_as_often_as_asked(config, small_data):
+    def starts(probability):
+        chosen = dataclasses.replace(config, still_probability=probability)
+        start = jax.jit(partial(start_trajectory, data=small_data, index=jnp.int32(0), config=chosen))
+        return [start(jax.random.key(seed)) for seed in range(20)]
+
+    assert all(abs(int(slot.frame - slot.before)) == 1 for slot in starts(0.0))
+    assert 4 <= sum(int(slot.frame == slot.before) for slot in starts(0.5)) <= 16
+    for slot in starts(1.0):
+        np.testing.assert_array_equal(slot.state.velocity, 0.0)
+        contacts = slot_problem(slot, small_data, jnp.int32(0), config).body.nearest
+        np.testing.assert_array_equal(contacts.next_points, contacts.points)
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc")
+def test_kept_memory_is_not_asked_for_again():
+    code = """
+import resource, sys
+import numpy as np
+from eslr_jax.training.memory import keep_memory
+if sys.argv[1] == "keep":
+    keep_memory()
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+np.ones(2**23)  # 64 MB
+before = faults()
+for _ in range(4):
+    np.ones(2**23)
+print(faults() - before)
+"""
+    kept, given_back = (
+        int(subprocess.run([sys.executable, "-c", code, word], capture_output=True, check=True).stdout)
+        for word in ("keep", "leave")
+    )
+    assert kept < 100
+    assert given_back > 4 * kept
 
 
 @pytest.fixture(scope="module")
