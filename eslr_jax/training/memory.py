@@ -10,9 +10,9 @@ _ARENA_MAX, _MMAP_MAX, _TRIM_THRESHOLD, _TOP_PAD = -8, -4, -1, -2  # of glibc's 
 def keep_memory() -> None:
     """Make glibc keep freed memory: one arena, no mapping per allocation, nothing given back.
 
-    A training step on a CPU takes a hundred megabytes of temporary buffers and frees them. By default glibc returns
-    them to the kernel, and a third of a step is page faults. Call it before the first array. Without glibc it does
-    nothing.
+    A training step on a CPU takes a hundred megabytes of temporary buffers and frees them. By default glibc
+    returns them to the kernel, and a third of a step is page faults. Call it before the first array. Without
+    glibc it does nothing.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
