@@ -278,9 +278,9 @@ def layer_blocks(
     gradient = weights[:, :, None] * normal[:, None]
     for corner, turn in zip(ends.T, (-first, first, -second, second), strict=True):
         gradient[rows, corner] += turn
-    return _barrier_blocks(
-        gradient, height, pairs, stiffness, np.asarray(problem.layers.thickness, np.float64)
-    )
+    overlap = np.maximum(np.asarray(problem.layers.thickness, np.float64)[is_used] - height, 0.0)
+    overlap[overlap > float(problem.layers.limit)] = 0.0  # there the energy is linear
+    return _barrier_blocks(gradient, overlap, pairs, stiffness)
 
 
 def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
@@ -321,7 +321,7 @@ def pair_blocks(
     height, normal, first, second = _turning_height(offset, *edges, np.asarray(pairs.side)[is_used])
     turn = np.stack([-first - second, first, second], axis=1)
     gradient = turn - weights[:, :, None] * normal[:, None]
-    return _barrier_blocks(gradient, height, pairs, stiffness, thickness)
+    return _barrier_blocks(gradient, np.maximum(thickness - height, 0.0), pairs, stiffness)
 
 
 def _turning_height(
@@ -340,13 +340,9 @@ def _turning_height(
     return height, normal, np.cross(second, tangential), np.cross(tangential, first)
 
 
-def _barrier_blocks(
-    gradient: np.ndarray, height: np.ndarray, pairs: Pairs, stiffness: float, thickness: np.ndarray | float
-) -> np.ndarray:
-    """Return 6 k a depth g g^T for pairs in use, from the gradient of their height and the height [m]."""
-    is_used = np.asarray(pairs.side) != 0
-    gradient = gradient.reshape(len(height), -1)
-    curvature = 6.0 * stiffness * np.asarray(pairs.areas, np.float64)[is_used]
-    kept = np.broadcast_to(thickness, is_used.shape)[is_used]
-    curvature = curvature * np.maximum(kept - height, 0.0)
+def _barrier_blocks(gradient: np.ndarray, overlap: np.ndarray, pairs: Pairs, stiffness: float) -> np.ndarray:
+    """Return 6 k a overlap g g^T for pairs in use, from the gradient of their height, and the overlap [m]."""
+    gradient = gradient.reshape(len(overlap), -1)
+    areas = np.asarray(pairs.areas, np.float64)[np.asarray(pairs.side) != 0]
+    curvature = 6.0 * stiffness * areas * overlap
     return curvature[:, None, None] * gradient[:, :, None] * gradient[:, None, :]

@@ -137,7 +137,8 @@ def pair_energies(position: Vector3, problem: FrameProblem) -> tuple[Float[Array
         if body.tips is not None:
             on_body += repulsion_energy(position, body.tips, stiffness, thickness)
     if layers is not None:
-        repulsion = repulsion_energy(position, layers.pairs, constants.repulsion_stiffness, layers.thickness)
+        stiffness = constants.repulsion_stiffness
+        repulsion = repulsion_energy(position, layers.pairs, stiffness, layers.thickness, layers.limit)
     return on_body, repulsion
 
 

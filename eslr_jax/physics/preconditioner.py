@@ -97,8 +97,8 @@ def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -
         if tips is not None:
             diagonal += repulsion_diagonal(position, tips, stiffness, thickness)
     if problem.layers is not None:
-        stiffness, thickness = constants.repulsion_stiffness, problem.layers.thickness
-        diagonal = diagonal + repulsion_diagonal(position, problem.layers.pairs, stiffness, thickness)
+        layers, stiffness = problem.layers, constants.repulsion_stiffness
+        diagonal += repulsion_diagonal(position, layers.pairs, stiffness, layers.thickness, layers.limit)
     return diagonal
 
 

@@ -50,6 +50,7 @@ class SelfContact:
 
     pairs: LayerPairs
     thickness: Float[Array, " pairs"]  # distance kept [m], see `simulation.frame`
+    limit: Float[Array, ""]  # overlap beyond which the force grows no further [m]
 
 
 class SecondOrder(NamedTuple):

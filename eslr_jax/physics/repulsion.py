@@ -1,4 +1,8 @@
-"""Repulsion: a one-sided cubic barrier between layers of cloth, or between cloth and tips of the body.
+"""Repulsion: a one-sided barrier between layers of cloth, or between cloth and tips of the body.
+
+It is cubic, and between layers linear once they have passed through each other by as much as they keep apart.
+Two limbs that cross force the layers between them through each other, and nothing can keep these apart: a force
+that grows without bound tore the cloth, with 100,000 times its weight.
 
 Layers are vertices over faces and edges over edges (`LayerPairs`). Tips are vertices of the body over faces of
 the cloth (`TipPairs`); they don't give way.
@@ -56,20 +60,26 @@ def repulsion_energy(
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
+    limit: Float[Array, ""] | float | None = None,
 ) -> Float[Array, ""]:
-    """Return stiffness sum_pairs a_p max(thickness - d, 0)^3 [J].
+    """Return stiffness sum_pairs a_p f(max(thickness - d, 0)) [J]; f(x) = x^3, and linear beyond the limit.
 
     Args:
         position: Cloth vertices at t + 1 [m].
         pairs: Places that are close at t, with the areas a_p.
         stiffness: [J/m^5].
         thickness: Distance kept [m].
+        limit: Overlap beyond which the force grows no further [m]; None: it always grows.
 
     Source: ContourCraft (arXiv 2405.09522), its repulsion loss, with areas in place of its count of vertices
         and the nearest place on the face in place of a corner.
     """
     depth = overlaps(position, pairs, thickness)
-    return stiffness * jnp.sum(pairs.areas * depth * depth * depth)
+    barrier = pairs.areas * depth * depth * depth
+    if limit is not None:
+        linear = pairs.areas * limit * limit * (3.0 * depth - 2.0 * limit)
+        barrier = jnp.where(depth < limit, barrier, linear)
+    return stiffness * jnp.sum(barrier)
 
 
 def repulsion_diagonal(
@@ -77,9 +87,15 @@ def repulsion_diagonal(
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
+    limit: Float[Array, ""] | float | None = None,
 ) -> Float[Array, " vertices"]:
-    """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal."""
+    """Return an estimate of the energy's curvature per vertex [N/m], a third of that along the normal.
+
+    Beyond the limit, where the energy has none, it is that at the limit.
+    """
     depth = overlaps(position, pairs, thickness)
+    if limit is not None:
+        depth = jnp.minimum(depth, limit)
     curvature = 2.0 * stiffness * pairs.areas * depth
     ids, weights = _stencil(pairs)
     return segment_sum((weights**2 * curvature[None]).ravel(), ids.ravel(), position.shape[0])

@@ -234,6 +234,25 @@ def test_gradient_equals_central_differences_and_closed_form():
 
 
 @pytest.mark.numerics
+def test_the_force_grows_no_further_beyond_the_limit():
+    limit = 2e-3  # [m] of overlap
+    with jax.enable_x64(True):
+        slopes, energies = [], []
+        for height in (1e-3, 0.999999e-3, 0.0, -0.01):  # overlaps of 2, a little more, 3 and 13 mm
+            garment, position, contacts = pair_of(height, dtype=jnp.float64)
+            contacts = contacts.replace(side=jnp.where(contacts.side != 0, 1.0, 0.0))  # also from behind
+            value, slope = repulsion(position, contacts, STIFFNESS, THICKNESS, limit)
+            energies.append(float(value))
+            slopes.append(float(slope[3, 1]))
+            diagonal = repulsion_diagonal(position, contacts, STIFFNESS, THICKNESS, limit)
+        area = float(garment.vertex_areas[3])
+        np.testing.assert_allclose(slopes, -3 * STIFFNESS * area * limit**2, rtol=1e-5)
+        assert energies[3] - energies[2] == pytest.approx(-0.01 * slopes[2], rel=1e-5)
+        assert energies[1] == pytest.approx(energies[0], rel=1e-5)
+        assert float(diagonal[3]) == pytest.approx(2 * STIFFNESS * area * limit, rel=1e-5)
+
+
+@pytest.mark.numerics
 def test_forces_have_no_resultant_and_no_moment(cloth, spiral_contacts):
     with jax.enable_x64(True):
         contacts = tree_cast(spiral_contacts, jnp.float64)

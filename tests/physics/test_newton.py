@@ -130,9 +130,11 @@ def test_blocks_of_layers_are_the_outer_product_of_the_gradient(case64):
         count=np.int32(1),
         status=np.int32(0),
     )
-    layers = SelfContact(pairs, np.full(3, thickness))
+    layers = SelfContact(pairs, np.full(3, thickness), limit=np.float64(1.0))
     problem = case64.problem.replace(layers=layers)
     blocks = hessian.layer_blocks(position, problem)
+    beyond = problem.replace(layers=layers.replace(limit=np.float64(1e-3)))
+    assert not hessian.layer_blocks(position, beyond).any()  # where the energy is linear
     stiffness = float(problem.constants.repulsion_stiffness)
     for row, block in enumerate(blocks):
         one = jax.tree.map(lambda leaf, row=row: leaf[row : row + 1] if leaf.ndim else leaf, pairs)
