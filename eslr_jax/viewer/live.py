@@ -250,8 +250,9 @@ def _load(live: Live, choice: Choice) -> None:
     with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
         rig = load_body(choice.body, betas=choice.betas)
         poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
-        if live.cast is None:
-            _draw_body(live, poses, rig)
+        spots, drawn_body = _spots(poses), []
+        if live.cast is None:  # there is something to see while the rest loads
+            drawn_body = _draw_body(live, poses, rig, spots[0])
         # A shape of the body is tried once: its garments are not kept on disk.
         garments = [
             load_garment_file(name, vertices=choice.vertices, body=rig, cache=not choice.betas)  # type: ignore[arg-type]
@@ -264,14 +265,14 @@ def _load(live: Live, choice: Choice) -> None:
     if live.cast is not None:
         for _, mesh in (*live.cast.drawn, *live.cast.drawn_body):
             mesh.remove()
-    spots = _spots(poses)
+        drawn_body = _draw_body(live, poses, rig, spots[0])
     drawn = [
         _draw(live, f"/garments/{number}", piece, np.asarray(stage.scene.initial_state.position) - spots[0])
         for number, piece in enumerate(garment_pieces(np.asarray(cloth.faces), stored.outfit))
     ]
     for _, mesh in drawn:
         mesh.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
-    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, _draw_body(live, poses, rig))
+    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
     live.recorded, live.is_compiled, live.refused = [], False, None
     _restart(live)
 
@@ -284,9 +285,9 @@ def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, A
     return piece, mesh
 
 
-def _draw_body(live: Live, poses: BodyMotion, rig: Body) -> list[tuple[Piece, Any]]:
-    """Draw a body at the first frame of its motion."""
-    positions = np.asarray(poses.positions[0]) - _spots(poses)[0]
+def _draw_body(live: Live, poses: BodyMotion, rig: Body, spot: np.ndarray) -> list[tuple[Piece, Any]]:
+    """Draw a body at the first frame of its motion, where it stands on a spot [m]."""
+    positions = np.asarray(poses.positions[0]) - spot
     pieces = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
     return [_draw(live, f"/body/{piece.name}", piece, positions) for piece in pieces]
 
