@@ -1,8 +1,8 @@
 """Repulsion: a one-sided barrier between layers of cloth, or between cloth and tips of the body.
 
-It is cubic, and between layers linear once they have passed through each other by as much as they keep apart.
-Two limbs that cross force the layers between them through each other, and nothing can keep these apart: a force
-that grows without bound tore the cloth, with 100,000 times its weight.
+It is cubic, and between layers linear once they have passed through each other. Two limbs that cross force the
+layers between them through each other, and nothing can keep these apart: a force that grows without bound tore
+the cloth, with 100,000 times its weight.
 
 Layers are vertices over faces and edges over edges (`LayerPairs`). Tips are vertices of the body over faces of
 the cloth (`TipPairs`); they don't give way.

@@ -28,11 +28,6 @@ from eslr_jax.physics.repulsion import pair_heights
 from eslr_jax.scene.build import slice_tracks
 from eslr_jax.types import ClothState, PastState, Scene, SceneBody
 
-# Thicknesses of overlap between layers beyond which their force grows no further: they have then passed through
-# each other by one. At one thickness, more pairs cross; without bound, cloth tears. See `experiments/README.md`,
-# what was tried.
-_YIELD = 2.0
-
 
 class BodyStep(NamedTuple):
     """Where the searched part of the body is at both ends of a frame."""
@@ -192,7 +187,7 @@ def _layers(problem: FrameProblem, pairs: LayerPairs) -> SelfContact:
     """
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
     height, _ = pair_heights(problem.position, pairs)
-    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0), limit=_YIELD * thickness)
+    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0), limit=thickness)
 
 
 def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:
