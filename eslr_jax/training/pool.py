@@ -91,7 +91,6 @@ def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], conf
     position = clear_of_body(position, body, data.surface, garment)
     state = initial_state(position, velocity)
     material = sample_material(keys[3], config.material_probability)
-    frame, before = frame.astype(jnp.int32), before.astype(jnp.int32)
     return Slot(state, frame, before, yaw, girth, jnp.int32(0), material, jnp.zeros((), bool), shape)
 
 
