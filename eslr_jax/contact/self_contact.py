@@ -73,8 +73,9 @@ class TipPairs:
 
     next_points: Float[Array, "pairs 3"]  # the tips at t + 1 [m]
     corners: Int[Array, "pairs 3"]  # vertices of the face
-    weights: Float[Array, "pairs 3"]  # as of `FacePairs`, like what follows
-    side: Float[Array, " pairs"]
+    # Of the corners, in the offset from the place on the face: as of `FacePairs`, but negative.
+    weights: Float[Array, "pairs 3"]
+    side: Float[Array, " pairs"]  # as of `FacePairs`
     areas: Float[Array, " pairs"]  # [m^2]
     status: Int[Array, ""]
 
@@ -156,7 +157,7 @@ def find_tip_contacts(
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
     faces = _find_pairs(points, cloth, TIP_RADIUS, capacity)
     next_points = next_body[faces.vertices]
-    return TipPairs(next_points, faces.corners, faces.weights, faces.side, faces.areas, faces.status)
+    return TipPairs(next_points, faces.corners, -faces.weights, faces.side, faces.areas, faces.status)
 
 
 def _ends(

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
-from eslr_jax.body.motion import Motion, pose_body, still_motion
+from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
@@ -124,18 +124,6 @@ def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> li
     """Load garments padded to one bucket: all scenes then share one compiled rollout."""
     return pad_alike(
         [load_garment(name, vertices=vertices, **model.garment_options) for name in names]  # type: ignore[arg-type]
-    )
-
-
-def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion:
-    """Return a motion of at least `num_frames` frames at `fps`, played forwards and backwards by turns."""
-    needed = int(np.ceil(num_frames * motion.fps / fps)) + 1
-    count = len(motion.translations)
-    period = max(2 * (count - 1), 1)
-    phase = np.arange(needed) % period
-    index = np.where(phase < count, phase, period - phase)
-    return dataclasses.replace(
-        motion, rotations=motion.rotations[index], translations=motion.translations[index]
     )
 
 

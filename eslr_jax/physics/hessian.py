@@ -13,7 +13,6 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import Pairs
@@ -261,7 +260,7 @@ def _friction_blocks(
 def layer_blocks(
     position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
 ) -> Float[np.ndarray, "pairs 12 12"]:
-    """Return the Hessian of the repulsion between layers per pair in use [N/m]; see `pair_blocks`."""
+    """Return the Hessian of the repulsion between layers per pair in use [N/m]; see `tip_blocks`."""
     if problem.layers is None:
         return np.zeros((0, 12, 12))
     pairs, stiffness = problem.layers.pairs, float(problem.constants.repulsion_stiffness)
@@ -283,13 +282,25 @@ def layer_blocks(
     return _barrier_blocks(gradient, overlap, pairs, stiffness)
 
 
-def tip_blocks(position: Float[np.ndarray, "vertices 3"], problem: FrameProblem) -> np.ndarray:
-    """Return the Hessian of the contact with the body's tips per pair [N/m], shape [pairs, 9, 9]."""
+def tip_blocks(
+    position: Float[np.ndarray, "vertices 3"], problem: FrameProblem
+) -> Float[np.ndarray, "pairs 9 9"]:
+    """Return the Gauss-Newton Hessian of the contact with tips of the body per pair in use [N/m].
+
+    That is 6 k a depth g g^T, with g = dd / dx.
+    """
     if problem.body is None or problem.body.tips is None:
         return np.zeros((0, 9, 9))
-    constants, tips = problem.constants, problem.body.tips
-    stiffness, thickness = float(constants.collision_stiffness), float(constants.collision_thickness)
-    return pair_blocks(position, tips, stiffness, thickness)
+    tips, constants = problem.body.tips, problem.constants
+    is_used = np.asarray(tips.side) != 0
+    point, weights = (np.asarray(one, np.float64)[is_used] for one in (tips.next_points, tips.weights))
+    corners = position[np.asarray(tips.corners)[is_used]]
+    offset = point + np.einsum("pk,pka->pa", weights, corners)
+    edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    height, normal, first, second = _turning_height(offset, *edges, np.asarray(tips.side)[is_used])
+    gradient = weights[:, :, None] * normal[:, None] + np.stack([-first - second, first, second], axis=1)
+    overlap = np.maximum(float(constants.collision_thickness) - height, 0.0)
+    return _barrier_blocks(gradient, overlap, tips, float(constants.collision_stiffness))
 
 
 def pair_table(pairs: Pairs | None, num_corners: int) -> Int[np.ndarray, "pairs corners"]:
@@ -297,31 +308,6 @@ def pair_table(pairs: Pairs | None, num_corners: int) -> Int[np.ndarray, "pairs 
     if pairs is None:
         return np.zeros((0, num_corners), np.int64)
     return np.asarray(pairs.corners)[np.asarray(pairs.side) != 0]
-
-
-def pair_blocks(
-    position: Float[np.ndarray, "vertices 3"],
-    pairs: TipPairs,
-    stiffness: float,
-    thickness: float,
-) -> Float[np.ndarray, "pairs 9 9"]:
-    """Return the Gauss-Newton Hessian of the repulsion of tips per pair in use: 6 k a depth g g^T, g = dd/dx.
-
-    Args:
-        position: Vertex positions [m].
-        pairs: Tips of the body, which don't move, and faces of the cloth.
-        stiffness: k [J/m^5].
-        thickness: Distance kept [m].
-    """
-    is_used = np.asarray(pairs.side) != 0
-    point, weights = (np.asarray(one, np.float64)[is_used] for one in (pairs.next_points, pairs.weights))
-    corners = position[np.asarray(pairs.corners)[is_used]]
-    offset = point - np.einsum("pk,pka->pa", weights, corners)
-    edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    height, normal, first, second = _turning_height(offset, *edges, np.asarray(pairs.side)[is_used])
-    turn = np.stack([-first - second, first, second], axis=1)
-    gradient = turn - weights[:, :, None] * normal[:, None]
-    return _barrier_blocks(gradient, np.maximum(thickness - height, 0.0), pairs, stiffness)
 
 
 def _turning_height(

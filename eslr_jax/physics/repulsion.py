@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
 from eslr_jax.contact.self_contact import TipPairs
@@ -28,9 +28,9 @@ def pair_heights(
 ) -> tuple[Float[Array, " pairs"], Vector3]:
     """Return how high the first place of every pair is on the side it is kept on [m], and that direction.
 
-    d = side (x_p - sum_k w_k x_k) . n, with the face's unit normal n at `position`; so the energy of d turns
-    with the cloth. The forces between layers have no resultant and no moment; see `layer_heights`. Unused rows
-    give zero.
+    d = side (x_p + sum_k w_k x_k) . n, with a tip x_p and the face's unit normal n at `position`; of layers see
+    `layer_heights`. So the energy of d turns with the cloth. The forces between layers have no resultant and no
+    moment. Unused rows give zero.
     """
     x = components(position)
     if isinstance(pairs, LayerPairs):
@@ -38,11 +38,11 @@ def pair_heights(
     point, places = components(pairs.next_points), take3(x, pairs.corners.T)
     corners = [tuple(c[k] for c in places) for k in range(3)]
     weights = [pairs.weights[:, k] for k in range(3)]
-    foot = tuple(sum(weights[k] * corners[k][axis] for k in range(3)) for axis in range(3))
+    offset = tuple(point[axis] + sum(weights[k] * corners[k][axis] for k in range(3)) for axis in range(3))
     normal = cross3(sub3(corners[1], corners[0]), sub3(corners[2], corners[0]))  # type: ignore[arg-type]
     unit = safe_normalize(jnp.stack(normal, axis=0), axis=0)
     direction = (pairs.side * unit[0], pairs.side * unit[1], pairs.side * unit[2])
-    return dot3(sub3(point, foot), direction), direction  # type: ignore[arg-type]
+    return dot3(offset, direction), direction  # type: ignore[arg-type]
 
 
 def overlaps(
@@ -97,8 +97,8 @@ def repulsion_diagonal(
     if limit is not None:
         depth = jnp.minimum(depth, limit)
     curvature = 2.0 * stiffness * pairs.areas * depth
-    ids, weights = _stencil(pairs)
-    return segment_sum((weights**2 * curvature[None]).ravel(), ids.ravel(), position.shape[0])
+    weights = pairs.weights.T
+    return segment_sum((weights**2 * curvature[None]).ravel(), pairs.corners.T.ravel(), position.shape[0])
 
 
 def push_apart(
@@ -113,7 +113,7 @@ def push_apart(
     """
     num_vertices = position.shape[0]
     share = 0.5 if isinstance(pairs, LayerPairs) else 1.0
-    ids, weights = _stencil(pairs)
+    ids, weights = pairs.corners.T, pairs.weights.T
     # A place moves by one if corner k of it moves by w_k / |w|^2. The sign of a weight doesn't say whose it is:
     # rounding makes some of a face's a little negative.
     is_first = _are_first(pairs)
@@ -139,9 +139,3 @@ def _are_first(pairs: Pairs) -> Bool[Array, "corners pairs"]:
         is_edge = pairs.is_edge
         return jnp.stack([jnp.ones_like(is_edge), is_edge, jnp.zeros_like(is_edge), jnp.zeros_like(is_edge)])
     return jnp.zeros(pairs.corners.T.shape, bool)
-
-
-def _stencil(pairs: Pairs) -> tuple[Int[Array, "corners pairs"], Float[Array, "corners pairs"]]:
-    """Return the vertices of cloth in every pair, and their weights in the offset between both of its places."""
-    sign = 1.0 if isinstance(pairs, LayerPairs) else -1.0
-    return pairs.corners.T, sign * pairs.weights.T

@@ -154,25 +154,6 @@ def _step(
     return Step(*step_frame(stepper, scene, state, frame))
 
 
-def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int]:
-    """Return the two frames of a step, for a motion that is played forth and back without end.
-
-    Args:
-        step: Number of the step, from zero.
-        num_frames: Of the motion.
-        first: Frame from which on it is played forth and back; those before it are played once.
-    """
-    period = 2 * (num_frames - 1 - first)
-
-    def place(at: int) -> int:
-        if at < first:
-            return at
-        at = (at - first) % period
-        return first + min(at, period - at)
-
-    return place(step), place(step + 1)
-
-
 def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
     """Return the vertex that a ray points at: of those within a centimetre more than the nearest, the first.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
-from eslr_jax.body.motion import pose_body
+from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.extras import require
@@ -34,7 +34,6 @@ from eslr_jax.simulation.live import (
     nearest_vertex,
     no_hand,
     set_stage,
-    there_and_back,
 )
 from eslr_jax.simulation.stepper import FrameReport
 from eslr_jax.types import Body, BodyMotion, ClothState

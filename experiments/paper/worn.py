@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.evaluate import back_and_forth
+from eslr_jax.body.motion import back_and_forth, pose_body
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.types import BodyMotion, Scene

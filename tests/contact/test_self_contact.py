@@ -290,7 +290,7 @@ def test_a_tip_over_an_edge_pushes_by_no_more_than_its_depth():
     contacts = TipPairs(
         next_points=jnp.array([[0.05, -0.001, 0.0]]),
         corners=jnp.array([[0, 1, 2]]),
-        weights=jnp.array([[0.5, 0.5 + 6e-8, -6e-8]]),
+        weights=-jnp.array([[0.5, 0.5 + 6e-8, -6e-8]]),
         side=jnp.ones(1),
         areas=jnp.asarray(garment.vertex_areas[:1]),
         status=jnp.int32(0),

@@ -110,7 +110,7 @@ def one_pair(case):
     return TipPairs(
         next_points=np.asarray(case.position)[vertices] + 0.01,
         corners=faces,
-        weights=np.array([[0.2, 0.3, 0.5], [1 / 3, 1 / 3, 1 / 3]]),
+        weights=-np.array([[0.2, 0.3, 0.5], [1 / 3, 1 / 3, 1 / 3]]),
         side=np.array([-1.0, 0.0]),
         areas=np.asarray(case.problem.garment.vertex_areas)[vertices],
         status=np.int32(0),
@@ -182,7 +182,10 @@ def test_blocks_of_tips_are_the_outer_product_of_the_gradient(case64):
     depth = thickness - height
     table = hessian.pair_table(pairs, 3)
     assert table.shape == (1, 3)
-    (block,) = hessian.pair_blocks(position, pairs, 3.5e7, thickness)
+    problem = case64.problem
+    constants = problem.constants.replace(collision_stiffness=3.5e7, collision_thickness=thickness)
+    problem = problem.replace(constants=constants, body=problem.body.replace(tips=pairs))
+    (block,) = hessian.tip_blocks(position, problem)
     slope = force[table[0]].ravel()
     expected = np.outer(slope, slope) * 6 / (9 * 3.5e7 * pairs.areas[0] * depth**3)
     np.testing.assert_allclose(block, expected, atol=1e-9 * np.abs(expected).max())

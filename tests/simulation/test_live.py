@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
+from eslr_jax.body.motion import there_and_back
 from eslr_jax.physics.materials import COTTON, fabric_material
 from eslr_jax.simulation.live import (
     advance,
@@ -13,7 +14,6 @@ from eslr_jax.simulation.live import (
     nearest_vertex,
     no_hand,
     set_stage,
-    there_and_back,
 )
 from eslr_jax.simulation.program import _compile
 
