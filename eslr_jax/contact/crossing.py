@@ -16,7 +16,7 @@ _LEAST_COSINE = 0.2
 _NEXT_LAYER = 0.02
 # [m] between a vertex and a face at rest. Beyond it the rest mesh says nothing: the walls of a pleat, far apart
 # around the body at rest, may meet with either side, and one that takes the wrong side tears its neighbours. See
-# `experiments/README.md`, what was tried.
+# `experiments/tried.md`.
 _REST_REACH = 0.06
 
 

@@ -19,7 +19,7 @@ from eslr_jax.types import Garment, Material
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/solver_convergence.py)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms
 # Of a vertex's springs in its diagonal, times their sum: alike along all axes, they are stiffer across the cloth
-# than it is. Fitted to the gap after 10 and 20 iterations, see experiments/README.md.
+# than it is. Fitted to the gap after 10 and 20 iterations, see experiments/tried.md.
 _DOMINANCE = 1.43
 
 
