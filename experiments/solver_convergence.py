@@ -38,7 +38,7 @@ from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.newton import minimize_newton, potential_float64
-from eslr_jax.physics.potential import evaluate, potential
+from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import (
     Stiffness,
     hessian_diagonal,
@@ -97,8 +97,7 @@ PRECONDITIONERS = {
 def lbfgs(start: Positions, problem: FrameProblem, iterations: int, preconditioner: str) -> Positions:
     """Return positions [m] after so many iterations; their number is traced, so all share a program."""
     matrix = PRECONDITIONERS[preconditioner](problem, start)
-    point = evaluate(start, problem)
-    return minimize(lambda x: potential(x, problem), point, matrix, Stop(iterations)).position
+    return minimize(lambda x: potential(x, problem), start, matrix, Stop(iterations)).position
 
 
 def make_scene(name: str) -> Scene:

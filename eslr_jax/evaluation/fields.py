@@ -18,7 +18,7 @@ from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.run import Run
 from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.potential import evaluate, potential, potential_terms
+from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs
@@ -176,7 +176,7 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
         position: Any stepper's positions at t + 1 [m], shape [vertices, 3].
         problem: The frame's problem.
     """
-    start = Start(evaluate(position, problem), potential(pushed_out_guess(problem), problem))
+    start = Start(position, potential(pushed_out_guess(problem), problem))
     minimum = solve(problem, start, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     way = position - minimum.position
     places, weights = np.polynomial.legendre.leggauss(_QUADRATURE)

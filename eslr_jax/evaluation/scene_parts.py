@@ -15,7 +15,7 @@ from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.physics.preconditioner import solve_stiffness, stretched_stiffness
-from eslr_jax.physics.solve import solve, start_from_guess
+from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.stepper import make_stepper
@@ -98,7 +98,7 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
         "gradient of the potential": (lambda x: evaluate(x, problem), (guess.position,)),
         "preconditioner": (lambda x: solve_stiffness(stretched_stiffness(problem, x), x), (guess.position,)),
         f"solver, {_ITERATIONS} iterations": (
-            lambda guess: solve(problem, start_from_guess(problem, guess), iterations=_ITERATIONS).position,
+            lambda guess: solve(problem, Start(*guess), iterations=_ITERATIONS).position,
             (guess,),
         ),
         "whole frame": (

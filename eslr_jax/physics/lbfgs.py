@@ -88,7 +88,7 @@ def _direction(state: _State) -> Float[Array, " n"]:
 
 def minimize(
     function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
-    start: Point,
+    start: Float[Array, "vertices 3"],
     stiffness: Stiffness,
     stop: Stop,
     *,
@@ -97,9 +97,12 @@ def minimize(
 ) -> Minimum:
     """Minimise `function` from `start` by L-BFGS.
 
+    The loop's first pass goes to the start and counts as no iteration, so that the energy, most of a frame's
+    program, is compiled once.
+
     Args:
         function: Differentiable energy [J] of positions [m], shape [vertices, 3].
-        start: Where to begin, with value and gradient.
+        start: Where to begin [m].
         stiffness: Initial Hessian of the recursion, up to a scale.
         stop: When to end.
         memory: Number of pairs of steps and gradient changes kept; static.
@@ -126,28 +129,32 @@ def minimize(
     def is_running(state: _State) -> Array:
         is_above = jnp.dot(state.gradient, state.gradient) > 0
         is_far = 2.0 * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
-        return (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
+        is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
+        return is_going | (state.iterations < 0)
 
     def iterate(state: _State) -> _State:
-        direction = _direction(state)
+        is_first = state.iterations < 0
+        direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
         slope = jnp.dot(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
         # Where no step along the direction leads down, the history is dropped and tried without.
         kept = state._replace(is_kept=state.is_kept & is_lower)
         moved = _advance(kept, Point(x, value, gradient), inverse)
         return moved._replace(
-            decrement=-0.5 * slope,
+            decrement=jnp.where(is_first, jnp.inf, -0.5 * slope),
             iterations=state.iterations + 1,
             is_stuck=~is_lower & ~jnp.any(state.is_kept),
         )
 
-    first = _flat_point(start)
-    x = first.position
+    # Without a previous point the first step has no length, and says nothing of curvature.
+    x = _flat(start if previous is None else previous.position)
+    nothing = jnp.zeros_like(x)
+    gradient = nothing if previous is None else _flat(previous.gradient)
     initial = _State(
         x=x,
-        value=first.value,
-        gradient=first.gradient,
-        smoothed=inverse(first.gradient),
+        value=jnp.full((), jnp.inf, x.dtype),
+        gradient=gradient,
+        smoothed=nothing if previous is None else inverse(gradient),
         pairs=jnp.zeros((2 * memory, x.size), x.dtype),
         by_gradient=jnp.zeros(2 * memory, x.dtype),
         by_change=jnp.zeros((2 * memory, memory), x.dtype),
@@ -155,15 +162,9 @@ def minimize(
         head=jnp.zeros((), jnp.int32),
         scale=jnp.ones((), x.dtype),
         decrement=jnp.full((), jnp.inf, x.dtype),
-        iterations=jnp.zeros((), jnp.int32),
+        iterations=jnp.full((), -1, jnp.int32),
         is_stuck=jnp.zeros((), bool),
     )
-    if previous is not None:
-        before = _flat_point(previous)
-        initial = initial._replace(
-            x=before.position, gradient=before.gradient, smoothed=inverse(before.gradient)
-        )
-        initial = _advance(initial, first, inverse)
     final = jax.lax.while_loop(is_running, iterate, initial)
     gain = stop.reference - final.value
     gap_bound = jnp.where(gain > 0, jnp.sqrt(2.0 * final.decrement / jnp.where(gain > 0, gain, 1.0)), jnp.inf)
@@ -183,11 +184,6 @@ def _split(flat: Float[Array, " n"]) -> list[Array]:
 def _vectors(flat: Float[Array, " n"]) -> Float[Array, "vertices 3"]:
     """Return flat vectors in rows."""
     return flat.reshape(3, -1).T
-
-
-def _flat_point(point: Point) -> Point:
-    """Return a point whose position and gradient have one axis."""
-    return Point(_flat(point.position), point.value, _flat(point.gradient))
 
 
 def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
@@ -223,14 +219,17 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
 def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):
     """Halve the step until the energy falls enough; keep the old point if it never does.
 
+    The first pass of `minimize` goes to the start, whatever its energy.
+
     Returns:
         The point, its value and its gradient, and whether it is another point than before.
     """
+    is_first = state.iterations < 0
     slack = 4 * jnp.finfo(state.x.dtype).eps * jnp.abs(state.value)
 
     def is_wanting(carry):
         size, trials, _, value, _ = carry
-        is_good = value <= state.value + _ARMIJO * size * slope + slack
+        is_good = (value <= state.value + _ARMIJO * size * slope + slack) | is_first
         return (trials == 0) | (~is_good & (trials <= _MAX_HALVINGS))
 
     def trial(carry):
@@ -242,7 +241,7 @@ def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, sl
     # The first trial is one of the loop's, so that the energy is compiled once.
     untried = (jnp.zeros((), state.x.dtype), jnp.int32(0), state.x, state.value, state.gradient)
     *_, x, value, gradient = jax.lax.while_loop(is_wanting, trial, untried)
-    is_kept = (value <= state.value + slack) & (slope < 0)
+    is_kept = ((value <= state.value + slack) & (slope < 0)) | is_first
     return (
         jnp.where(is_kept, x, state.x),
         jnp.where(is_kept, value, state.value),

@@ -21,10 +21,9 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.physics import tangent
-from eslr_jax.physics.guess import InitialGuess
 from eslr_jax.physics.lbfgs import Minimum, Stop, minimize
 from eslr_jax.physics.minres import LinearSolution, solve_symmetric
-from eslr_jax.physics.potential import Point, evaluate, potential
+from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.problem import FrameProblem
 
@@ -38,14 +37,9 @@ _LINEAR_STALL = 1e-2  # residual above which the derivative is refused
 class Start(NamedTuple):
     """Where the solver begins a frame."""
 
-    point: Point
+    position: Float[Array, "vertices 3"]  # [m]
     inertial_energy: Float[Array, ""]  # [J], see `InitialGuess`
-    previous: Point | None = None  # from which a network came to `point`; None for the solver's own guess
-
-
-def start_from_guess(problem: FrameProblem, guess: InitialGuess) -> Start:
-    """Return the solver's own guess as a start, with its potential and gradient."""
-    return Start(evaluate(guess.position, problem), guess.inertial_energy)
+    previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
 
 
 def lower_point(reached: Point, previous: Point) -> Point:
@@ -82,7 +76,7 @@ def solve(
     iterations = jnp.asarray(iterations)
     if not jnp.issubdtype(iterations.dtype, jnp.integer):
         raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
-    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance, start.point.value.dtype))
+    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance, start.inertial_energy.dtype))
     return _solve(problem, jax.lax.stop_gradient(start), limits, memory)
 
 
@@ -92,8 +86,8 @@ def _solve(
 ) -> Minimum:
     return minimize(
         lambda position: potential(position, problem),
-        start.point,
-        stretched_stiffness(problem, start.point.position),
+        start.position,
+        stretched_stiffness(problem, start.position),
         Stop(*limits, start.inertial_energy),
         memory=memory,
         previous=start.previous,

@@ -15,10 +15,10 @@ from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Minimum
-from eslr_jax.physics.potential import contact_load, evaluate, potential_terms
+from eslr_jax.physics.potential import Point, contact_load, evaluate, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pin, separate, weight_norm
-from eslr_jax.physics.solve import Start, lower_point, solve, start_from_guess
-from eslr_jax.simulation.network import predict
+from eslr_jax.physics.solve import Start, lower_point, solve
+from eslr_jax.simulation.network import Prediction, predict
 from eslr_jax.types import ClothState, PastState, PotentialTerms
 
 
@@ -71,9 +71,9 @@ def make_stepper(
                     'a network steps by implicit Euler; choose integrator "euler", or iterations of the solver '
                     "behind the network"
                 )
-            start, status = find_start(params, problem, state, config)
-            unknown = jnp.full_like(start.point.value, jnp.inf)
-            minimum = Minimum(*start.point, iterations=jnp.int32(0), gap_bound=unknown)
+            point, _, status = _begin(params, problem, state, config)
+            unknown = jnp.full_like(point.value, jnp.inf)
+            minimum = Minimum(*point, iterations=jnp.int32(0), gap_bound=unknown)
         position = pin(problem, minimum.position)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
@@ -102,18 +102,27 @@ def find_start(
         state: Cloth at t.
         config: Says whether there is a network; static.
     """
-    if config.model is None:
-        return start_from_guess(problem, initial_guess(problem)), jnp.int32(Status.OK)
-    prediction = predict(params, problem, state, config.model)
-    point = evaluate(separate(problem, prediction.position), problem)
-    if prediction.previous is not None:
-        point = lower_point(point, prediction.previous)
+    point, prediction, status = _begin(params, problem, state, config)
     guess = prediction.guess
     if guess is None:
         # Without a tolerance nobody asks, and the compiler drops it.
         guess = initial_guess(problem)
+    return Start(point.position, guess.inertial_energy, prediction.previous), status
+
+
+def _begin(
+    params: Any, problem: FrameProblem, state: ClothState, config: SimConfig
+) -> tuple[Point, Prediction, Int[Array, ""]]:
+    """Return the point of `find_start`, what it comes from, and status bits."""
+    if config.model is None:
+        guess = initial_guess(problem)
+        return evaluate(guess.position, problem), Prediction(guess.position, guess), jnp.int32(Status.OK)
+    prediction = predict(params, problem, state, config.model)
+    point = evaluate(separate(problem, prediction.position), problem)
+    if prediction.previous is not None:
+        point = lower_point(point, prediction.previous)
     # A solver that starts elsewhere would hide a prediction that is not a number.
-    return Start(point, guess.inertial_energy, prediction.previous), _finiteness(prediction.position)
+    return point, prediction, _finiteness(prediction.position)
 
 
 def _finiteness(values: Float[Array, ...]) -> Int[Array, ""]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.config import TrainConfig
-from eslr_jax.physics.potential import evaluate, potential_terms
+from eslr_jax.physics.potential import potential_terms
 from eslr_jax.physics.problem import FrameProblem, pin, pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.network import predict_acceleration, refine
@@ -69,8 +69,8 @@ def physics_loss(
     guess_value = sum(terms_of(guess, problem))
     onward = positions[-1]
     if config.iterations:
-        start = evaluate(jax.lax.stop_gradient(positions[-1]), problem)
-        minimum = solve(problem, Start(start, guess_value), iterations=config.iterations)
+        start = Start(jax.lax.stop_gradient(positions[-1]), guess_value)
+        minimum = solve(problem, start, iterations=config.iterations)
         onward = pin(problem, minimum.position)
         optimum = _Optimum(onward, minimum.value, guess, guess_value)
         loss = _mean_start_error(positions, energies, optimum, problem)

@@ -33,7 +33,7 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.numerics import vertex_normals
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.preconditioner import stretched_stiffness
-from eslr_jax.physics.solve import solve, start_from_guess
+from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_problem
@@ -63,7 +63,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
     states, inputs = trajectory_states(run.trajectory, scene)
     state, step = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), (states, inputs))
     problem = jax.jit(frame_problem)(scene, state, step)
-    start = jax.jit(lambda problem: start_from_guess(problem, initial_guess(problem)))(problem)
+    start = Start(*jax.jit(initial_guess)(problem))
     surface, blocks = scene.body.surface, scene.garment.vertex_blocks
 
     @jax.jit
@@ -73,8 +73,8 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
     @jax.jit
     def before(scene, state, step):
         problem = frame_problem(scene, state, step)
-        start = start_from_guess(problem, initial_guess(problem))
-        return start, stretched_stiffness(problem, start.point.position)
+        guess = initial_guess(problem)
+        return guess, stretched_stiffness(problem, guess.position)
 
     @jax.jit
     def whole(scene, state, step):
@@ -87,7 +87,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
         "both contacts": (jax.jit(find_both_sides), body),
         "frame problem": (jax.jit(frame_problem), (scene, state, step)),
         "guess": (jax.jit(initial_guess), (problem,)),
-        "preconditioner": (jax.jit(stretched_stiffness), (problem, start.point.position)),
+        "preconditioner": (jax.jit(stretched_stiffness), (problem, start.position)),
         "all before the first iteration": (before, (scene, state, step)),
         "few": (minimise, (problem, start, FEW)),
         "many": (minimise, (problem, start, MANY)),

@@ -15,7 +15,7 @@ from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.membrane import principal_stretches, stretch_energy
-from eslr_jax.physics.potential import evaluate, potential
+from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import FrameProblem, pin
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_problem
@@ -148,7 +148,7 @@ def settle(
         inertial_guess=position,
         pin_targets=pin_targets,
     )
-    start = Start(evaluate(position, problem), jnp.float32(0.0))
+    start = Start(position, jnp.float32(0.0))
     return pin(problem, solve(problem, start, iterations=_SETTLE_ITERATIONS, memory=16).position)
 
 
@@ -168,7 +168,7 @@ def _gaps(trajectory: Trajectory, scene: Scene, every: int) -> Float[Array, " fr
         problem = frame_problem(scene, state, inputs)
 
         def descend(position):
-            start = Start(evaluate(position, problem), jnp.float32(0.0))
+            start = Start(position, jnp.float32(0.0))
             return solve(problem, start, iterations=_OPTIMUM_ITERATIONS, memory=16).value
 
         optima = jax.lax.map(descend, jnp.stack([initial_guess(problem).position, reached]))

@@ -10,7 +10,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.newton import minimize_newton
-from eslr_jax.physics.solve import solve, start_from_guess
+from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes
 from eslr_jax.simulation.frame import first_problem
@@ -65,7 +65,7 @@ def test_newton_and_the_solver_find_the_same_minimum_on_the_ground():
     problem = jax.jit(first_problem)(sliding(0.5))
     reference = minimize_newton(problem)
     assert reference.is_converged
-    found = jax.jit(lambda p: solve(p, start_from_guess(p, initial_guess(p)), iterations=100))(problem)
+    found = jax.jit(lambda p: solve(p, Start(*initial_guess(p)), iterations=100))(problem)
     np.testing.assert_allclose(np.asarray(found.position), reference.position, atol=2e-6)
 
 

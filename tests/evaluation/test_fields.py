@@ -15,7 +15,7 @@ from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.io.run import read_run
-from eslr_jax.physics.potential import evaluate, potential, potential_terms
+from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.problem import pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
@@ -61,7 +61,7 @@ def test_energy_shares_add_up_to_the_energy(problem, term):
 @pytest.mark.slow
 def test_gap_shares_add_up_to_the_optimality_gap(problem):
     position = pushed_out_guess(problem)
-    start = Start(evaluate(position, problem), potential(position, problem))
+    start = Start(position, potential(position, problem))
     minimum = solve(problem, start, iterations=500, tolerance=1e-3)
     gap = float(potential(position, problem) - minimum.value)
     shares = np.asarray(gap_shares(position, problem))

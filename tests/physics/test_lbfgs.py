@@ -13,7 +13,7 @@ from physics_cases import make_case, pad_case
 
 from eslr_jax.config import SimConfig
 from eslr_jax.physics.lbfgs import Stop, minimize
-from eslr_jax.physics.potential import Point, evaluate, potential
+from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
 from eslr_jax.physics.problem import weight_norm
 from eslr_jax.physics.solve import lower_point
@@ -38,7 +38,7 @@ def descend(
     """Minimise a function of a few points, the iterations traced."""
     return minimize(
         function,
-        point_of(function, position),
+        position,
         diagonal_of(diagonal),
         Stop(iterations, tolerance, reference),
         memory=memory,
@@ -187,7 +187,7 @@ def solve(case, iterations, has_springs=True):
     matrix = stiffness(case.problem, case.position)
     return minimize(
         lambda x: potential(x, case.problem),
-        evaluate(case.position, case.problem),
+        case.position,
         matrix.replace(springs=jnp.where(has_springs, matrix.springs, 0.0)),
         Stop(iterations),
     )

@@ -17,7 +17,7 @@ from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.physics.newton import minimize_newton, potential_float64
-from eslr_jax.physics.potential import evaluate, potential, potential_terms
+from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.problem import SelfContact
 from eslr_jax.physics.repulsion import pair_heights, repulsion_energy
@@ -193,9 +193,7 @@ def test_blocks_of_tips_are_the_outer_product_of_the_gradient(case64):
 
 @jax.jit
 def descend(problem, position):
-    return minimize(
-        lambda x: potential(x, problem), evaluate(position, problem), stiffness(problem, position), Stop(400)
-    )
+    return minimize(lambda x: potential(x, problem), position, stiffness(problem, position), Stop(400))
 
 
 @pytest.mark.parametrize("is_pinned", [None, np.arange(30) < 6], ids=["free", "pinned"])

@@ -116,7 +116,10 @@ def test_newton_and_lbfgs_find_one_minimum_of_a_woven_sheet(woven_problem):
     newton = minimize_newton(problem)
     start = evaluate(problem.inertial_guess, problem)
     lbfgs = minimize(
-        lambda x: potential(x, problem), start, stiffness(problem, start.position), Stop(iterations=300)
+        lambda x: potential(x, problem),
+        start.position,
+        stiffness(problem, start.position),
+        Stop(iterations=300),
     )
     assert newton.is_converged
     gap = potential_float64(np.asarray(lbfgs.position), problem) - newton.value
