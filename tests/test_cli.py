@@ -247,3 +247,14 @@ def test_a_resumed_training_takes_no_other_configuration(tmp_path):
 def test_an_evaluation_of_nothing_is_refused(option, value):
     result = eslr("evaluate", "--model", "eslr-small", f"--{option}", value)
     refused(result, option.replace("-", "_"), "or more")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes differ")
+@pytest.mark.parametrize("arguments", [["train", "--help"], ["assets", "--json"]])
+def test_whoever_reads_the_output_may_leave(arguments):
+    ours, end = os.pipe()
+    os.close(ours)
+    command = [sys.executable, "-m", "eslr_jax.cli", *arguments]
+    result = subprocess.run(command, stdout=end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(end)
+    assert (result.returncode, result.stderr) == (141, "")

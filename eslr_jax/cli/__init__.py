@@ -7,6 +7,7 @@ something that the user can put right.
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import warnings
 
@@ -41,6 +42,7 @@ COMMANDS = (
     convert,
 )  # each has registered its own
 
+_BROKEN_PIPE = 128 + 13  # as a shell reports the signal SIGPIPE
 _REPEATABLE = {  # and the commands that collect its values
     "--set": ("train",),
     "--garment": ("simulate", "play", "score"),
@@ -58,8 +60,15 @@ def main() -> None:
     warnings.showwarning = _show_warning
     try:
         _refuse_repetition(sys.argv[1:])
-        with leave_at_once():
-            app.cli(prog="eslr")
+        try:
+            with leave_at_once():
+                app.cli(prog="eslr")
+        finally:
+            sys.stdout.flush()  # here, where a broken pipe is still caught
+    except BrokenPipeError:
+        # Who reads the output, such as `head`, has enough of it. Python flushes once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_BROKEN_PIPE)
     except EslrError as error:
         say(f"eslr: {error}")
         sys.exit(2)
