@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -28,8 +29,9 @@ class FrameReport(NamedTuple):
     terms: PotentialTerms  # energies that it ended with [J]
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
-    gap_bound: Float[Array, ""]  # share of the initial gap that the solver left at most; infinite without one
-    pair_demand: Int[Array, ""] | None  # see Trajectory
+    # Share of the initial gap that the solver left at most; infinite without one.
+    gap_bound: Float[Array, ""] | float = math.inf
+    pair_demand: Int[Array, ""] | None = None  # see Trajectory
 
 
 MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
