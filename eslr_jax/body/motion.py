@@ -260,6 +260,15 @@ def _skin_bent(rest, directions, weights, indices, rotations, transforms):
     return jax.lax.map(pose, (rotations, transforms))
 
 
+def _frame_at(step: int, num_frames: int, first: int = 0) -> int:
+    """Return the frame at the beginning of a step; see `there_and_back`."""
+    if step < first:
+        return step
+    period = max(2 * (num_frames - 1 - first), 1)
+    place = (step - first) % period
+    return first + min(place, period - place)
+
+
 def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int]:
     """Return the two frames of a step, for a motion that is played forth and back without end.
 
@@ -268,21 +277,13 @@ def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int
         num_frames: Of the motion.
         first: Frame from which on it is played forth and back; those before it are played once.
     """
-    period = max(2 * (num_frames - 1 - first), 1)
-
-    def place(at: int) -> int:
-        if at < first:
-            return at
-        at = (at - first) % period
-        return first + min(at, period - at)
-
-    return place(step), place(step + 1)
+    return _frame_at(step, num_frames, first), _frame_at(step + 1, num_frames, first)
 
 
 def back_and_forth(motion: Motion, num_frames: int, fps: float = 30.0) -> Motion:
     """Return a motion of at least `num_frames` frames at `fps`, played forwards and backwards by turns."""
     needed = int(np.ceil(num_frames * motion.fps / fps)) + 1
-    index = [there_and_back(step, len(motion.translations))[0] for step in range(needed)]
+    index = [_frame_at(step, len(motion.translations)) for step in range(needed)]
     return dataclasses.replace(
         motion, rotations=motion.rotations[index], translations=motion.translations[index]
     )

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.physics.potential import Point, potential
+from eslr_jax.physics.lbfgs import unknown_point
+from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
@@ -127,11 +128,11 @@ def measure_gap(
         starts = [find_start(None, problem, state, SimConfig())[0]]
         if model is not None:
             starts.append(find_start(params, problem, state, SimConfig(model=model))[0])
-        # Stacked, so that the solver is compiled once. A start without a previous point stands for its own, where
-        # nothing is known: a step of length zero adds nothing to the history.
-        same = [Point(one.position, jnp.inf, jnp.zeros_like(one.position)) for one in starts]
-        known = [one._replace(previous=one.previous or own) for one, own in zip(starts, same, strict=True)]
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *known)
+        # Stacked, so that the solver is compiled once: all have a previous point, or stand for it themselves.
+        stacked = jax.tree.map(
+            lambda *leaves: jnp.stack(leaves),
+            *(start._replace(previous=start.previous or unknown_point(start.position)) for start in starts),
+        )
 
         def descend(task):
             row, count = task

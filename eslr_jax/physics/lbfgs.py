@@ -51,7 +51,7 @@ class _State(NamedTuple):
     head: Int[Array, ""]
     scale: Float[Array, ""]
     decrement: Float[Array, ""]  # gap [J] that the last point was estimated to have
-    iterations: Int[Array, ""]
+    iterations: Int[Array, ""]  # -1 before the start is evaluated
     is_stuck: Bool[Array, ""]  # not even the preconditioned gradient leads down
 
 
@@ -146,15 +146,13 @@ def minimize(
             is_stuck=~is_lower & ~jnp.any(state.is_kept),
         )
 
-    # Without a previous point the first step has no length, and says nothing of curvature.
-    x = _flat(start if previous is None else previous.position)
-    nothing = jnp.zeros_like(x)
-    gradient = nothing if previous is None else _flat(previous.gradient)
+    before = unknown_point(start) if previous is None else previous
+    x, gradient = _flat(before.position), _flat(before.gradient)
     initial = _State(
         x=x,
         value=jnp.full((), jnp.inf, x.dtype),
         gradient=gradient,
-        smoothed=nothing if previous is None else inverse(gradient),
+        smoothed=gradient if previous is None else inverse(gradient),  # of zero it is zero
         pairs=jnp.zeros((2 * memory, x.size), x.dtype),
         by_gradient=jnp.zeros(2 * memory, x.dtype),
         by_change=jnp.zeros((2 * memory, memory), x.dtype),
@@ -169,6 +167,14 @@ def minimize(
     gain = stop.reference - final.value
     gap_bound = jnp.where(gain > 0, jnp.sqrt(2.0 * final.decrement / jnp.where(gain > 0, gain, 1.0)), jnp.inf)
     return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations, gap_bound)
+
+
+def unknown_point(position: Float[Array, "vertices 3"]) -> Point:
+    """Return positions [m], shape [vertices, 3], as a point at which nothing is known.
+
+    As the previous point of its own position it adds nothing to the history: the step has no length.
+    """
+    return Point(position, jnp.full((), jnp.inf, position.dtype), jnp.zeros_like(position))
 
 
 def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:
