@@ -1,7 +1,10 @@
 """The commands, snippets and links of the documentation work."""
 
+import ast
 import contextlib
+import importlib
 import io
+import json
 import re
 import shlex
 import shutil
@@ -142,13 +145,53 @@ def test_documented_views_serve_a_page(workplace, page, words):
             server.terminate()
 
 
+PYTHON = {page: "\n".join(blocks(page, "python")) for page in PAGES if blocks(page, "python")}
+NOTEBOOK = ROOT / "notebooks" / "tour.ipynb"
+
+
+def cells(notebook):
+    """Return the code of a notebook."""
+    every = json.loads(notebook.read_text())["cells"]
+    return "\n".join("".join(cell["source"]) for cell in every if cell["cell_type"] == "code")
+
+
+CHECKED = {**PYTHON, NOTEBOOK: cells(NOTEBOOK)}
+
+
+@pytest.fixture(scope="module")
+def complaints(tmp_path_factory):
+    """Return what a type checker says of every page's Python, page by page."""
+    folder = tmp_path_factory.mktemp("documented")
+    for page, code in CHECKED.items():
+        (folder / f"{page.stem}.py").write_text(code)
+    # Calls and names alone: what flax adds to a class, a type checker does not see.
+    rules = {"typeCheckingMode": "off", "reportCallIssue": "error", "reportUndefinedVariable": "error"}
+    (folder / "pyrightconfig.json").write_text(json.dumps(rules))
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable]
+    result = subprocess.run([*command, "-p", str(folder)], capture_output=True, text=True, check=False)
+    report = json.loads(result.stdout[result.stdout.index("{") :])  # the first run may say what it installs
+    assert report["summary"]["filesAnalyzed"] == len(CHECKED)
+    return {
+        page: [one["message"] for one in report["generalDiagnostics"] if Path(one["file"]).stem == page.stem]
+        for page in CHECKED
+    }
+
+
+@pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
+def test_documented_python_calls_what_exists(page, complaints):
+    # The slow test below runs it; this one finds at once an argument or a name that is gone.
+    assert complaints[page] == []
+    for statement in ast.walk(ast.parse(CHECKED[page])):
+        if isinstance(statement, ast.ImportFrom):
+            module = importlib.import_module(statement.module)
+            assert all(hasattr(module, one.name) for one in statement.names)
+
+
 @pytest.mark.slow
 @pytest.mark.example
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem
-)
+@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
 def test_documented_python_runs(page):
-    code = "\n".join(blocks(page, "python"))
+    code = PYTHON[page]
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=False
     )
@@ -172,7 +215,7 @@ def test_notebook_runs_top_to_bottom(tmp_path):
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     nbformat = pytest.importorskip("nbformat")
-    notebook = nbformat.read(ROOT / "notebooks" / "tour.ipynb", as_version=4)
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
     client = nbclient.NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}})
     client.execute()
     text = "".join(out.get("text", "") for cell in notebook.cells for out in cell.get("outputs", []))
