@@ -419,7 +419,7 @@ def _measure(
     trajectory, timing, scene = simulation
     parts = stored.face_parts, stored.part_names
     skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-    has_stopped = np.asarray(trajectory.iterations[1:]) < method.config.iterations
+    has_stopped = np.asarray(trajectory.iterations)[1:] < method.config.iterations
     return {
         "simulator": method.simulator,
         "model": method.model,

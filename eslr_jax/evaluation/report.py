@@ -52,6 +52,7 @@ def trajectory_report(
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
         any, of every tenth simulated frame and the last; None where self-contact is not modelled.
     """
+    trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
     measures: FrameMeasures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
@@ -64,7 +65,7 @@ def trajectory_report(
         "total": sum(terms.values()),
         "max_principal_stretch": float(measures.max_stretch.max()),
         "p99_principal_stretch": float(measures.p99_stretch.max()),
-        "start_principal_stretch": float(np.max(face_stretches(trajectory.positions[:1], scene.garment))),
+        "start_principal_stretch": float(_stretches(trajectory, scene, 0).max()),
         "worst_stretch": _worst_stretch(trajectory, scene, int(np.argmax(measures.max_stretch)) + 1, parts),
         "penetration_p999_mm": None,
         "penetration_max_mm": None,
@@ -190,8 +191,13 @@ def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion)
 
 def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:
     """Return where a frame is stretched most."""
-    stretch = np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
+    stretch = _stretches(trajectory, scene, frame)
     return _place(frame, int(np.asarray(scene.garment.faces)[stretch.argmax(), 0]), scene, parts)
+
+
+def _stretches(trajectory: Trajectory, scene: Scene, frame: int) -> np.ndarray:
+    """Return the larger principal stretch of every face in a frame, shape [faces]."""
+    return np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
 
 
 def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any]:

@@ -299,10 +299,11 @@ def reachable_vertices(
     A T-shirt's scene then searches no legs, no head and no feet. `radii` say how far each real vertex strays [m].
     """
     is_real = np.asarray(garment.vertex_mask)
-    is_near = np.zeros(poses.positions.shape[1], bool)
+    bodies = np.asarray(poses.positions)  # cut on the host, where it compiles nothing
+    is_near = np.zeros(bodies.shape[1], bool)
     for frame in _sampled(len(skinned)):
         far = np.flatnonzero(~is_near)  # once is enough
-        points = np.asarray(poses.positions[frame])[far]
+        points = bodies[frame, far]
         is_near[far] = _within(radii, np.asarray(skinned[frame])[is_real], points)
     return is_near
 

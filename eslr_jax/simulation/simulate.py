@@ -263,9 +263,9 @@ def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[
     first = trajectory.num_frames - num_frames
     if first <= 0:
         return trajectory, scene
-    bad = trajectory.first_bad_frame
+    bad = int(trajectory.first_bad_frame)
     kept = _slice_frames(trajectory, slice(first, None))
-    kept = kept.replace(first_bad_frame=jnp.where(bad >= 0, bad - first, bad))
+    kept = kept.replace(first_bad_frame=jnp.int32(bad - first if bad >= 0 else bad))
     state = state_at(trajectory, scene, first).replace(frame=jnp.int32(0))
     return kept, slice_tracks(scene, slice(first, None)).replace(initial_state=state, num_frames=num_frames)
 
