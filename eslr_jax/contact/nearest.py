@@ -17,7 +17,7 @@ _OPPOSED = -0.2  # cosine between normals below which two parts of the body face
 _TOUCHING = 0.02  # [m] that a vertex may already be inside the part across
 CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for the body
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
-PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
+_PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
 _ROOM = 0.01  # [m] that cloth needs between two parts of the body: a clearance to either side, and slack
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
@@ -328,25 +328,12 @@ def clear_of_body(
         garment: Says which vertices are pinned.
     """
 
-    def project(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+    def project(_, position):
         contacts = find_contacts(position, body, body, surface, garment.vertex_blocks)
-        return onto_body(position, contacts, garment)
+        height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
+        height = jnp.minimum(height, contacts.distances)
+        lift = jnp.where(contacts.is_near, jnp.maximum(CLEARANCE - height, 0.0), 0.0)
+        lift = jnp.where(garment.is_pinned, 0.0, lift)
+        return position + lift[:, None] * contacts.normals
 
-    return jax.lax.fori_loop(0, PUSH_OUT_STEPS, project, position)
-
-
-def onto_body(
-    position: Float[Array, "vertices 3"], contacts: Contacts, garment: Garment
-) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with vertices inside the body moved onto its tangent planes.
-
-    Args:
-        position: Garment vertices [m], shape [vertices, 3].
-        contacts: Their nearest body points.
-        garment: Says which vertices are pinned.
-    """
-    height = jnp.sum((position - contacts.points) * contacts.normals, axis=-1)
-    height = jnp.minimum(height, contacts.distances)
-    lift = jnp.where(contacts.is_near, jnp.maximum(CLEARANCE - height, 0.0), 0.0)
-    lift = jnp.where(garment.is_pinned, 0.0, lift)
-    return position + lift[:, None] * contacts.normals
+    return jax.lax.fori_loop(0, _PUSH_OUT_STEPS, project, position)

@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.edges import Cloth, Skin, clearance_over, find_crossings
-from eslr_jax.contact.nearest import CLEARANCE, PUSH_OUT_STEPS, find_contacts, onto_body
+from eslr_jax.contact.nearest import CLEARANCE, find_contacts
 from eslr_jax.contact.search import face_corners, following_vertices, nearest_candidates, nearest_face_around
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, components, dot3, sub3, take3, vertex_normals
@@ -107,55 +107,37 @@ def skin_heights(position: Float[Array, "vertices 3"] | Vector3, skin: SkinConta
     return dot3(sub3(place, components(skin.next_points)), components(skin.next_normals))  # type: ignore[arg-type]
 
 
-def clear_of_skin(
+def lift_off_skin(
     position: Float[Array, "vertices 3"],
     body: Float[Array, "surface_vertices 3"],
     surface: BodySurface,
     garment: Garment,
 ) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], out of the body, and faces of the cloth off the skin.
-
-    Vertices are moved onto the body first, as `clear_of_body` does, then faces are lifted; pinned vertices stay.
+    """Return positions [m], shape [vertices, 3], with faces of the cloth lifted off the skin; pinned ones stay.
 
     Args:
-        position: Cloth vertices [m], shape [vertices, 3].
-        body: Surface vertices [m], shape [surface_vertices, 3].
+        position: Cloth vertices outside the body, of `clear_of_body` [m].
+        body: Surface vertices [m].
         surface: Faces of the body.
         garment: Says which vertices are pinned.
     """
+    count = position.shape[0]
 
-    def move(number: Array, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        # One loop for both, since the search for the nearest points takes seconds to compile.
+    def lift(_, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
         nearest = find_contacts(position, body, body, surface, garment.vertex_blocks)
-        return jax.lax.cond(
-            number < PUSH_OUT_STEPS,
-            lambda: onto_body(position, nearest, garment),
-            lambda: _off_skin(position, nearest, body, surface, garment),
-        )
+        skin = find_skin_contacts((position, position), (body, body), nearest, surface, garment)
+        depth = jnp.where(skin.is_near, jnp.maximum(CLEARANCE - skin_heights(position, skin), 0.0), 0.0)
+        # Corner k moves by w_k / |w|^2 times the depth, so that the place does by the depth; a corner of several
+        # places by the largest that they ask for.
+        share = skin.weights / jnp.sum(skin.weights**2, axis=1, keepdims=True) * depth[:, None]
+        highest = jnp.zeros(count, position.dtype).at[skin.corners].max(share)
+        is_highest = (share > 0) & (share == highest[skin.corners])
+        moves = jnp.where(is_highest[..., None], share[..., None] * skin.next_normals[:, None], 0.0)
+        times = jnp.zeros(count, position.dtype).at[skin.corners].add(is_highest.astype(position.dtype))
+        move = jnp.zeros_like(position).at[skin.corners].add(moves) / jnp.maximum(times, 1.0)[:, None]
+        return position + jnp.where(garment.is_pinned[:, None], 0.0, move)
 
-    return jax.lax.fori_loop(0, PUSH_OUT_STEPS + _LIFTS, move, position)
-
-
-def _off_skin(
-    position: Float[Array, "vertices 3"],
-    nearest: Contacts,
-    body: Float[Array, "surface_vertices 3"],
-    surface: BodySurface,
-    garment: Garment,
-) -> Float[Array, "vertices 3"]:
-    """Return positions with faces of the cloth lifted off the skin once; see `clear_of_skin`."""
-    skin = find_skin_contacts((position, position), (body, body), nearest, surface, garment)
-    depth = jnp.where(skin.is_near, jnp.maximum(CLEARANCE - skin_heights(position, skin), 0.0), 0.0)
-    # Corner k moves by w_k / |w|^2 times the depth, so that the place does by the depth; a corner of several
-    # places by the largest that they ask for.
-    share = skin.weights / jnp.sum(skin.weights**2, axis=1, keepdims=True) * depth[:, None]
-    nothing = jnp.zeros(position.shape[0], position.dtype)
-    highest = nothing.at[skin.corners].max(share)
-    is_highest = (share > 0) & (share == highest[skin.corners])
-    moves = jnp.where(is_highest[..., None], share[..., None] * skin.next_normals[:, None], 0.0)
-    times = nothing.at[skin.corners].add(is_highest.astype(position.dtype))
-    move = jnp.zeros_like(position).at[skin.corners].add(moves) / jnp.maximum(times, 1.0)[:, None]
-    return position + jnp.where(garment.is_pinned[:, None], 0.0, move)
+    return jax.lax.fori_loop(0, _LIFTS, lift, position)
 
 
 def _nearest_vertices(

@@ -52,8 +52,8 @@ def trajectory_report(
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
         any, of every tenth simulated frame and the last; None where self-contact is not modelled.
     """
-    trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
     measures: FrameMeasures = jax.device_get(measure_frames(trajectory.positions, scene))
+    trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}

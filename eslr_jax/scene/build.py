@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
-from eslr_jax.contact.skin import clear_of_skin
+from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.types import (
     Air,
     BodyMotion,
@@ -67,8 +67,9 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     position, body = skinned[0], None
     if plan.surface is not None:
         body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids], has_skin=plan.has_skin)
-        clear = clear_of_skin if plan.has_skin else clear_of_body
-        position = clear(position, body.positions[0], plan.surface, garment)
+        position = clear_of_body(position, body.positions[0], plan.surface, garment)
+        if plan.has_skin:
+            position = lift_off_skin(position, body.positions[0], plan.surface, garment)
     if plan.ground is not None:
         position = clear_of_ground(position, plan.ground, garment.is_pinned)
     velocity = (skinned[1] - skinned[0]) / poses.timestep

@@ -8,7 +8,7 @@ from draped_ball import RADIUS, ball, drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.contact.skin import clear_of_skin, find_skin_contacts, skin_heights
+from eslr_jax.contact.skin import find_skin_contacts, lift_off_skin, skin_heights
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.collision import skin_diagonal, skin_energy
@@ -60,7 +60,7 @@ def test_faces_are_lifted_off_the_skin():
     scene = scene_of(has_skin=True, num_frames=2)
     cut = scene.garment.rest_positions - jnp.array([[0.0, 0.006, 0.0]])
     assert height_over_top(cut) < -1e-3
-    lifted = clear_of_skin(cut, scene.body.positions[0], scene.body.surface, scene.garment)
+    lifted = lift_off_skin(cut, scene.body.positions[0], scene.body.surface, scene.garment)
     assert height_over_top(lifted) >= 0
 
 
