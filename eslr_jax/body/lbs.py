@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from eslr_jax.numerics import product
+
 SERIES_BELOW = 1e-2  # [rad^2], where the truncated series are exact to float32 and the closed forms are not
 
 
@@ -74,7 +76,7 @@ def joint_transforms(
         joints, above = generations[level]
         bones = joint_rest_positions[joints] - joint_rest_positions[above]
         posed = posed.at[joints].set(posed[above] + _apply(turned[above], bones), mode="drop")
-        return turned.at[joints].set(_product(turned[above], turned[joints]), mode="drop"), posed
+        return turned.at[joints].set(product(turned[above], turned[joints]), mode="drop"), posed
 
     # A loop, not a row of copies: a skeleton of twenty generations would be a second of compilation.
     generations = jnp.asarray(_generations(parents))
@@ -108,7 +110,7 @@ def skin(
     dense = jnp.sum(
         jnp.where(is_joint, weights[:, :, None], 0.0), axis=1
     )  # a product beats gathers everywhere
-    blended = _product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
+    blended = product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
 
@@ -143,7 +145,7 @@ def bend(
     Source: Loper et al. 2015, equation 9.
     """
     flat = directions.reshape((-1, directions.shape[2]))
-    return _product(flat, turned.reshape((-1, 1))).reshape((-1, 3))
+    return product(flat, turned.reshape((-1, 1))).reshape((-1, 3))
 
 
 def _generations(parents: tuple[int, ...]) -> Int[np.ndarray, "generations 2 width"]:
@@ -159,11 +161,6 @@ def _generations(parents: tuple[int, ...]) -> Int[np.ndarray, "generations 2 wid
     for row, joints in zip(rows, members, strict=True):
         row[:, : len(joints)] = joints, parent[joints]
     return rows
-
-
-def _product(left: Array, right: Array) -> Array:
-    """Return a matrix product in the full precision of its arguments."""
-    return jnp.matmul(left, right, precision=jax.lax.Precision.HIGHEST)
 
 
 def _apply(matrices: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

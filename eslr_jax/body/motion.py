@@ -16,6 +16,7 @@ from eslr_jax.body.retarget import ARM_ABDUCTION, abduct_arms, resample
 from eslr_jax.errors import ConfigError, MotionError
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.io.skeleton import Skeleton
+from eslr_jax.numerics import product
 from eslr_jax.types import Body, BodyMotion, BodySurface
 
 _MAX_ABDUCTION = 90.0  # [degrees]; arms lifted further are above the shoulders
@@ -197,8 +198,8 @@ def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
         )
     coefficients = jnp.asarray(np.pad(given, (0, known - len(given))), jnp.float32)
     return body.replace(
-        rest_positions=body.rest_positions + body.shape_directions @ coefficients,
-        joint_rest_positions=body.joint_rest_positions + body.joint_shape_directions @ coefficients,
+        rest_positions=body.rest_positions + product(body.shape_directions, coefficients),
+        joint_rest_positions=body.joint_rest_positions + product(body.joint_shape_directions, coefficients),
     )
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.numerics import product
 from eslr_jax.physics.potential import Point
 from eslr_jax.physics.preconditioner import Stiffness, stiffness_inverse
 
@@ -79,11 +80,13 @@ def _direction(state: _State) -> Float[Array, " n"]:
     curvatures = jnp.diag(step_change)
     upper = jnp.triu(step_change) + jnp.diag(jnp.where(is_kept, 0.0, 1.0))  # an empty row solves to nothing
     back = solve_triangular(upper, jnp.where(is_kept, of_step, 0.0))
-    right = curvatures * back + state.scale * (change_change @ back - jnp.where(is_kept, of_change, 0.0))
+    right = curvatures * back + state.scale * (
+        product(change_change, back) - jnp.where(is_kept, of_change, 0.0)
+    )
     forth = solve_triangular(upper, right, trans="T")
     weights = jnp.zeros_like(state.by_gradient).at[order].set(forth)
     weights = weights.at[memory + order].set(-state.scale * back)
-    return -(state.scale * state.smoothed + weights @ state.pairs)
+    return -(state.scale * state.smoothed + product(weights, state.pairs))
 
 
 def minimize(
@@ -127,7 +130,7 @@ def minimize(
         return value, gradient
 
     def is_running(state: _State) -> Array:
-        is_above = jnp.dot(state.gradient, state.gradient) > 0
+        is_above = product(state.gradient, state.gradient) > 0
         is_far = 2.0 * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
         is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
         return is_going | (state.iterations < 0)
@@ -135,7 +138,7 @@ def minimize(
     def iterate(state: _State) -> _State:
         is_first = state.iterations < 0
         direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
-        slope = jnp.dot(direction, state.gradient)
+        slope = product(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
         # Where no step along the direction leads down, the history is dropped and tried without.
         kept = state._replace(is_kept=state.is_kept & is_lower)
@@ -199,12 +202,12 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
     # P g is summed up: as a difference of two P g, P y holds ten times the rounding.
     smoothed_change = inverse(change)
     smoothed = state.smoothed + smoothed_change
-    curvature = jnp.dot(step, change)
-    is_useful = curvature > 1e-10 * jnp.sqrt(jnp.dot(step, step) * jnp.dot(change, change))
+    curvature = product(step, change)
+    is_useful = curvature > 1e-10 * jnp.sqrt(product(step, step) * product(change, change))
     memory = state.is_kept.shape[0]
     head = (state.head + 1) % memory
     pairs = state.pairs.at[head].set(step).at[memory + head].set(smoothed_change)
-    products = pairs @ change
+    products = product(pairs, change)
     by_change = state.by_change.at[:, head].set(products)
     by_change = by_change.at[memory + head].set(products[memory:])  # Y'PY is symmetric
     weighted = products[memory + head]
@@ -214,7 +217,7 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
         gradient=gradient,
         smoothed=smoothed,
         pairs=pairs,
-        by_gradient=pairs @ gradient,
+        by_gradient=product(pairs, gradient),
         by_change=by_change,
         is_kept=state.is_kept.at[head].set(is_useful),
         head=head,

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+_inner = partial(jnp.vdot, precision=jax.lax.Precision.HIGHEST)  # GPUs round float32 to ten bits otherwise
 
 Operator = Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]]
 
@@ -65,7 +68,7 @@ def solve_symmetric(
     Source: Paige and Saunders 1975, doi 10.1137/0712047.
     """
     y = precondition(force)
-    whole = jnp.sqrt(jnp.vdot(force, y))
+    whole = jnp.sqrt(_inner(force, y))
     zero, zeros = jnp.zeros((), force.dtype), jnp.zeros_like(force)
 
     def is_running(state: _State) -> Array:
@@ -74,10 +77,10 @@ def solve_symmetric(
     def iterate(s: _State) -> _State:
         v = s.y / s.beta
         product = apply(v) - s.beta / jnp.where(s.old_beta > 0, s.old_beta, 1.0) * s.r1
-        alpha = jnp.vdot(v, product)
+        alpha = _inner(v, product)
         product = product - alpha / s.beta * s.r2
         y = precondition(product)
-        beta = jnp.sqrt(jnp.maximum(jnp.vdot(product, y), 0.0))
+        beta = jnp.sqrt(jnp.maximum(_inner(product, y), 0.0))
 
         delta = s.cosine * s.dbar + s.sine * alpha
         gbar = s.sine * s.dbar - s.cosine * alpha
@@ -127,5 +130,5 @@ def solve_symmetric(
     end = jax.lax.while_loop(is_running, iterate, start)
     # The recursion's own residual goes on falling where rounding has stopped the true one.
     left = force - apply(end.x)
-    residual = jnp.sqrt(jnp.vdot(left, precondition(left))) / jnp.where(whole > 0, whole, 1.0)
+    residual = jnp.sqrt(_inner(left, precondition(left))) / jnp.where(whole > 0, whole, 1.0)
     return LinearSolution(end.x, residual, end.iterations, end.is_indefinite)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from eslr_jax.numerics import product
 from eslr_jax.physics.potential import Point
 
 _MIN_CURVATURE = 1e-3  # of a combination, as a share of the directions' own: below it float32 holds noise
@@ -38,12 +39,12 @@ def combine_directions(
     """
     spanning = jax.lax.stop_gradient(directions) if fixed_weights else directions
     changes = jax.vmap(lambda step: jax.grad(function)(point.position + step) - point.gradient)(spanning)
-    slopes = jnp.einsum("kij,ij->k", spanning, point.gradient)
-    curvatures = jnp.einsum("kij,lij->kl", spanning, changes)
+    slopes = jnp.sum(spanning * point.gradient[None], axis=(1, 2))
+    curvatures = jnp.einsum("kij,lij->kl", spanning, changes, precision=jax.lax.Precision.HIGHEST)
     weights = _minimize_quadratic(slopes, 0.5 * (curvatures + curvatures.T))
     if fixed_weights:
         weights = jax.lax.stop_gradient(weights)
-    combined = jnp.einsum("k,kij->ij", weights, directions)
+    combined = jnp.sum(weights[:, None, None] * directions, axis=0)
     moves = jnp.stack([combined, directions[0], jnp.zeros_like(combined)])
     ends = jnp.stack(
         [function(point.position + combined), function(point.position + directions[0]), point.value]
@@ -61,14 +62,14 @@ def _minimize_quadratic(
     diagonal = jnp.abs(jnp.diag(curvatures))
     is_real = diagonal > 0
     scale = jnp.where(is_real, 1.0 / jnp.sqrt(jnp.where(is_real, diagonal, 1.0)), 0.0)
-    return -scale * (_inverse_absolute(curvatures * scale[:, None] * scale[None, :]) @ (scale * slopes))
+    return -scale * product(_inverse_absolute(curvatures * scale[:, None] * scale[None, :]), scale * slopes)
 
 
 @jax.custom_jvp
 def _inverse_absolute(matrix: Float[Array, "rows rows"]) -> Float[Array, "rows rows"]:
     """Return f(matrix) with f(x) = 1 / max(|x|, least) on the eigenvalues of a symmetric matrix."""
     values, vectors = jnp.linalg.eigh(matrix)
-    return (vectors / jnp.maximum(jnp.abs(values), _MIN_CURVATURE)[None, :]) @ vectors.T
+    return product(vectors / jnp.maximum(jnp.abs(values), _MIN_CURVATURE)[None, :], vectors.T)
 
 
 @_inverse_absolute.defjvp
@@ -87,5 +88,6 @@ def _inverse_absolute_jvp(primals, tangents):
         (inverse[:, None] - inverse[None, :]) / jnp.where(is_apart, apart, 1.0),
         0.5 * (slope[:, None] + slope[None, :]),
     )
-    change = vectors @ (divided * (vectors.T @ tangents[0] @ vectors)) @ vectors.T
-    return (vectors * inverse[None, :]) @ vectors.T, change
+    turned = divided * product(product(vectors.T, tangents[0]), vectors)
+    change = product(product(vectors, turned), vectors.T)
+    return product(vectors * inverse[None, :], vectors.T), change

@@ -17,7 +17,7 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.skinning import smooth
-from eslr_jax.numerics import vertex_normals
+from eslr_jax.numerics import product, vertex_normals
 from eslr_jax.scene.plan import shared_surface
 from eslr_jax.types import Body, BodySurface, Garment
 
@@ -78,11 +78,11 @@ class TrainingData:
         """Return joint transforms of a frame, the scene turned about the vertical by `yaw` [rad]."""
         transforms = self.joint_transforms[frame]
         if self.shapes is not None and shape is not None:
-            transforms = transforms.at[:, :, 3].add(self.shapes.joints[frame] @ shape)
+            transforms = transforms.at[:, :, 3].add(product(self.shapes.joints[frame], shape))
         cos, sin = jnp.cos(yaw), jnp.sin(yaw)
         zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
         turn = jnp.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
-        return turn @ transforms
+        return product(turn[None], transforms)
 
     def body(
         self,
@@ -93,7 +93,7 @@ class TrainingData:
         """Return the posed surface of a body of some shape, thicker by `girth` [m]."""
         rest = self.surface_rest + girth * self.surface_normals
         if self.shapes is not None and shape is not None:
-            rest = rest + self.shapes.surface @ shape
+            rest = rest + product(self.shapes.surface, shape)
         return lbs.skin(rest, self.surface_skin_weights, self.surface_skin_indices, transforms)
 
     def skinned(
@@ -106,7 +106,7 @@ class TrainingData:
         garment = self.garment(index)
         rest = garment.rest_positions
         if self.shapes is not None and shape is not None:
-            rest = rest + self.shapes.garments[index] @ shape
+            rest = rest + product(self.shapes.garments[index], shape)
         return lbs.skin(rest, garment.skin_weights, garment.skin_indices, transforms)
 
 

@@ -216,11 +216,7 @@ def _sample_gradient(
 ) -> tuple[Any, _Sample]:
     """Return one trajectory's gradient, and move it on by a frame."""
     index = entry.index % data.num_garments
-    slot = jax.lax.cond(
-        entry.slot.is_done,
-        lambda: start_trajectory(entry.key, data, index, config),
-        lambda: entry.slot,
-    )
+    slot = _living_slot(entry, data, index, config)
     problem = slot_problem(slot, data, index, config)
     progress = curriculum(config, step)
     terms_of = potential_terms
@@ -244,6 +240,38 @@ def _sample_gradient(
         **report.terms._asdict(),
     }
     return gradient, _Sample(slot, metrics, statistics)
+
+
+def _living_slot(entry: _Entry, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:
+    """Return the trajectory, or the start of another where it is done.
+
+    Under `vmap` a condition computes both sides. Starts are rare, so they are left out while no trajectory of the
+    batch is done.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def living(entry: _Entry, data: TrainingData, index: Array) -> Slot:
+        return jax.lax.cond(
+            entry.slot.is_done, lambda: start_trajectory(entry.key, data, index, config), lambda: entry.slot
+        )
+
+    @living.def_vmap
+    def living_batch(size, is_batched, *given):
+        axes = jax.tree.map(lambda leaf: 0 if leaf else None, tuple(is_batched))
+
+        def choose(entry: _Entry, data: TrainingData, index: Array) -> Slot:
+            fresh = start_trajectory(entry.key, data, index, config)
+            return jax.tree.map(lambda new, old: jnp.where(entry.slot.is_done, new, old), fresh, entry.slot)
+
+        kept = jax.vmap(lambda entry, data, index: entry.slot, axes, axis_size=size)
+        slots = jax.lax.cond(
+            jnp.any(given[0].slot.is_done),
+            lambda: jax.vmap(choose, axes, axis_size=size)(*given),
+            lambda: kept(*given),
+        )
+        return slots, jax.tree.map(lambda _: True, slots)
+
+    return living(entry, data, index)
 
 
 def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> FrameProblem:

@@ -1,0 +1,79 @@
+"""Time rollouts of many scenes by how many go through a step together.
+
+    python experiments/benchmarks/batch_size.py [--vertices 1k] [--batches 1 8 64] [--out DIR] [--smoke]
+
+A T-shirt walks on the clips of the test split, as often as the largest batch asks for. Every frame takes 20
+iterations. Writes batch_size.json with the milliseconds of a frame, and of a frame and scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+
+from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
+from eslr_jax.assets.load import Resolution
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import environment
+from eslr_jax.io.atomic import atomic_write
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
+from eslr_jax.simulation.budget import device_name
+
+RESULTS = Path(__file__).parents[1] / "results"
+CONFIG = SimConfig(iterations=20)
+
+
+def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -> list[dict[str, float]]:
+    """Return a row for every batch: the quickest of some turns."""
+    body, clips = load_body(), split_clips("test")
+    poses = [pose_body(body, load_motion(clip), num_frames=frames + 1) for clip in clips]
+    garments = [load_garment("tshirt", vertices=vertices)] * len(clips)
+    scenes = stack_scenes(
+        prepare_scenes(garments, poses, [COTTON] * len(clips), options=SceneOptions(self_contact=False))
+    )
+    rows = []
+    for batch in batches:
+        places = jnp.arange(batch, dtype=jnp.int32) % len(clips)
+        some = jax.tree.map(lambda leaf, places=places: leaf[places], scenes)
+        jax.block_until_ready(rollout_scenes(None, some, CONFIG, batch_size=batch))
+        seconds = []
+        for _ in range(turns):
+            began = time.perf_counter()
+            jax.block_until_ready(rollout_scenes(None, some, CONFIG, batch_size=batch))
+            seconds.append(time.perf_counter() - began)
+        milliseconds = 1e3 * min(seconds) / frames
+        rows.append({"batch": batch, "frame_ms": milliseconds, "frame_and_scene_ms": milliseconds / batch})
+        print(
+            f"{vertices}, {batch} scenes: {milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
+        )
+    return rows
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--vertices", choices=get_args(Resolution), default="1k")
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64])
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--smoke", action="store_true", help="two frames, one turn")
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    path = chosen.out / "batch_size.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    rows = measure(chosen.vertices, chosen.batches, *((2, 1) if chosen.smoke else (20, 3)))
+    known[f"{device_name()}, {chosen.vertices}"] = {"rows": rows, "environment": environment()}
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(known, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""Several seeds in one compiled step train as each does alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+from seeds import make_seeds_step, stack_seeds, take_seed
+
+from eslr_jax.config import TrainConfig
+from eslr_jax.training.step import init_train_state, make_train_step
+
+STEPS = 5
+
+
+def test_seeds_together_are_each_alone(small_data, cheap_model):
+    # Trajectories of at most two frames: some start anew while others go on.
+    config = TrainConfig(model=cheap_model, steps=STEPS, horizon=2, horizon_growth=1)
+    configs = [dataclasses.replace(config, seed=seed) for seed in (3, 4)]
+    alone = [init_train_state(one, (small_data,)) for one in configs]
+    together = stack_seeds([init_train_state(one, (small_data,)) for one in configs])
+    step, seeds_step = make_train_step(config, 0), make_seeds_step(config)
+    losses = []
+    for _ in range(STEPS):
+        together, metrics = seeds_step(together, small_data)
+        results = [step(state, small_data) for state in alone]
+        alone = [state for state, _ in results]
+        losses.append((np.asarray(metrics["loss"]), np.array([own["loss"] for _, own in results])))
+    found, expected = np.array(losses).swapaxes(0, 1)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    assert abs(expected[:, 0] - expected[:, 1]).min() > 0  # the seeds differ
+    for place, state in enumerate(alone):
+        for one, other in zip(
+            jax.tree.leaves(take_seed(together, place).params), jax.tree.leaves(state.params), strict=True
+        ):
+            np.testing.assert_allclose(one, other, atol=1e-4)
+        assert int(take_seed(together, place).step) == STEPS
