@@ -58,8 +58,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="two steps")
     chosen = parser.parse_args()
-    config = load_recipe(chosen.config, dict(parse_override(text) for text in chosen.changes))
+    changes = dict(parse_override(text) for text in chosen.changes) | ({"steps": 2} if chosen.smoke else {})
+    config = load_recipe(chosen.config, changes)
     train_seeds([dataclasses.replace(config, seed=seed) for seed in chosen.seeds], chosen.out, chosen.resume)
 
 
