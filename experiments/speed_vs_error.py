@@ -101,6 +101,7 @@ def draw(result: dict, path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     sizes, peers = list(result["sizes"]), result["peers"]
     names = dict.fromkeys(name for size in sizes for name in result["sizes"][size]["methods"])
@@ -126,6 +127,9 @@ def draw(result: dict, path: Path) -> None:
         axis.set_title(f"{size} vertices")
         axis.set_xlabel("time per frame [ms]")
         axis.grid(True, which="both", alpha=0.2)
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a panel may span less than a decade
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0][0].set_ylabel("optimality gap / the initial gap (median)")
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize=8)
     with atomic_write(path) as temporary:
