@@ -127,7 +127,7 @@ def _lowest(
 ) -> tuple[Int[Array, " starts"], Int[Array, "starts 3"], Float[Array, " starts"]]:
     """Return vertices, corners and sides of the pairs of a vertex and a face that are closest at t."""
     weights = jax.lax.stop_gradient(faces.weights)
-    place = jnp.sum(weights[None] * now[:, faces.corners], axis=2)
+    place = jnp.einsum("pk,xpk->xp", weights, now[:, faces.corners], precision=jax.lax.Precision.HIGHEST)
     squared = jnp.sum(jnp.square(now[:, faces.vertices] - place), axis=0)
     _, lowest = jax.lax.top_k(-jnp.where(faces.side != 0, squared, jnp.inf), count)
     return faces.vertices[lowest], faces.corners[lowest], faces.side[lowest]

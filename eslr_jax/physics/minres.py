@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-_inner = partial(jnp.vdot, precision=jax.lax.Precision.HIGHEST)  # GPUs round float32 to ten bits otherwise
+_inner = partial(jnp.vdot, precision=jax.lax.Precision.HIGHEST)  # as numerics.product does
 
 Operator = Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]]
 

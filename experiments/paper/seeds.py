@@ -94,9 +94,10 @@ def train_seeds(configs: list[TrainConfig], out: Path, is_resumed: bool) -> None
                 }
                 _log(folders, jax.device_get(window), times)
                 window = []
+            if done % config.checkpoint_every == 0 or done == config.steps or stop.is_wanted:
+                checkpoints.save(state)
             if stop.is_wanted:
                 break
-    checkpoints.save(state)
     checkpoints.close()
     for place, (folder, one) in enumerate(zip(folders, configs, strict=True)):
         export(take_seed(state, place), one, folder)
@@ -107,7 +108,7 @@ def _log(folders: list[Path], window: list[dict[str, np.ndarray]], times: dict[s
     for place, folder in enumerate(folders):
         values = {name: float(np.median([entry[name][place] for entry in window])) for name in window[0]}
         with (folder / "metrics.jsonl").open("a") as log:
-            log.write(json.dumps({**times, "skipped": 0, **values}) + "\n")
+            log.write(json.dumps(times | values) + "\n")
 
 
 if __name__ == "__main__":
