@@ -87,3 +87,10 @@ def test_a_part_is_in_the_program_only_where_it_is_modelled(default, everything,
     for source in SOURCES[part]:
         assert count_from(default, source) == 0, source
         assert count_from(everything, source) > 0, source
+
+
+def test_physics_multiplies_in_full_precision(everything):
+    """A GPU rounds the operands of other products of float32 to ten bits."""
+    products = [line for line in everything.splitlines() if "stablehlo.dot_general" in line]
+    assert products
+    assert not [line for line in products if "HIGHEST" not in line]
