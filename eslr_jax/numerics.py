@@ -34,11 +34,16 @@ def safe_normalize(x: Float[Array, ...], axis: int = -1) -> Float[Array, ...]:
     return jnp.where(is_zero, 0.0, x * jax.lax.rsqrt(jnp.where(is_zero, 1.0, squared)))
 
 
-def product(left: Float[Array, ...], right: Float[Array, ...]) -> Float[Array, ...]:
-    """Return left @ right with all bits of its arguments; a GPU rounds those of float32 to ten by default.
+def sum_products(subscripts: str, left: Float[Array, ...], right: Float[Array, ...]) -> Float[Array, ...]:
+    """Return jnp.einsum with all bits of its arguments; a GPU rounds those of float32 to ten by default.
 
     Positions of metres would be off by half a millimetre.
     """
+    return jnp.einsum(subscripts, left, right, precision=jax.lax.Precision.HIGHEST)
+
+
+def product(left: Float[Array, ...], right: Float[Array, ...]) -> Float[Array, ...]:
+    """Return left @ right with all bits of its arguments; see `sum_products`."""
     return jnp.matmul(left, right, precision=jax.lax.Precision.HIGHEST)
 
 

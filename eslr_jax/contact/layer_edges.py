@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lines import cross_lines
 from eslr_jax.contact.self_contact import FacePairs
-from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, take3
+from eslr_jax.numerics import Vector3, cross3, dot3, safe_normalize, sub3, sum_products, take3
 from eslr_jax.types import Garment
 
 # [m] between two edges at t or at t + 1, within which they are paired: three times the thickness of repulsion.
@@ -126,8 +126,7 @@ def _lowest(
     now: Float[Array, "3 vertices"], faces: FacePairs, count: int
 ) -> tuple[Int[Array, " starts"], Int[Array, "starts 3"], Float[Array, " starts"]]:
     """Return vertices, corners and sides of the pairs of a vertex and a face that are closest at t."""
-    weights = jax.lax.stop_gradient(faces.weights)
-    place = jnp.einsum("pk,xpk->xp", weights, now[:, faces.corners], precision=jax.lax.Precision.HIGHEST)
+    place = sum_products("pk,xpk->xp", jax.lax.stop_gradient(faces.weights), now[:, faces.corners])
     squared = jnp.sum(jnp.square(now[:, faces.vertices] - place), axis=0)
     _, lowest = jax.lax.top_k(-jnp.where(faces.side != 0, squared, jnp.inf), count)
     return faces.vertices[lowest], faces.corners[lowest], faces.side[lowest]

@@ -16,7 +16,7 @@ from eslr_jax.evaluation.gap import map_frames, trajectory_states
 from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.run import Run
-from eslr_jax.numerics import scatter_corners
+from eslr_jax.numerics import product, scatter_corners
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
@@ -186,7 +186,7 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
         return jnp.sum(gradient * way, axis=-1)
 
     works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
-    return jnp.asarray(0.5 * weights, position.dtype) @ works
+    return product(jnp.asarray(0.5 * weights, position.dtype), works)
 
 
 def _distances(run: Run) -> Field:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-_inner = partial(jnp.vdot, precision=jax.lax.Precision.HIGHEST)  # as numerics.product does
+from eslr_jax.numerics import product
 
 Operator = Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]]
 
@@ -76,11 +75,11 @@ def solve_symmetric(
 
     def iterate(s: _State) -> _State:
         v = s.y / s.beta
-        product = apply(v) - s.beta / jnp.where(s.old_beta > 0, s.old_beta, 1.0) * s.r1
-        alpha = _inner(v, product)
-        product = product - alpha / s.beta * s.r2
-        y = precondition(product)
-        beta = jnp.sqrt(jnp.maximum(_inner(product, y), 0.0))
+        applied = apply(v) - s.beta / jnp.where(s.old_beta > 0, s.old_beta, 1.0) * s.r1
+        alpha = _inner(v, applied)
+        applied = applied - alpha / s.beta * s.r2
+        y = precondition(applied)
+        beta = jnp.sqrt(jnp.maximum(_inner(applied, y), 0.0))
 
         delta = s.cosine * s.dbar + s.sine * alpha
         gbar = s.sine * s.dbar - s.cosine * alpha
@@ -93,7 +92,7 @@ def solve_symmetric(
         return _State(
             x=s.x + cosine * s.phi * w,
             r1=s.r2,
-            r2=product,
+            r2=applied,
             y=y,
             w1=s.w2,
             w2=w,
@@ -132,3 +131,8 @@ def solve_symmetric(
     left = force - apply(end.x)
     residual = jnp.sqrt(_inner(left, precondition(left))) / jnp.where(whole > 0, whole, 1.0)
     return LinearSolution(end.x, residual, end.iterations, end.is_indefinite)
+
+
+def _inner(left: Float[Array, "*shape"], right: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """Return the sum of left times right, entry by entry."""
+    return product(left.ravel(), right.ravel())

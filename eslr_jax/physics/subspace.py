@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import product
+from eslr_jax.numerics import product, sum_products
 from eslr_jax.physics.potential import Point
-
-_sum_products = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)  # as numerics.product does
 
 _MIN_CURVATURE = 1e-3  # of a combination, as a share of the directions' own: below it float32 holds noise
 
@@ -42,12 +39,12 @@ def combine_directions(
     """
     spanning = jax.lax.stop_gradient(directions) if fixed_weights else directions
     changes = jax.vmap(lambda step: jax.grad(function)(point.position + step) - point.gradient)(spanning)
-    slopes = _sum_products("kij,ij->k", spanning, point.gradient)
-    curvatures = _sum_products("kij,lij->kl", spanning, changes)
+    slopes = sum_products("kij,ij->k", spanning, point.gradient)
+    curvatures = sum_products("kij,lij->kl", spanning, changes)
     weights = _minimize_quadratic(slopes, 0.5 * (curvatures + curvatures.T))
     if fixed_weights:
         weights = jax.lax.stop_gradient(weights)
-    combined = _sum_products("k,kij->ij", weights, directions)
+    combined = sum_products("k,kij->ij", weights, directions)
     moves = jnp.stack([combined, directions[0], jnp.zeros_like(combined)])
     ends = jnp.stack(
         [function(point.position + combined), function(point.position + directions[0]), point.value]

@@ -245,33 +245,25 @@ def _sample_gradient(
 def _living_slot(entry: _Entry, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:
     """Return the trajectory, or the start of another where it is done.
 
-    Under `vmap` a condition computes both sides. Starts are rare, so they are left out while no trajectory of the
-    batch is done.
+    Under `vmap` a condition computes both sides. A start is rare and searches contacts several times, so it is
+    left out while no trajectory of the batch is done.
     """
 
-    @jax.custom_batching.custom_vmap
     def living(entry: _Entry, data: TrainingData, index: Array) -> Slot:
         return jax.lax.cond(
             entry.slot.is_done, lambda: start_trajectory(entry.key, data, index, config), lambda: entry.slot
         )
 
-    @living.def_vmap
     def living_batch(size, is_batched, *given):
         axes = jax.tree.map(lambda leaf: 0 if leaf else None, tuple(is_batched))
-
-        def choose(entry: _Entry, data: TrainingData, index: Array) -> Slot:
-            fresh = start_trajectory(entry.key, data, index, config)
-            return jax.tree.map(lambda new, old: jnp.where(entry.slot.is_done, new, old), fresh, entry.slot)
-
-        kept = jax.vmap(lambda entry, data, index: entry.slot, axes, axis_size=size)
-        slots = jax.lax.cond(
-            jnp.any(given[0].slot.is_done),
-            lambda: jax.vmap(choose, axes, axis_size=size)(*given),
-            lambda: kept(*given),
-        )
+        batched = partial(jax.vmap, in_axes=axes, axis_size=size)
+        is_any_done = jnp.any(given[0].slot.is_done)
+        slots = jax.lax.cond(is_any_done, batched(living), batched(lambda entry, *_: entry.slot), *given)
         return slots, jax.tree.map(lambda _: True, slots)
 
-    return living(entry, data, index)
+    switched = jax.custom_batching.custom_vmap(living)
+    switched.def_vmap(living_batch)
+    return switched(entry, data, index)
 
 
 def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> FrameProblem:

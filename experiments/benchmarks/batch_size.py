@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -22,6 +22,7 @@ from eslr_jax.assets.load import Resolution
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, prepare_scenes
@@ -40,17 +41,14 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
     scenes = stack_scenes(
         prepare_scenes(garments, poses, [COTTON] * len(clips), options=SceneOptions(self_contact=False))
     )
-    rows = []
+    calls = {}
     for batch in batches:
         places = jnp.arange(batch, dtype=jnp.int32) % len(clips)
         some = jax.tree.map(lambda leaf, places=places: leaf[places], scenes)
-        jax.block_until_ready(rollout_scenes(None, some, CONFIG, batch_size=batch))
-        seconds = []
-        for _ in range(turns):
-            began = time.perf_counter()
-            jax.block_until_ready(rollout_scenes(None, some, CONFIG, batch_size=batch))
-            seconds.append(time.perf_counter() - began)
-        milliseconds = 1e3 * min(seconds) / frames
+        calls[batch] = (partial(rollout_scenes, None, config=CONFIG, batch_size=batch), (some,))
+    rows = []
+    for batch, times in time_in_turns(calls, turns).items():
+        milliseconds = min(times) / frames
         rows.append({"batch": batch, "frame_ms": milliseconds, "frame_and_scene_ms": milliseconds / batch})
         print(
             f"{vertices}, {batch} scenes: {milliseconds:.2f} ms a frame, {milliseconds / batch:.3f} a scene"
