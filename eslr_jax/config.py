@@ -183,6 +183,7 @@ class TrainConfig:
     log_every: int = 100  # steps between lines of metrics.jsonl
     checkpoint_every: int = 1000  # steps
     seed: int = 0  # of weights, clips and fabrics
+    seeds: int = 1  # trained at once, from `seed` on; a GPU takes hardly longer for some
 
     def __post_init__(self) -> None:
         """Reject impossible values.
@@ -192,6 +193,7 @@ class TrainConfig:
         """
         for name in (
             "steps",
+            "seeds",
             "batch_size",
             "slots_per_garment",
             "horizon",

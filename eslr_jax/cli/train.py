@@ -50,7 +50,7 @@ def train(
     those of several machines: start the same command once on each.
 
     Args:
-        out: Folder of metrics, checkpoints and the exported model.
+        out: Folder of metrics, checkpoints and the exported model; with `--set seeds=3` of folders for each seed.
         config: TOML file of a training configuration; not needed with --resume.
         set_: Changes to the configuration, as key=value.
         resume: Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
@@ -69,6 +69,7 @@ def train(
     from eslr_jax.training.memory import keep_memory
     from eslr_jax.training.plot import plot_curves
     from eslr_jax.training.recipe import load_recipe
+    from eslr_jax.training.seeds import seed_folders
 
     if resume:
         changes = dict(parse_override(text) for text in set_)
@@ -94,12 +95,15 @@ def train(
         state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
     if not is_first_process():
         return
-    plot_curves(out)
+    folders = seed_folders(chosen, out)
+    for folder in folders:
+        plot_curves(folder, chosen)
     done = int(state.step)
     if done < chosen.steps:
         say(f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume")
     else:
-        print(out / "model.npz")
+        for folder in folders:
+            print(folder / "model.npz")
 
 
 def _join_processes(coordinator: str, num_processes: int | None, process_id: int | None) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CapacityError, CheckpointError, NonFiniteError
+from eslr_jax.errors import CapacityError, CheckpointError, ConfigError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.simulation.interrupt import Interruption
 from eslr_jax.training.checkpoint import Checkpoints, has_checkpoint, read_run_config, write_run_config
 from eslr_jax.training.data import TrainingData, load_training_data
+from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -46,36 +48,45 @@ def train(
         resume: Go on from the newest checkpoint of `out`.
         initial_params: Weights to start from instead of random ones.
         datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
-        on_progress: Called with steps done, steps in all, and the latest means.
+        on_progress: Called with steps done, steps in all, and the latest means, of the first seed.
+
+    Returns:
+        The last state; of several seeds stacked, see `training.seeds`.
 
     Raises:
         CheckpointError: `out` holds another run, or none to resume.
+        ConfigError: Several seeds would be spread over devices.
         NonFiniteError: Too many updates had to be skipped; the last good checkpoint is kept.
         CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
+    if config.seeds > 1 and mesh is not None:
+        raise ConfigError(f"seeds = {config.seeds} share one device; take batch_size = 1, or seeds = 1")
     _check_run(config, out, resume)
     datasets = datasets or tuple(load_training_data(config, vertices) for vertices in config.vertices)
-    state = init_train_state(config, datasets)
+    state = _first_state(config, datasets, initial_params)
     datasets, state = tuple(replicate(data, mesh) for data in datasets), replicate(state, mesh)
-    if initial_params is not None:
-        given = replicate(jax.tree.map(jax.numpy.array, initial_params), mesh)
-        state = state.replace(params={**state.params, **given})
     checkpoints = Checkpoints(ensure_output_dir(out))
+    folders = [ensure_output_dir(folder) for folder in seed_folders(config, out)]
     if resume:
         state = checkpoints.restore(state)
-        _forget_after(out / "metrics.jsonl", int(state.step))
+        for folder in folders:
+            _forget_after(folder / "metrics.jsonl", int(state.step))
     if is_first_process():
         write_run_config(out, config)
     if not resume:
         checkpoints.save(state)
         checkpoints.wait()
-    step_functions = [make_train_step(config, resolution, mesh) for resolution in range(len(datasets))]
+    step_functions = [
+        make_seeds_step(config, resolution) if config.seeds > 1 else make_train_step(config, resolution, mesh)
+        for resolution in range(len(datasets))
+    ]
     window: list[dict[str, jax.Array]] = []
     began, first = time.perf_counter(), int(state.step)
-    spent = core_seconds(out) - time.process_time()
-    metrics_file = out / "metrics.jsonl" if is_first_process() else Path(os.devnull)
-    with metrics_file.open("a") as log, Interruption() as stop:
+    spent = core_seconds(folders[0]) - time.process_time()
+    with ExitStack() as stack:
+        logs = [stack.enter_context(_metrics_file(folder).open("a")) for folder in folders]
+        stop = stack.enter_context(Interruption())
         for step in range(first, config.steps):
             resolution = step % len(step_functions)
             state, metrics = step_functions[resolution](state, datasets[resolution])
@@ -85,18 +96,19 @@ def train(
             window.append(metrics)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
-                overflowed = any(float(entry["overflows"]) for entry in window)
-                means = _means(window)
+                overflowed = any(np.any(entry["overflows"]) for entry in window)
+                means = _means(window, len(folders))
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
                 seconds = {
                     "seconds": time.perf_counter() - began,
                     "core_seconds": spent + time.process_time(),
                 }
-                record = {"step": done, **seconds, "its": speed, **means}
-                log.write(json.dumps(record) + "\n")
-                log.flush()
-                on_progress(done, config.steps, record)
+                records = [{"step": done, **seconds, "its": speed, **own} for own in means]
+                for log, record in zip(logs, records, strict=True):
+                    log.write(json.dumps(record) + "\n")
+                    log.flush()
+                on_progress(done, config.steps, records[0])
                 _check_skipped(state, config, checkpoints, out)
                 if overflowed:
                     raise CapacityError(
@@ -111,8 +123,20 @@ def train(
                 break
     checkpoints.close()
     if int(state.step) >= config.steps and is_first_process():
-        export(state, config, out)
+        for place, (one, folder) in enumerate(zip(seed_configs(config), folders, strict=True)):
+            export(take_seed(state, place) if config.seeds > 1 else state, one, folder)
     return state
+
+
+def _first_state(config: TrainConfig, datasets: tuple[TrainingData, ...], initial_params: Any) -> TrainState:
+    """Return the state before the first step, of several seeds stacked."""
+    states = [init_train_state(one, datasets) for one in seed_configs(config)]
+    if initial_params is not None:  # copies, since a step donates its state
+        states = [
+            state.replace(params={**state.params, **jax.tree.map(jax.numpy.array, initial_params)})
+            for state in states
+        ]
+    return stack_seeds(states) if config.seeds > 1 else states[0]
 
 
 def _is_stopping(stop: Interruption, done: int) -> bool:
@@ -161,6 +185,11 @@ def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:
         )
 
 
+def _metrics_file(folder: Path) -> Path:
+    """Return where a process writes metrics."""
+    return folder / "metrics.jsonl" if is_first_process() else Path(os.devnull)
+
+
 def _forget_after(metrics: Path, step: int) -> None:
     """Drop the records of steps that a killed run did after its last checkpoint: they come again."""
     if not is_first_process() or not metrics.exists():
@@ -176,15 +205,18 @@ def is_first_process() -> bool:
     return jax.process_index() == 0
 
 
-def _means(window: list[dict[str, jax.Array]]) -> dict[str, float]:
-    """Return the medians of a window: single resets have energies a hundred times the usual."""
+def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, float]]:
+    """Return every seed's medians of a window: single resets have energies a hundred times the usual."""
     fetched = jax.device_get(window)
-    return {name: float(np.median([float(entry[name]) for entry in fetched])) for name in fetched[0]}
+    medians = {
+        name: np.median([np.reshape(entry[name], seeds) for entry in fetched], axis=0) for name in fetched[0]
+    }
+    return [{name: float(values[place]) for name, values in medians.items()} for place in range(seeds)]
 
 
 def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:
     """Stop a run that produces nothing but NaN."""
-    skipped = int(state.skipped)
+    skipped = int(np.max(state.skipped))
     if skipped > config.max_skipped:
         checkpoints.wait()
         last = checkpoints.latest()

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from eslr_jax.config import TrainConfig
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.training.checkpoint import read_run_config
 
 _LOSS = "loss, in units of lifting the garment by 1 cm"
 _CONTRACTION = "loss, mean share of a pass's gap that it leaves"
 _TERMS = ("stretch", "bending", "inertia", "collision", "friction")
 
 
-def plot_curves(folder: Path) -> Path | None:
+def plot_curves(folder: Path, config: TrainConfig) -> Path | None:
     """Draw the curves of a run's `metrics.jsonl` into `curves.png`; None without matplotlib or metrics."""
     try:
         import matplotlib
@@ -27,7 +27,7 @@ def plot_curves(folder: Path) -> Path | None:
         return None
     steps = [record["step"] for record in records]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    label = _CONTRACTION if read_run_config(folder).refinement_weights == "contraction" else _LOSS
+    label = _CONTRACTION if config.refinement_weights == "contraction" else _LOSS
     losses = [record["loss"] for record in records]
     spans_decades = not 0 < max(losses) < 10 * min(losses)
     left.plot(steps, losses)

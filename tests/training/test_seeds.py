@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
+import signal
 
 import jax
 import numpy as np
-from seeds import make_seeds_step, stack_seeds, take_seed
 
+from eslr_jax.assets.load import load_model
 from eslr_jax.config import TrainConfig
+from eslr_jax.training.loop import train
+from eslr_jax.training.seeds import make_seeds_step, stack_seeds, take_seed
 from eslr_jax.training.step import init_train_state, make_train_step
 
 STEPS = 5
@@ -20,7 +25,7 @@ def test_seeds_together_are_each_alone(small_data, cheap_model):
     configs = [dataclasses.replace(config, seed=seed) for seed in (3, 4)]
     alone = [init_train_state(one, (small_data,)) for one in configs]
     together = stack_seeds([init_train_state(one, (small_data,)) for one in configs])
-    step, seeds_step = make_train_step(config, 0), make_seeds_step(config)
+    step, seeds_step = make_train_step(config, 0), make_seeds_step(config, 0)
     losses = []
     for _ in range(STEPS):
         together, metrics = seeds_step(together, small_data)
@@ -36,3 +41,23 @@ def test_seeds_together_are_each_alone(small_data, cheap_model):
         ):
             np.testing.assert_allclose(one, other, atol=1e-4)
         assert int(take_seed(together, place).step) == STEPS
+
+
+def test_a_run_of_two_seeds_goes_on_and_exports_both(small_data, cheap_model, tmp_path):
+    config = TrainConfig(model=cheap_model, steps=STEPS, seeds=2, seed=3, log_every=1, checkpoint_every=2)
+
+    def interrupt(done, total, metrics):
+        if done == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    train(config, tmp_path, datasets=(small_data,), on_progress=interrupt)
+    assert not list(tmp_path.rglob("model.npz"))
+    state = train(config, tmp_path, datasets=(small_data,), resume=True)
+    for place, folder in enumerate((tmp_path / "seed-3", tmp_path / "seed-4")):
+        records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        assert [record["step"] for record in records] == [1, 2, 3, 4, 5]
+        params, _ = load_model(str(folder / "model.npz"))
+        for exported, trained in zip(
+            jax.tree.leaves(params), jax.tree.leaves(take_seed(state, place).params), strict=True
+        ):
+            np.testing.assert_array_equal(exported, trained)
