@@ -18,9 +18,6 @@ from eslr_jax.types import Garment, Material
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/solver_convergence.py)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms
-# Of a vertex's springs in its diagonal, times their sum: alike along all axes, they are stiffer across the cloth
-# than it is. Fitted to the gap after 10 and 20 iterations, see experiments/tried.md.
-_DOMINANCE = 1.43
 
 
 @struct.dataclass
@@ -129,8 +126,9 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
 def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
 
-    A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. Networks take
-    `stiffness`, which they were trained with.
+    A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal holds the
+    sum of a vertex's springs and no more: with a larger share long waves converge slowly (experiments/tried.md).
+    Networks take `stiffness`, which they were trained with.
 
     Args:
         problem: The frame's problem.
@@ -142,7 +140,7 @@ def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 
     )
     is_spring = matrix.springs > 0
     springs = matrix.springs * jnp.where(is_spring, squared, 0.0) / jnp.where(is_spring, rest, 1.0)
-    added = jnp.sum(_DOMINANCE * springs - matrix.springs, axis=1)
+    added = jnp.sum(springs - matrix.springs, axis=1)
     return matrix.replace(springs=springs, diagonal=matrix.diagonal + added)
 
 
