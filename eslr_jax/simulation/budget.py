@@ -148,14 +148,15 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
     options = []
     for method in methods:
         counts = range(min(int(key) for key in method.p99), ITERATIONS[-1] + 1)
-        kept = next((count for count in counts if interpolate_gap(method.p99, count) <= tolerance), None)
-        if kept is not None:
-            stops_at = _STOPS_AT * tolerance
-            stops = (count for count in counts if interpolate_gap(method.median, count) <= stops_at)
-            count = max(kept, next(stops, counts[-1]))
+        # Where a frame ended in another minimum than the deepest known one, no number of iterations keeps it.
+        kept = (count for count in counts if interpolate_gap(method.p99, count) <= tolerance)
+        stops_at = _STOPS_AT * tolerance
+        stops = (count for count in counts if interpolate_gap(method.median, count) <= stops_at)
+        count = max(next(kept, counts[-1]), next(stops, counts[-1]))
+        if interpolate_gap(method.median, count) <= tolerance:
             options.append((method.fixed_ms + count * method.iteration_ms, method, count))
     if not options:
-        best = min(min(method.p99.values()) for method in methods)
+        best = min(min(method.median.values()) for method in methods)
         raise ConfigError(f"--tolerance {tolerance:.3%}: the best that was measured here is {best:.3%}")
     options.sort(key=lambda option: option[0])
     cost, method, count = options[0]
