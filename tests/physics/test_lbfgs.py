@@ -178,6 +178,15 @@ def test_springs_are_symmetric_and_carried_by_the_diagonal(case32, make):
     assert np.count_nonzero(table) == int(garment.neighbor_mask.sum())
 
 
+def test_springs_of_collapsed_cloth_keep_a_tenth(case32):
+    at_rest, collapsed = (
+        jax.jit(make)(case32.problem, jnp.zeros_like(case32.position))
+        for make in (stiffness, stretched_stiffness)
+    )
+    np.testing.assert_allclose(collapsed.springs, 0.1 * at_rest.springs, rtol=1e-5)
+    assert np.all(collapsed.springs.sum(axis=1) < collapsed.diagonal)
+
+
 # --- cloth --------------------------------------------------------------------------------------------------
 
 
