@@ -36,7 +36,8 @@ def thrown_sheets(obstacles, *, above):
 def test_sheets_thrown_at_a_plane_a_ball_and_a_limb_end_in_front_of_them(obstacles):
     for above in (0.35, 0.52):  # each within one frame of the plane, and of the ball
         scene = thrown_sheets(obstacles, above=above)
-        positions = np.asarray(rollout_scene(None, scene, SimConfig(iterations=60)).positions)
+        # The frame of the impact ends 5.1 mm deep after 60 iterations, 3.2 after 90 and 2.9 after 200 and 500.
+        positions = np.asarray(rollout_scene(None, scene, SimConfig(iterations=100)).positions)
         on_plane, on_ball, on_limb = np.split(positions - np.repeat(PLACES, 81, axis=0), 3, axis=1)
         assert on_plane[..., 1].min() > -2e-3, above
         assert np.linalg.norm(on_ball, axis=-1).min() > BALL - 5e-3, above
