@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import jraph
 import numpy as np
 import optax
 from jaxtyping import Array, Float
@@ -38,9 +39,10 @@ from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.graph.build import incoming_edges
 from eslr_jax.graph.features import mean_edge_length
-from eslr_jax.graph.operators import MeshTables, sum_receivers
+from eslr_jax.graph.operators import mesh_tables, sum_receivers
 from eslr_jax.models.lsdmp import Latents, LayerTables, LsdmpLayer
 from eslr_jax.models.mlp import MLP
+from eslr_jax.models.registry import draw_weights
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_products, vertex_normals
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
@@ -207,7 +209,8 @@ class Network(nn.Module):
         """Return the factors."""
         garment, body = places.problem.garment, places.problem.body
         assert body is not None
-        tables, incoming = mesh_tables(garment)
+        graph = mesh_graph(garment)
+        tables, incoming = mesh_tables(graph, places.start.dtype), graph.globals["incoming_edges"]
         vertices, edges = vertex_features(places), edge_features(places)
         vertices = MLP(vertices.shape[1], WIDTH, WIDTH, 1)(vertices)
         edges = MLP(edges.shape[1], WIDTH, WIDTH, 1)(edges)
@@ -236,18 +239,18 @@ def degrees_of(garment: Garment) -> Float[Array, " vertices"]:
     return jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1), 1).astype(jnp.float32)
 
 
-def mesh_tables(garment: Garment) -> tuple[MeshTables, Array]:
-    """Return what messages along the mesh follow, and the edges that enter every vertex."""
+def mesh_graph(garment: Garment) -> jraph.GraphsTuple:
+    """Return the graph of the mesh, without features."""
     incoming = incoming_edges(garment.neighbor_mask, garment.receivers.shape[0])
-    neighbors = jnp.append(garment.senders, jnp.int32(garment.neighbors.shape[0]))[incoming]
-    tables = MeshTables(
-        senders=garment.senders,
-        receivers=garment.receivers,
-        reverse_edges=garment.reverse_edges,
-        neighbors=neighbors,
-        degree=degrees_of(garment)[:, None],
+    return jraph.GraphsTuple(
+        nodes=None,
+        edges=None,
+        senders={"mesh": garment.senders},
+        receivers={"mesh": garment.receivers},
+        globals={"reverse_edges": garment.reverse_edges, "incoming_edges": incoming},
+        n_node=None,
+        n_edge=None,
     )
-    return tables, incoming
 
 
 def vertex_features(places: Places) -> Float[Array, "vertices features"]:
@@ -379,15 +382,9 @@ def shares_of(values: Float[Array, " energies"], frame: Frame) -> Float[Array, "
     return (values - frame.best) / (frame.initial - frame.best)
 
 
-def init(maker: nn.Module, places: Places, seed: int = 0) -> Any:
-    """Return new parameters; kernels hold their spread until it is multiplied by normal numbers, see `dense`."""
-    generator = np.random.default_rng(seed)
-
-    def draw(path, leaf):
-        is_kernel = path[-1].key.startswith("kernel")
-        return leaf * generator.standard_normal(leaf.shape, np.float32) if is_kernel else leaf
-
-    return jax.tree_util.tree_map_with_path(draw, maker.init(jax.random.key(0), places))
+def init(maker: nn.Module, places: Places) -> Any:
+    """Return new parameters."""
+    return draw_weights(maker.init(jax.random.key(0), places), seed=0)
 
 
 def train(name: str, frames: list[list[Frame]], steps: int) -> Any:

@@ -113,18 +113,28 @@ def init_model(config: ModelConfig, seed: int = 0) -> Params:
         config: Architecture; its own seed is that of the random attention directions.
         seed: Seed of the initial weights.
     """
+    params = jax.jit(lambda: _declare(config))()
+    params["params"] = draw_weights(params["params"], seed)
+    if config.attention_blocks:
+        directions = orthogonal_projection(config.attention_features, config.attention_size, config.seed)
+        params["constants"] = {"projection": jnp.asarray(directions, jnp.float32)}
+    return params
+
+
+def draw_weights(spreads: Params, seed: int) -> Params:
+    """Return weights as modules declare them, with the kernels drawn; see `dense.kernel_spread`.
+
+    Args:
+        spreads: Weights of a module's `init`.
+        seed: Of the normal numbers that kernels are multiplied by.
+    """
     generator = np.random.default_rng(seed)
 
     def draw(path, spread):
         is_kernel = not any(word in path[-1].key for word in ("bias", "scale"))
         return spread * generator.standard_normal(spread.shape, np.float32) if is_kernel else spread
 
-    params = jax.jit(lambda: _declare(config))()
-    params["params"] = jax.tree_util.tree_map_with_path(draw, params["params"])
-    if config.attention_blocks:
-        directions = orthogonal_projection(config.attention_features, config.attention_size, config.seed)
-        params["constants"] = {"projection": jnp.asarray(directions, jnp.float32)}
-    return params
+    return jax.tree_util.tree_map_with_path(draw, spreads)
 
 
 def apply_model(

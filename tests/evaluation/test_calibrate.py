@@ -64,6 +64,7 @@ def test_a_frame_that_ends_in_another_minimum_forbids_no_tolerance():
     )
     assert choice.method == SOLVER
     assert choice.expected_ms == pytest.approx(161.0)
+    assert "in the median frame" in choice.reason
 
 
 def test_costs_grow_with_the_garment_from_the_nearest_size():
