@@ -98,8 +98,9 @@ class ModelConfig:
             )
         if self.hierarchical and not (self.update_body and self.edge_latents):
             raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
-        if self.output in ("descent", "subspace") and self.features != "gradient":
-            raise ValueError(f'output = "{self.output}" needs features = "gradient", which hold the step')
+        features = "hood" if self.output == "acceleration" else "gradient"  # without a guess, or of one
+        if self.features != features:
+            raise ValueError(f'output = "{self.output}" needs features = "{features}"')
 
 
 @runtime_checkable
@@ -156,7 +157,7 @@ class TrainConfig:
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
     # Of the set "hood": which of its three readings, see physics.hood. "metric" has the constants of its tables.
     criterion: Criterion = "postcvpr"
-    self_contact: bool = False  # layers of cloth keep apart, as in SimConfig
+    self_contact: bool = False  # layers of cloth keep apart, as in SceneOptions
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate; "hood" also of the horizon
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine
@@ -244,6 +245,8 @@ def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> 
         resolved[key] = _convert(cls, fields[key], value, f"{where}{key}")
     try:
         return cls(**resolved)
+    except TypeError as error:
+        raise ConfigError(f"{where}an option is missing: {error}") from error
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

@@ -46,6 +46,7 @@ class Status(enum.IntFlag):
 
     OK = 0
     NON_FINITE = 1
+    TIP_OVERFLOW = 2
     SELF_CONTACT_OVERFLOW = 4
     BODY_TOO_FAST = 8
 
@@ -54,9 +55,11 @@ class Status(enum.IntFlag):
         texts = {
             Status.NON_FINITE: "positions or forces became NaN or infinite; use the solver, more iterations, "
             "or a smaller timestep",
+            Status.TIP_OVERFLOW: "more cloth bunches around fine points of the body than a buffer holds; "
+            "smooth the body there, or take a coarser garment",
             Status.SELF_CONTACT_OVERFLOW: "more self-contact than its buffers hold; "
             "prepare the scene with a larger PairCapacity",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
-            "resample the motion to a smaller timestep",
+            "slow the motion down, or pose it with more frames a second",
         }
         return "; ".join(text for bit, text in texts.items() if bit in self)

@@ -372,36 +372,3 @@ def _arctan2_jvp(primals, tangents):
     squared = x * x + y * y
     inverse = jnp.where(squared == 0, 0.0, 1.0 / jnp.where(squared == 0, 1.0, squared))
     return arctan2(y, x), (x * y_dot - y * x_dot) * inverse
-
-
-@jax.custom_vjp
-def gather_rows(
-    x: Float[Array, "rows features"],
-    indices: Int[Array, "items corners"],
-    incidence: Int[Array, "rows degree"],
-) -> Float[Array, "items corners features"]:
-    """Return `x[indices]`, with a backward pass that gathers instead of scattering.
-
-    XLA's scatter-add on a CPU adds one element at a time; summing each row's incoming cotangents through a
-    fixed-degree incidence table is vectorised, and deterministic on a GPU.
-
-    Args:
-        x: Rows to gather.
-        indices: Row of every corner of every item (a face, a hinge, an edge).
-        incidence: For each row the flat positions in `indices` that name it, padded with
-            `indices.size` (one past the end).
-    """
-    return x[indices]
-
-
-def _gather_rows_forward(x, indices, incidence):
-    return x[indices], incidence
-
-
-def _gather_rows_backward(incidence, cotangent):
-    flat = cotangent.reshape((-1, cotangent.shape[-1]))
-    flat = jnp.concatenate([flat, jnp.zeros_like(flat[:1])])
-    return sum(flat[incidence[:, k]] for k in range(incidence.shape[1])), None, None
-
-
-gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)

@@ -206,7 +206,7 @@ class Contacts:
     next_points: Float[Array, "vertices 3"]  # the same material points at t + 1 [m]
     normals: Float[Array, "vertices 3"]  # outward unit normals at t
     next_normals: Float[Array, "vertices 3"]  # at t + 1
-    distances: Float[Array, " vertices"]  # signed distance of the vertex at t, positive outside [m]
+    distances: Float[Array, " vertices"]  # signed, of the vertex at t or on its path, positive outside [m]
     is_near: Bool[Array, " vertices"]  # close enough for the tangent plane to stand for the body
     faces: Int[Array, " vertices"]  # of the body surface, that hold the points; zero on the ground
 

@@ -78,6 +78,8 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ("model = [", "not valid TOML"),
         ('model = "eslr-small"\nstebs = 3', "did you mean steps"),
         ('model = "eslr-small"\nhorizon = 0', "horizon must be at least 1"),
+        ('[model]\nbase = "mgn-5"\noutput = "correction"', 'needs features = "gradient"'),
+        ('[model]\nbase = "mgn-5"\nfeatures = "gradient"', 'needs features = "hood"'),
     ],
 )
 def test_broken_recipes_are_refused(tmp_path, text, message):

@@ -29,9 +29,14 @@ _CODE = (
     "body/alignment.py",
     "body/joints.py",
     "body/lbs.py",
+    "body/motion.py",
+    "body/retarget.py",
+    "body/rig.py",
     "io/mesh.py",
     "io/gltf_document.py",
     "io/garment.py",
+    "io/skeleton.py",
+    "numerics.py",
     "types.py",
 )
 

@@ -24,7 +24,14 @@ def load_actor(options: Options) -> tuple[Any, Any, str]:
 
     body = options.body
     if Path(body).exists() and is_mesh_sequence(body):
-        given = {"--motion": options.motion, "--start": options.start, "--loop": options.loop}
+        given = {
+            "--motion": options.motion,
+            "--start": options.start,
+            "--loop": options.loop,
+            "--joint-map": options.joint_map,
+            "--arm-abduction": options.arm_abduction,
+            "--betas": options.betas or None,
+        }
         for option, value in given.items():
             if value is not None:
                 raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out {option}")

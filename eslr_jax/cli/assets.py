@@ -175,14 +175,17 @@ def _show_scene(
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
     from eslr_jax.assets.load import default_model
     from eslr_jax.body.motion import pose_body
+    from eslr_jax.cli.simulate import BEHIND_NETWORK, ITERATIONS
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
     from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
-    config = SimConfig(model=architecture)
-    options = SceneOptions(self_contact=self_contact or None, has_folds=simulator != "network")
+    config = SimConfig(model=architecture, iterations=ITERATIONS if architecture is None else BEHIND_NETWORK)
+    options = SceneOptions(  # those of `eslr simulate`
+        self_contact=self_contact or None, has_folds=True, has_skin=True, integrator="bdf2"
+    )
     with waiting("measuring"):
         rig = load_body()
         poses = pose_body(rig, load_motion(motion))

@@ -106,12 +106,14 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
     from eslr_jax.assets.load import START_MODEL, default_model
     from eslr_jax.evaluation.calibrate import calibrate as run
     from eslr_jax.evaluation.report import environment
+    from eslr_jax.io.atomic import ensure_output_dir
     from eslr_jax.simulation.budget import cache_path, write_calibration
 
     use_compile_cache()
+    path = out or cache_path()
+    ensure_output_dir(path.parent)  # before minutes are spent
     with waiting("measuring"):
         measured = run(models or (START_MODEL, default_model()))
-    path = out or cache_path()
     write_calibration(measured, path, environment())
     table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "gap after 20", box=None)
     for method in measured.methods:

@@ -49,10 +49,12 @@ def fit(
     from eslr_jax.assets import load_body, load_garment_file, prepare_stored
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.report import describe_cost, describe_fit, describe_transfer
-    from eslr_jax.io.garment import write_garment_npz
+    from eslr_jax.io.garment import is_garment_file, write_garment_npz
 
     if out.suffix != ".npz":
         raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
+    if Path(garment).is_file() and is_garment_file(garment):
+        raise AssetError(f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh")
     use_compile_cache()
 
     def describe_source(source) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from eslr_jax.errors import ConfigError
+from eslr_jax.errors import AssetError, ConfigError
 
 if TYPE_CHECKING:
     from eslr_jax.simulation.budget import Choice
@@ -105,7 +105,18 @@ def read_interrupted(
     from eslr_jax.types import PairCapacity
 
     done, record = read_unfinished(out)
-    values, usual = record["options"], inspect.signature(simulate).parameters
+    try:
+        values, choice, capacity = record["options"], record["choice"], record["capacity"]
+        typed = {name: tuple(values[name]) for name in ("garment", "fabric", "betas")}
+        typed["joint_map"] = None if values["joint_map"] is None else Path(values["joint_map"])
+        options = Options(**values | typed)
+        choice = None if choice is None else Choice(**choice)
+        capacity = None if capacity is None else PairCapacity(**capacity)
+    except (KeyError, TypeError) as error:
+        raise AssetError(
+            f"{out} was simulated by another version; start without --resume in another folder"
+        ) from error
+    usual = inspect.signature(simulate).parameters
     for name, value in vars(given).items():
         if value != usual[name].default and _plain(value) != values.get(name):
             own = values.get(name)
@@ -113,16 +124,7 @@ def read_interrupted(
                 f"{out} was simulated with {name.replace('_', '-')} = {_text(own)}, not {_text(_plain(value))}; "
                 "leave out all options but --out to go on, or start in another folder without --resume"
             )
-    values = values | {name: tuple(values[name]) for name in ("garment", "fabric", "betas")}
-    if values["joint_map"] is not None:
-        values["joint_map"] = Path(values["joint_map"])
-    choice, capacity = record["choice"], record["capacity"]
-    return (
-        done,
-        Options(**values),
-        None if choice is None else Choice(**choice),
-        None if capacity is None else PairCapacity(**capacity),
-    )
+    return done, options, choice, capacity
 
 
 def check_same_scene(done: Trajectory, scene: Scene, out: Path) -> None:

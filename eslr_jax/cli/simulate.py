@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from eslr_jax.simulation.simulate import Simulation
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
-_ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
-_BEHIND_NETWORK = 10  # likewise behind a network
+ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
+BEHIND_NETWORK = 10  # likewise behind a network
 _LONG = 5.0  # [s] of waiting for the compiler, from which on it is told
 _KEPT = 1.2  # times a budget, from which on it counts as missed
 
@@ -190,7 +190,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.fabric import beyond_training, garment_material
     from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
-    from eslr_jax.io.run import ClothTrack, write_run
+    from eslr_jax.io.run import ClothTrack, scene_record, write_run
     from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
     from eslr_jax.simulation.simulate import (
@@ -287,15 +287,11 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             "garment": label,
             "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
             "motion": motion,
-            "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
-            "integrator": integrator,
-            "substeps": scene.substeps,
+            **scene_record(scene),
             "settle": settle,
-            "skin_contacts": modelled.has_skin,
             "wind_m_s": options.wind,
             "gust": options.gust,
             "damping_s": options.damping,
-            "ground_m": None if scene.ground is None else float(scene.ground),
             "interrupted_at": last if is_unfinished else None,
             "error": error,
             **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
@@ -303,6 +299,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     with waiting("writing files"):
         track = ClothTrack(trajectory.positions, trajectory.velocities, trajectory.friction_loads)
         write_run(out, track, scene, (rig, poses, stored), report=report)
+        (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
     if has_pictures and not is_unfinished:
@@ -340,7 +337,7 @@ def _choose_method(
     if simulator == "network":
         model = model or default_model()
         params, architecture = load_model(model)
-    usual = _ITERATIONS if architecture is None else _BEHIND_NETWORK
+    usual = ITERATIONS if architecture is None else BEHIND_NETWORK
     config = SimConfig(
         model=architecture,
         iterations=usual if iterations is None else iterations,

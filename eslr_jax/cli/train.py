@@ -91,7 +91,7 @@ def train(
     if start_from is not None:
         initial, _ = load_model(start_from)
         check_params(chosen.model, initial)
-    with _training_progress(chosen.steps, out if tensorboard else None) as show:
+    with _training_progress(chosen.steps, out if tensorboard and is_first_process() else None) as show:
         state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
     if not is_first_process():
         return
@@ -131,10 +131,9 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
     Raises:
         MissingExtraError: TensorBoard's event files are asked for and its writer is not installed.
     """
-    events = None
+    writer = None
     if tensorboard is not None:
         writer = require("tensorboardX", extra="tensorboard", purpose="--tensorboard").SummaryWriter
-        events = writer(str(tensorboard / "events"))
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -143,18 +142,21 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=stderr) as progress:
+    with contextlib.ExitStack() as stack:
+        progress = stack.enter_context(Progress(*columns, console=stderr))
         task = progress.add_task("training", total=total, text="compiling")
+        events = None
 
         def show(done: int, total: int, metrics: dict[str, float]) -> None:
             terms = ("stretch", "bending", "inertia", "collision", "friction")
             shares = "\n".join(f"{name} {metrics[name] * 1e3:.1f} mJ" for name in terms)
             text = f"{metrics['its']:.1f} it/s\nloss {metrics['loss']:.4f}\n{shares}"
             progress.update(task, completed=done, total=total, text=text)
+            nonlocal events
+            if writer is not None and events is None:  # a run that is refused leaves no file
+                events = stack.enter_context(contextlib.closing(writer(str(tensorboard / "events"))))
             if events is not None:
                 for name, value in metrics.items():
                     events.add_scalar(name, value, done)
 
         yield show
-    if events is not None:
-        events.close()

@@ -77,7 +77,7 @@ class TipPairs:
     weights: Float[Array, "pairs 3"]
     side: Float[Array, " pairs"]  # as of `FacePairs`
     areas: Float[Array, " pairs"]  # [m^2]
-    status: Int[Array, ""]
+    status: Int[Array, ""]  # Status.TIP_OVERFLOW if there was too little room
 
 
 def default_capacity(num_vertices: int) -> PairCapacity:
@@ -157,7 +157,8 @@ def find_tip_contacts(
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
     faces = _find_pairs(points, cloth, TIP_RADIUS, capacity)
     next_points = next_body[faces.vertices]
-    return TipPairs(next_points, faces.corners, -faces.weights, faces.side, faces.areas, faces.status)
+    status = jnp.where(faces.count > capacity.pairs, int(Status.TIP_OVERFLOW), int(Status.OK))
+    return TipPairs(next_points, faces.corners, -faces.weights, faces.side, faces.areas, status)
 
 
 def _ends(

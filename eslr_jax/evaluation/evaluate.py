@@ -13,14 +13,14 @@ from scipy.spatial import cKDTree
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
 from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax.errors import ConfigError, Status
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene.plan import prepare_scene, shared_surface
-from eslr_jax.simulation.simulate import simulate
+from eslr_jax.simulation.simulate import hold_last, simulate
 from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
@@ -77,8 +77,10 @@ def evaluate(
         the measures of free rollouts; per garment and clip under `scenes`.
 
     Raises:
-        ConfigError: There is no such split, or it is empty.
+        ConfigError: There is no such split, or it is empty; or iterations are negative.
     """
+    if iterations < 0:
+        raise ConfigError(f"iterations = {iterations}; give 0 or more")
     garments = options.garments or tuple(load_splits()["garments"]["train"])
     clips = options.clips or split_clips(options.split)
     config = SimConfig(model=model, iterations=iterations)
@@ -132,9 +134,14 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
     options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
     for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS)), (params, config)):
-        trajectory = simulate(weights, scene, config=steps, raises=False).trajectory
+        trajectory = _roll(weights, scene, steps)
         measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
     return measured[0], measured[1]
+
+
+def _roll(params: Any, scene: Scene, config: SimConfig) -> Trajectory:
+    """Simulate all frames of a scene; one that goes wrong stands still from there on, and its status tells."""
+    return hold_last(simulate(params, scene, config=config, raises=False).trajectory, scene.num_frames)
 
 
 def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
@@ -149,10 +156,10 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
 
 def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any]:
     """Return the measures of one free rollout, beside those of the solver's on the same scene."""
-    trajectory = simulate(params, scene, config=config, raises=False).trajectory
+    trajectory = _roll(params, scene, config)
     measured = measure_rollout(trajectory, scene)
     near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
-    reference = simulate(None, scene, config=near_optimum, raises=False).trajectory
+    reference = _roll(None, scene, near_optimum)
     return {
         **measured,
         "distance_mm": distance_mm(trajectory, reference, scene),
@@ -178,7 +185,8 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     body = np.asarray(scene.body.positions)
     jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
     return {
-        "finite": bool(np.isfinite(positions).all()),
+        "finite": bool(np.isfinite(positions).all())
+        and Status.NON_FINITE not in Status(int(trajectory.status)),
         "num_frames": int(scene.num_frames),
         "terms": terms,
         "total": sum(terms.values()),
@@ -191,7 +199,7 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
 
 def _drift(params: Any, scene: Scene, config: SimConfig) -> float:
     """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s]."""
-    trajectory = simulate(params, scene, config=config, raises=False).trajectory
+    trajectory = _roll(params, scene, config)
     areas = np.asarray(scene.garment.vertex_areas)
     centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
     frames = round(1.0 / float(scene.timestep))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ from eslr_jax.types import (
 _TERMS = tuple(term for term in PotentialTerms._fields if term not in ("air", "damping", "own"))
 FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
-_CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
+_CONTACT_FIELDS = ("collision-energy", "friction-energy", "repulsion-energy", "gap")
 _ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
 _QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
 
@@ -150,18 +150,24 @@ def energy_shares(
             plate = material.plate.replace(rows=material.plate.rows * jnp.sqrt(on_faces))
             scaled = scaled.replace(material=scaled.material.replace(plate=plate))
         if problem.body is not None:
-            load = problem.body.friction_load * factors
-            scaled = scaled.replace(body=problem.body.replace(friction_load=load))
+            body = problem.body.replace(friction_load=problem.body.friction_load * factors)
+            rows = {name: _weigh(getattr(body, name), factors) for name in ("skin", "tips")}
+            scaled = scaled.replace(body=body.replace(**rows))
         if problem.ground is not None:
             load = problem.ground.friction_load * factors
             scaled = scaled.replace(ground=problem.ground.replace(friction_load=load))
         if problem.layers is not None:
-            pairs = problem.layers.pairs
-            pairs = pairs.replace(areas=pairs.areas * factors[pairs.corners].mean(axis=1))
-            scaled = scaled.replace(layers=problem.layers.replace(pairs=pairs))
+            scaled = scaled.replace(
+                layers=problem.layers.replace(pairs=_weigh(problem.layers.pairs, factors))
+            )
         return getattr(potential_terms(position, scaled), term)
 
     return jax.grad(total)(jnp.ones_like(garment.vertex_areas))
+
+
+def _weigh(rows: Any, factors: Float[Array, " vertices"]) -> Any:
+    """Return contacts of faces with their areas scaled by the mean factor of their corners; None stays None."""
+    return None if rows is None else rows.replace(areas=rows.areas * factors[rows.corners].mean(axis=1))
 
 
 def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:

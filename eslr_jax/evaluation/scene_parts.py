@@ -69,6 +69,8 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     sort("damping", scene.damping is not None, f"{float(scene.damping or 0.0):g} s", "not asked for")
     if scene.energies:
         modelled["own terms"] = f"{len(scene.energies)}"
+    has_skin = scene.body is not None and scene.body.has_skin
+    sort("skin contacts", has_skin, "the body keeps under the cloth's faces", "not asked for")
     sort(
         "self-contact",
         scene.self_contact is not None,

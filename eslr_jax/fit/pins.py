@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.topology import boundary_loops
 
-_COMPARISON = re.compile(r"\s*([xyz])\s*([<>])\s*(-?[\d.]+(?:e-?\d+)?)\s*")
+_COMPARISON = re.compile(r"\s*([xyz])\s*([<>])\s*(-?(?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)\s*")
 _SIDES = {
     "top": (1, 1),
     "bottom": (1, -1),

@@ -65,6 +65,8 @@ def export_trajectory(
         raise AssetError("this run has no body; export the garment")
     check_meshes(meshes, run.timestep)
     if chosen in ("usd", "usda", "usdc"):
+        if path.suffix.lower() != f".{chosen}":
+            raise AssetError(f"{path}: USD goes by the name of its file; name it .{chosen}")
         write_usd(path, meshes, run.timestep)
     elif chosen == "glb":
         write_animated_glb(path, meshes, run.timestep)
@@ -164,6 +166,7 @@ def write_sequence(folder: str | Path, mesh: AnimatedMesh, kind: Literal["obj", 
         raise AssetError(f"{target} exists already; name a new folder for the sequence")
     ensure_output_dir(target.parent)
     parts = target.with_name(f".{target.name}.part")
+    shutil.rmtree(parts, ignore_errors=True)  # of an export that was killed
     make: Callable[[np.ndarray], bytes] = _obj_writer(mesh) if kind == "obj" else _ply_writer(mesh)
     try:
         ensure_output_dir(parts)

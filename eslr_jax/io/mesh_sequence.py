@@ -89,7 +89,9 @@ def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[M
     if Path(file).suffix.lower() in GLTF_SUFFIXES:
         return _read_gltf(Path(file), mesh, fps)
     path = Path(path)
-    return [_read_folder(path, fps or DEFAULT_FPS) if path.is_dir() else _read_archive(path, fps)]
+    return [
+        _read_folder(path, DEFAULT_FPS if fps is None else fps) if path.is_dir() else _read_archive(path, fps)
+    ]
 
 
 def _read_archive(path: Path, fps: float | None) -> MeshSequence:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.atomic import atomic_write
+from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.io.npz import read_arrays
@@ -60,7 +60,7 @@ def write_run(
         AssetError: A file can't be written.
     """
     rig, poses, stored = actor
-    folder.mkdir(parents=True, exist_ok=True)
+    ensure_output_dir(folder)
     with atomic_write(folder / "report.json") as temporary:
         temporary.write_text(json.dumps(report, indent=2))
     write_garment_npz(folder / "garment.npz", stored)
@@ -68,6 +68,7 @@ def write_run(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
         faces=np.asarray(scene.garment.faces),
+        metadata={name: report[name] for name in ("garment", "motion") if name in report},
         timestep=float(poses.timestep),
         body=_body_track(scene, rig, poses),
         friction_loads=np.asarray(track.friction_loads),
@@ -76,6 +77,17 @@ def write_run(
     )
     write_trajectory(folder / "trajectory.npz", file)
     export_trajectory(file, folder / "animation.glb", garment=stored)
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """Return what a report says of its scene, and `evaluation.run_scene` makes the scene of again."""
+    return {
+        "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
+        "integrator": "euler" if scene.initial_state.past is None else "bdf2",
+        "substeps": scene.substeps,
+        "skin_contacts": scene.body is not None and scene.body.has_skin,
+        "ground_m": None if scene.ground is None else float(scene.ground),
+    }
 
 
 def _stored_number(leaf: Any) -> np.ndarray:
@@ -150,6 +162,8 @@ def read_run(path: str | Path) -> Run:
     if (folder / "report.json").is_file():
         try:
             report = json.loads((folder / "report.json").read_text())
+            if not isinstance(report, dict):
+                raise ValueError("no table")
         except (OSError, ValueError) as error:
             raise AssetError(f"{folder / 'report.json'} is damaged; simulate it again") from error
     return Run(folder.resolve().name if path.is_dir() else path.stem, trajectory, garment, report)

@@ -67,7 +67,9 @@ def read_unfinished(folder: Path) -> tuple[Trajectory, dict[str, Any]]:
     check_layout(arrays, _LAYOUT, what=str(path), remedy=_REMEDY)
     try:
         options = json.loads(str(arrays["options"]))
-    except json.JSONDecodeError as error:
+        if not isinstance(options, dict):
+            raise ValueError("no table")
+    except ValueError as error:
         raise AssetError(f"{path} is damaged: its options can't be read; {_REMEDY}") from error
     trajectory = Trajectory(
         **{name: arrays[name] for name in _FIELDS},

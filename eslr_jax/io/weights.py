@@ -48,9 +48,6 @@ def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[st
     """Read a network that `write_weights` wrote.
 
     Args:
-        path: Path of the npz file.
-
-    Args:
         path: The npz file; the JSON file lies beside it.
 
     Returns:

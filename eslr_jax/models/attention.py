@@ -43,12 +43,13 @@ def softmax_features(
     queries: Float[Array, "rows size"],
     keys: Float[Array, "rows size"],
     projection: Float[Array, "features size"],
+    mask: Bool[Array, " rows"] | None = None,
 ) -> tuple[Float[Array, "rows features"], Float[Array, "rows features"]]:
     """Return positive features whose products estimate exp(q . k / sqrt(size)), up to a factor per query.
 
     phi(x) = exp(w . x - |x|^2 / 2). A factor per query, or one common to all keys, cancels between numerator and
     denominator. So -|q|^2 / 2 is dropped, and exponents are shifted by the largest of each query's row and by the
-    largest of all keys. A shift per key would change the weights.
+    largest of all keys that may be attended to. A shift per key would change the weights.
 
     Source: Choromanski et al. (2021), lemma 1, with the stabiliser corrected.
     """
@@ -56,6 +57,8 @@ def softmax_features(
     queries, keys = queries * scale, keys * scale
     query_exponents = queries @ projection.T
     key_exponents = keys @ projection.T - jnp.sum(keys * keys, axis=1, keepdims=True) / 2
+    if mask is not None:  # as `linear_attention`'s; before the largest is taken
+        key_exponents = jnp.where(mask[:, None], key_exponents, -jnp.inf)
     query_top = jax.lax.stop_gradient(jnp.max(query_exponents, axis=1, keepdims=True))
     key_top = jax.lax.stop_gradient(jnp.max(key_exponents))
     return (

@@ -55,9 +55,11 @@ class GsaBlock(nn.Module):
         queries = project("query", located, QUERY_GAIN, size)
         keys = project("key", located, QUERY_GAIN, size)
         values = project("value", here, 1.0, size)
-        is_softmax = config.attention_kernel == "softmax"
-        make_features = attention.softmax_features if is_softmax else attention.relu_features
-        features = make_features(queries, keys, projection.astype(x.dtype))
+        directions = projection.astype(x.dtype)
+        if config.attention_kernel == "softmax":
+            features = attention.softmax_features(queries, keys, directions, mask)
+        else:
+            features = attention.relu_features(queries, keys, directions)
         mixed = project("output", attention.linear_attention(*features, values, mask), 0.5, width)
         bias = self.param("output_bias", nn.initializers.zeros, (width,))
         x = x + add_bias(mixed, bias.astype(x.dtype))

@@ -151,16 +151,13 @@ def apply_model(
     return make_network(config).apply(_variables(params), graph, _places(garment), params["statistics"])
 
 
-def encode_frame(
-    config: ModelConfig, params: Params, graph: jraph.GraphsTuple, garment: Garment
-) -> AnyEncoded:
+def encode_frame(config: ModelConfig, params: Params, graph: jraph.GraphsTuple) -> AnyEncoded:
     """Return what all refinement steps of a frame share.
 
     Args:
         config: Architecture with features "gradient"; static.
         params: Weights.
         graph: Graph of `build_frame_graph`.
-        garment: The graph's garment.
     """
     return make_network(config).apply(_variables(params), graph, method="encode_frame")
 

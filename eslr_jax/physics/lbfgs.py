@@ -140,11 +140,12 @@ def minimize(
         direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
         slope = product(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
-        # Where no step along the direction leads down, the history is dropped and tried without.
+        # Where no step along the direction leads down, the history is dropped and tried without. A direction
+        # that rounding has turned uphill tells nothing of the gap.
         kept = state._replace(is_kept=state.is_kept & is_lower)
         moved = _advance(kept, Point(x, value, gradient), inverse)
         return moved._replace(
-            decrement=jnp.where(is_first, jnp.inf, -0.5 * slope),
+            decrement=jnp.where(is_first | (slope >= 0), jnp.inf, -0.5 * slope),
             iterations=state.iterations + 1,
             is_stuck=~is_lower & ~jnp.any(state.is_kept),
         )

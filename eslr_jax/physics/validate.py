@@ -139,8 +139,10 @@ def _check_range(label: str, value: Any, accepted: Range) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{label} = {value!r} is not a number; give {_describe(accepted)}") from error
     # In float32 a bound itself may lie a rounding error outside.
-    slack = 1.0 + np.finfo(np.float32).eps
-    is_good = np.isfinite(values) & (values * slack >= accepted.low) & (values <= accepted.high * slack)
+    is_finite = np.isfinite(values)
+    known = np.where(is_finite, values, 0.0)
+    slack = np.finfo(np.float32).eps * np.abs(known)
+    is_good = is_finite & (known + slack >= accepted.low) & (known - slack <= accepted.high)
     if not is_good.all():
         index = tuple(int(k) for k in np.argwhere(~is_good)[0])
         place = f"[{', '.join(map(str, index))}]" if index else ""

@@ -120,11 +120,6 @@ def skin_garment(
     return lbs.skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
 
 
-def skin_frame(garment: Garment, transforms: Float[Array, "joints 3 4"]) -> Float[Array, "vertices 3"]:
-    """Return the garment carried by the joints of one frame [m], shape [vertices, 3]."""
-    return lbs.skin(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
-
-
 def start_integrator(state: ClothState, integrator: Integrator) -> ClothState:
     """Return a state without a past, from which an integrator can begin."""
     if integrator == "euler":

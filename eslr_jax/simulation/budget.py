@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -117,7 +118,7 @@ def methods_at(calibration: Calibration, num_vertices: int) -> list[Method]:
 
 def _affordable(budget_ms: float, fixed_ms: float, iteration_ms: float) -> int:
     """Return the iterations that a frame has time for, no more than were measured; negative where none fits."""
-    return min(int((budget_ms - fixed_ms) / iteration_ms), ITERATIONS[-1])
+    return min(math.floor((budget_ms - fixed_ms) / iteration_ms), ITERATIONS[-1])
 
 
 def _within_budget(methods: list[Method], budget_ms: float) -> Choice:

@@ -114,7 +114,7 @@ def refine(
     inputs = inputs.replace(
         guess=guess.position, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
     )
-    encoded = encode_frame(config, params, graph, garment)
+    encoded = encode_frame(config, params, graph)
     longest: Array = graph.globals["edge_length"]  # type: ignore[index, assignment]: jraph's trees
 
     def one_step(carry: GraphInputs, _):

@@ -122,6 +122,8 @@ def _in_chunks(
     iterations = config.iterations
     start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))
     begin = 0 if before is None else before.num_frames - 1
+    if before is not None and begin >= total:  # nothing is left
+        return before, Timing(0.0, 0.0)
     state, done, seconds, compile_s = start, [], 0.0, 0.0
     for first in range(begin, total, chunk):
         bound = None if loop.pace is None else jnp.int32(iterations)  # all numbers share a program
@@ -256,6 +258,16 @@ def good_frames(trajectory: Trajectory) -> Trajectory:
     count = trajectory.num_frames if bad < 0 else min(bad, trajectory.num_frames)
     kept = _slice_frames(trajectory, slice(count))
     return kept.replace(status=jnp.int32(Status.OK), first_bad_frame=jnp.int32(-1))
+
+
+def hold_last(trajectory: Trajectory, num_frames: int) -> Trajectory:
+    """Return the good frames of a rollout that ended early, followed by its last one, with its status."""
+    good = good_frames(trajectory)
+    rest = num_frames - good.num_frames
+    if rest <= 0:
+        return trajectory
+    longer = _map_frames(lambda leaf: np.concatenate([leaf, np.repeat(leaf[-1:], rest, axis=0)]), good)
+    return longer.replace(status=trajectory.status, first_bad_frame=trajectory.first_bad_frame)
 
 
 def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[Trajectory, Scene]:

@@ -148,6 +148,8 @@ def next_state(
         status: Bits that the frame has raised so far.
         residual: Force norm over weight that the frame ended with.
     """
+    # A network moves padding too; with its speed carried on it would come to look like thrown cloth.
+    position = jnp.where(problem.garment.vertex_mask[:, None], position, problem.position)
     # A gradient that is not finite stops the solver where it began, at positions that are.
     status = state.status | status | problem_status(problem)
     status = status | _finiteness(position) | _finiteness(jnp.asarray(residual))

@@ -123,6 +123,8 @@ def read_run_config(folder: Path) -> TrainConfig:
     try:
         record = json.loads(path.read_text())
         version, values = record["format"], record["train"]
+        if not isinstance(version, int) or not isinstance(values, dict):
+            raise TypeError("another layout")
     except FileNotFoundError as error:
         raise CheckpointError(f"{folder} holds no training run; start one without --resume") from error
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:

@@ -21,7 +21,7 @@ from eslr_jax.numerics import product, vertex_normals
 from eslr_jax.scene.plan import shared_surface
 from eslr_jax.types import Body, BodySurface, Garment
 
-_FPS = 30.0
+FPS = 30.0  # frames per second of training
 _SMOOTHING_STEPS = 10  # of what a garment takes over from the body, as for its skin weights
 
 
@@ -194,7 +194,7 @@ def _join_clips(motions: list[Motion]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """Resample clips and put them end to end."""
     rotations, translations, frames_left = [], [], []
     for motion in motions:
-        turned, moved = resample(motion.rotations, motion.translations, motion.fps, _FPS)
+        turned, moved = resample(motion.rotations, motion.translations, motion.fps, FPS)
         if motion.arm_abduction:
             turned = abduct_arms(turned, motion.joint_names, motion.arm_abduction)
         rotations.append(turned)

@@ -8,8 +8,6 @@ from pathlib import Path
 from eslr_jax.config import TrainConfig
 from eslr_jax.io.atomic import atomic_write
 
-_LOSS = "loss, in units of lifting the garment by 1 cm"
-_CONTRACTION = "loss, mean share of a pass's gap that it leaves"
 _TERMS = ("stretch", "bending", "inertia", "collision", "friction")
 
 
@@ -27,11 +25,10 @@ def plot_curves(folder: Path, config: TrainConfig) -> Path | None:
         return None
     steps = [record["step"] for record in records]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    label = _CONTRACTION if config.refinement_weights == "contraction" else _LOSS
     losses = [record["loss"] for record in records]
     spans_decades = not 0 < max(losses) < 10 * min(losses)
     left.plot(steps, losses)
-    left.set(xlabel="step", ylabel=label, yscale="symlog" if spans_decades else "linear")
+    left.set(xlabel="step", ylabel=f"loss, {_unit(config)}", yscale="symlog" if spans_decades else "linear")
     for term in _TERMS:
         right.plot(steps, [max(record[term], 1e-7) for record in records], label=term)
     right.set(xlabel="step", ylabel="energy at the prediction, median [J]", yscale="log")
@@ -40,3 +37,12 @@ def plot_curves(folder: Path, config: TrainConfig) -> Path | None:
         figure.savefig(temporary, format="png", dpi=100)
     plt.close(figure)
     return folder / "curves.png"
+
+
+def _unit(config: TrainConfig) -> str:
+    """Return what a run's loss is measured in, see `training.loss`."""
+    if config.iterations:
+        return "mean logarithm of the shares of gap and squared distance that are left"
+    if config.refinement_weights == "contraction":
+        return "mean share of a pass's gap that it leaves"
+    return "J" if config.energy_set == "hood" else "in units of lifting the garment by 1 cm"

@@ -12,11 +12,10 @@ from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
-from eslr_jax.training.data import TrainingData
+from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.types import ClothState, Material
 
 _DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD)
-FPS = 30.0  # frames per second of training
 
 
 @struct.dataclass

@@ -34,9 +34,9 @@ from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.network import graph_inputs
 from eslr_jax.simulation.stepper import next_state
-from eslr_jax.training.data import TrainingData
+from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
-from eslr_jax.training.pool import FPS, Slot, empty_pool, start_trajectory
+from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
 from eslr_jax.types import Normalizer, PhysicsConstants, Scene, SceneBody
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
@@ -353,7 +353,8 @@ def _advance(
     """Move the trajectory on with the network's prediction; mark it done where it ends or has gone astray."""
     state = next_state(report.onward, problem, slot.state, jnp.int32(0))
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
-    moved = jnp.max(jnp.abs(report.onward - slot.state.position))
+    is_real = problem.garment.vertex_mask[:, None]
+    moved = jnp.max(jnp.where(is_real, jnp.abs(report.onward - slot.state.position), 0.0))
     is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
     age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
     is_done = is_astray | (age >= horizon.frames)

@@ -22,7 +22,7 @@ from eslr_jax.extras import require
 from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.palette import byte_color
-from eslr_jax.io.run import ClothTrack, write_run
+from eslr_jax.io.run import ClothTrack, scene_record, write_run
 from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
@@ -394,11 +394,15 @@ def _save(live: Live, cast: Cast) -> None:
     report = {
         "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,
-        "integrator": "bdf2",
-        "skin_contacts": True,
+        **scene_record(scene),
         "wind_m_s": read_wind(live.controls),
     }
-    write_run(live.out, track, scene, (cast.rig, poses, cast.stored), report=report)
+    try:
+        write_run(live.out, track, scene, (cast.rig, poses, cast.stored), report=report)
+    except EslrError as error:  # the cloth goes on
+        for client in live.server.get_clients().values():
+            client.add_notification("The recording was not written", str(error))
+        return
     data = (live.out / "animation.glb").read_bytes()
     for client in live.server.get_clients().values():
         client.send_file_download("animation.glb", data, save_immediately=True)

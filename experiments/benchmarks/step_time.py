@@ -187,7 +187,7 @@ def measure_refinement_steps(size: str, turns: int) -> dict:
 
         def frame(params, garment, material, inputs, config=config):
             graph = build_frame_graph(garment, material, inputs, config)
-            return graph, encode_frame(config, params, graph, garment)
+            return graph, encode_frame(config, params, graph)
 
         def one_step(params, graph, encoded, garment, material, inputs, config=config):
             changing = build_refinement_graph(garment, material, inputs, graph)

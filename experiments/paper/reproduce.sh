@@ -38,7 +38,7 @@ if [[ $size == tshirt ]]; then
   one_garment posed snug --steps 500
   one_garment posed snug-m --steps 500
   one_garment ssch ssch --steps 1200 250
-  one_garment mat mat --steps 1000
+  one_garment mat mat --steps 1400
   rows+=("mat, untrained=mat@$out/tshirt~untrained" optimum=optimum)
   python experiments/paper/tables.py --tables native_garments --garments tshirt --models "${rows[@]}" \
     --out "$out/tables_tshirt" ${STEPS:+--smoke}

@@ -1,13 +1,15 @@
 """Garments of a user through the front door: fitted once, kept by content, safe with two processes."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from garment_files import bundled, scanned_tshirt
 
-from eslr_jax.assets import load, load_garment, load_garment_file
+from eslr_jax.assets import cache, load, load_garment, load_garment_file
 from eslr_jax.assets.cache import cache_folder, cached_arrays, content_key
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.io.garment import write_garment_npz
@@ -111,3 +113,17 @@ def test_4k_garment_is_quick(empty_cache, tmp_path, body):
         times.append(time.process_time() - began)
     assert times[0] < 5.0
     assert times[1] < 1.0
+
+
+def test_all_that_computes_an_entry_is_part_of_its_name():
+    """Whatever geometry and fit import makes their results; errors and options make none."""
+    package = Path(cache.__file__).parents[1]
+    listed = {file for name in cache._CODE for file in (package / name).glob("*.py")} | {
+        package / name for name in cache._CODE if name.endswith(".py")
+    }
+    makes_nothing = {package / name for name in ("errors.py", "extras.py")}
+    for file in sorted(listed):
+        for module in re.findall(r"^from eslr_jax\.(\S+) import", file.read_text(), flags=re.M):
+            source = package / (module.replace(".", "/") + ".py")
+            if source.exists() and file.parent.name in ("fit", "geometry"):
+                assert source in listed | makes_nothing, f"{file.name} imports {module}"

@@ -29,6 +29,8 @@ def test_a_budget_buys_the_least_gap():
     assert (choice.method, choice.iterations) == (SOLVER, 21)
     assert choice.expected_ms <= 22.0
     assert "net" in choice.reason
+    choice = choose(Calibration("here", (PLAIN, SLOW)), 1000, budget_ms=20.5)  # the network alone takes 21 ms
+    assert "net" not in choice.reason
     choice = choose(Calibration("there", (PLAIN, FAST)), 1000, budget_ms=12.0)
     assert (choice.method, choice.iterations) == ("net", 10)
     assert choice.expected_gap == pytest.approx(0.01)

@@ -11,6 +11,7 @@ from example_runs import write_run
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import AssetError
+from eslr_jax.evaluation import fields
 from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.geometry.prepare import prepare_garment
@@ -40,10 +41,10 @@ def test_stretch_of_uniform_stretch(runs):
     np.testing.assert_allclose(field.values[2], field.values[0], atol=1e-4)
 
 
-@pytest.fixture(scope="module")
-def problem():
+@pytest.fixture(scope="module", params=[False, True], ids=["vertices", "skin"])
+def problem(request):
     """The last frame of a square that falls over a ball."""
-    scene = prepare_scene(square(), drifting_ball(4))
+    scene = prepare_scene(square(), drifting_ball(4), options=SceneOptions(has_skin=request.param))
     states, inputs = trajectory_states(rollout_scene(None, scene, SimConfig(iterations=15)), scene)
     state, inputs = jax.tree.map(lambda leaf: leaf[-1], (states, inputs))
     return frame_problem(scene, state, inputs)
@@ -101,6 +102,21 @@ def test_a_run_without_a_body_has_no_field_of_it(runs, name):
     with pytest.raises(AssetError, match=f"has no body, and so no {name}") as caught:
         run_field(run, name)
     assert "\n" not in str(caught.value)
+
+
+def test_fields_of_contact_are_of_scenes_with_contact(runs, monkeypatch):
+    seen = []
+
+    def run_scene(*words, has_contact):
+        seen.append(has_contact)
+        raise AssetError("seen")
+
+    monkeypatch.setattr(fields, "run_scene", run_scene)
+    run = dataclasses.replace(runs[0], report={"self_contact": "all"})
+    for name in ("repulsion-energy", "collision-energy", "gap", "bending-energy"):
+        with pytest.raises(AssetError, match="seen"):
+            run_field(run, name)
+    assert seen == [True, True, True, False]
 
 
 def test_a_run_without_self_contact_has_no_repulsion(runs):

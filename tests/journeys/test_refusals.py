@@ -234,6 +234,15 @@ OTHERS = {
     "evaluation of an unknown network": (("evaluate", "--model", "eslr-huge"), "eslr-huge"),
     "evaluation on an unknown split": (("evaluate", "--model", "eslr-small", "--split", "tset"), "tset"),
     "evaluation of an unknown clip": (("evaluate", "--model", "eslr-small", "--clips", "x"), "x"),
+    "evaluation with minus one iteration": (
+        ("evaluate", "--model", "eslr-small", "--iterations", "-1"), "iterations",
+    ),
+    "a calibration into a file": (("calibrate", "--out", "key.toml/a.json"), "key.toml"),
+    "a run whose configuration is a list": (("train", "--resume", "--out", "list"), "config.json"),
+    "training with events of an unknown garment": (
+        ("train", "--config", "good.toml", "--set", 'garments=["tshrit"]', "--tensorboard", "--out", "t"),
+        "tshrit",
+    ),
     "info of an unknown network": (("info", "--model", "eslr-huge"), "eslr-huge"),
     "info of a missing scene": (("info", "--scene", "missing.obj"), "missing.obj"),
     "a body exported to stl": (("assets", "--export", "body.stl"), "obj"),
@@ -244,6 +253,10 @@ OTHERS = {
     "a fit with an edge of nothing": (("fit", "skirt.obj", "--out", "a.npz", "--edge-length", "0"), "edge"),
     "a fit with a weld of nan": (("fit", "skirt.obj", "--out", "a.npz", "--weld", "nan"), "weld"),
     "a fit with a pin of no vertex": (("fit", "skirt.obj", "--out", "a.npz", "--pin", "vertices:99999"), "99999"),
+    "a pin at no number": (("fit", "skirt.obj", "--out", "a.npz", "--pin", "region:y>1.2.3"), "y>1.2.3"),
+    "a text format in a binary file": (
+        ("export", "run", "--format", "usda", "--out", "a.usdc"), ".usda",
+    ),
     "a size of a garment of no other body": (
         ("fit", "skirt.obj", "--out", "a.npz", "--scale", "girth", "--no-picture"), "--made-for",
     ),
@@ -338,6 +351,7 @@ def test_bad_commands(tmp_path, body, refused, kind):
         "words.toml": "these are words", "key.toml": good.replace("steps", "stepz"), "good.toml": good,
         "type.toml": good.replace("2", '"two"'), "list.json": "[1, 2]", "wing.json": json.dumps({"Wing": "Hips"}),
         "good.bvh": BVH, "noise.npz": "noise",
+        "list/config.json": b'{"format": 1, "train": []}',
         "damaged/trajectory.npz": "noise", "damaged/unfinished.npz": "noise",
     }  # fmt: skip
     write(tmp_path, {name: content.encode() for name, content in named.items()})

@@ -25,7 +25,7 @@ def draw(scale, seed=0):
 def attend(q, k, v, num_features, seed=0, mask=None):
     projection = orthogonal_projection(num_features, SIZE, seed)
     q, k, v, projection = (jnp.asarray(array, jnp.float32) for array in (q, k, v, projection))
-    return np.asarray(linear_attention(*softmax_features(q, k, projection), v, mask))
+    return np.asarray(linear_attention(*softmax_features(q, k, projection, mask), v, mask))
 
 
 def error(num_features):
@@ -71,6 +71,8 @@ def test_masked_rows_change_nothing():
     spoiled = np.where(np.arange(ROWS)[:, None] < 150, v, 1e6)
     first, second = (attend(q, k, rows, 64, mask=mask)[:150] for rows in (v, spoiled))
     np.testing.assert_allclose(first, second, atol=1e-6)
+    loud = np.where(np.arange(ROWS)[:, None] < 150, k, 20 * k)  # their exponents are the largest of all
+    np.testing.assert_allclose(attend(q, loud, v, 64, mask=mask)[:150], first, atol=1e-6)
 
 
 def test_directions_are_orthogonal_seeded_and_as_long_as_gaussian_vectors():

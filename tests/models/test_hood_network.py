@@ -62,7 +62,7 @@ def test_network_with_gradient_features_matches_numpy():
         graph = build_graph(garment, material, inputs, CORRECTING)
         frame = build_frame_graph(garment, material, inputs, CORRECTING)
         changing = build_refinement_graph(garment, material, inputs, frame)
-        encoded = registry.encode_frame(CORRECTING, params, frame, garment)
+        encoded = registry.encode_frame(CORRECTING, params, frame)
         return (
             graph,
             apply_model(CORRECTING, params, graph, garment),

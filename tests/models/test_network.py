@@ -133,7 +133,7 @@ def test_refinement_of_an_encoded_frame_equals_the_whole_graph(name, scene):
     @quick_jit
     def refine(params, garment, material, inputs):
         graph = build_frame_graph(garment, material, inputs, config)
-        encoded = registry.encode_frame(config, params, graph, garment)
+        encoded = registry.encode_frame(config, params, graph)
         changing = build_refinement_graph(garment, material, inputs, graph)
         return registry.apply_refinement(config, params, encoded, changing, garment)
 

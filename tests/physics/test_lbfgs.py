@@ -12,6 +12,7 @@ from cloth import make_garment, make_sheet
 from physics_cases import make_case, pad_case
 
 from eslr_jax.config import SimConfig
+from eslr_jax.physics import lbfgs
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
@@ -125,6 +126,24 @@ def test_the_step_from_a_previous_point_is_the_first_pair():
     assert float(alone.value) > 1e-3 * float(function(near)), "the test must be able to fail"
     same = descend(function, near, jnp.ones(2), 1, previous=near)
     np.testing.assert_array_equal(same.position, alone.position)
+
+
+def test_a_direction_that_leads_up_ends_nothing_before_it_was_tried_without_history(monkeypatch):
+    """Rounding can turn it; the decrement of such a direction would be negative, and its bound NaN."""
+    function, center = make_function()
+    down, told = lbfgs._direction, []
+
+    def turned(state):
+        told.append(state)
+        return jnp.where((state.iterations == 3) & jnp.any(state.is_kept), -1.0, 1.0) * down(state)
+
+    monkeypatch.setattr(lbfgs, "_direction", turned)
+    start = jnp.asarray(center, jnp.float32) + 1.0
+    found = descend(lambda x: function(x), start, jnp.ones(4), 60, tolerance=1e-3, reference=function(start))
+    assert told
+    assert int(found.iterations) > 6
+    assert np.isfinite(found.gap_bound)
+    assert float(found.value) < 1e-4 * float(function(start))
 
 
 def test_the_lower_of_two_points_is_the_finite_one():

@@ -11,11 +11,12 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import (
     CONSTANT_RANGES,
     MATERIAL_RANGES,
+    validate_air,
     validate_constants,
     validate_material,
     validate_timestep,
 )
-from eslr_jax.types import Material, PhysicsConstants
+from eslr_jax.types import Air, Material, PhysicsConstants
 
 
 def test_defaults_and_the_ends_of_the_training_ranges_are_accepted():
@@ -37,6 +38,10 @@ def test_defaults_and_the_ends_of_the_training_ranges_are_accepted():
 def test_the_bounds_themselves_are_accepted_in_float32():
     for pick in (0, 1):
         validate_material(Material(**{k: np.float32(v[pick]) for k, v in MATERIAL_RANGES.items()}))
+    for bound in (-100.0, 100.0):
+        np.testing.assert_array_equal(validate_air(Air(wind=(bound, 0.0, 0.0))).wind, [bound, 0.0, 0.0])
+    with pytest.raises(ConfigError, match=r"-100\.1"):
+        validate_air(Air(wind=(-100.1, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize("field", list(MATERIAL_RANGES))
