@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -131,9 +132,10 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
     Raises:
         MissingExtraError: TensorBoard's event files are asked for and its writer is not installed.
     """
-    writer = None
+    open_events = None
     if tensorboard is not None:
-        writer = require("tensorboardX", extra="tensorboard", purpose="--tensorboard").SummaryWriter
+        board = require("tensorboardX", extra="tensorboard", purpose="--tensorboard")
+        open_events = partial(board.SummaryWriter, str(tensorboard / "events"))
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -153,8 +155,8 @@ def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
             text = f"{metrics['its']:.1f} it/s\nloss {metrics['loss']:.4f}\n{shares}"
             progress.update(task, completed=done, total=total, text=text)
             nonlocal events
-            if writer is not None and events is None:  # a run that is refused leaves no file
-                events = stack.enter_context(contextlib.closing(writer(str(tensorboard / "events"))))
+            if open_events is not None and events is None:  # a run that is refused leaves no file
+                events = stack.enter_context(contextlib.closing(open_events()))
             if events is not None:
                 for name, value in metrics.items():
                     events.add_scalar(name, value, done)
