@@ -12,7 +12,7 @@ def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene,
     parts = describe_scene(small_scene, small_poses, small_config)
     assert set(parts.modelled) == {"stretch", "bending", "inertia and gravity", "collision and friction"}
     assert set(parts.left_out) == {
-        "pins", "ground", "air", "damping", "self-contact", "fabric by part", "network",
+        "pins", "ground", "air", "damping", "skin contacts", "self-contact", "fabric by part", "network",
     }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
     options = SceneOptions(has_body=False, self_contact=True, air=Air((3.0, 0.0, 4.0)), damping=0.01)
