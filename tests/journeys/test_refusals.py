@@ -351,7 +351,7 @@ def test_bad_commands(tmp_path, body, refused, kind):
         "words.toml": "these are words", "key.toml": good.replace("steps", "stepz"), "good.toml": good,
         "type.toml": good.replace("2", '"two"'), "list.json": "[1, 2]", "wing.json": json.dumps({"Wing": "Hips"}),
         "good.bvh": BVH, "noise.npz": "noise",
-        "list/config.json": b'{"format": 1, "train": []}',
+        "list/config.json": '{"format": 1, "train": []}',
         "damaged/trajectory.npz": "noise", "damaged/unfinished.npz": "noise",
     }  # fmt: skip
     write(tmp_path, {name: content.encode() for name, content in named.items()})
