@@ -54,7 +54,10 @@ def fit(
     if out.suffix != ".npz":
         raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
     if Path(garment).is_file() and is_garment_file(garment):
-        raise AssetError(f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh")
+        raise AssetError(
+            f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh that it was "
+            "fitted from"
+        )
     use_compile_cache()
 
     def describe_source(source) -> None:
@@ -71,8 +74,8 @@ def fit(
         report = stored.metadata.get("fit") or stored.metadata.get("transfer")
         if report is None:
             raise AssetError(
-                f"{garment} needs no fit: it is made for this body or already fitted; give it to eslr simulate, "
-                "or give eslr fit a mesh"
+                f"{garment} needs no fit: it is made for this body; give it to eslr simulate, or give eslr fit "
+                "a mesh"
             )
         stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
         garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
@@ -96,12 +99,10 @@ def _carry(garment: str, bodies: tuple[Body, Body], options: FitOptions, on_sour
     """
     from eslr_jax.assets import asset_names
     from eslr_jax.fit.fit import fit_garment
-    from eslr_jax.io.garment import is_garment_file, read_garment_source
+    from eslr_jax.io.garment import read_garment_source
 
     if garment in asset_names("garment") or f"{garment}_1k" in asset_names("garment"):
         raise AssetError(f"garment {garment} is made for the bundled body; leave out --made-for")
-    if Path(garment).is_file() and is_garment_file(garment):
-        raise AssetError(f"{garment} is fitted already; give the mesh that it was fitted from")
     source = read_garment_source(garment)
     on_source(source)
     return fit_garment(source, bodies[0], options, made_for=bodies[1])

@@ -157,7 +157,7 @@ def find_tip_contacts(
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
     faces = _find_pairs(points, cloth, TIP_RADIUS, capacity)
     next_points = next_body[faces.vertices]
-    status = jnp.where(faces.count > capacity.pairs, int(Status.TIP_OVERFLOW), int(Status.OK))
+    status = jnp.where(faces.status == int(Status.OK), int(Status.OK), int(Status.TIP_OVERFLOW))
     return TipPairs(next_points, faces.corners, -faces.weights, faces.side, faces.areas, status)
 
 

@@ -353,8 +353,7 @@ def _advance(
     """Move the trajectory on with the network's prediction; mark it done where it ends or has gone astray."""
     state = next_state(report.onward, problem, slot.state, jnp.int32(0))
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
-    is_real = problem.garment.vertex_mask[:, None]
-    moved = jnp.max(jnp.where(is_real, jnp.abs(report.onward - slot.state.position), 0.0))
+    moved = jnp.max(jnp.abs(state.position - slot.state.position))
     is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
     age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
     is_done = is_astray | (age >= horizon.frames)
