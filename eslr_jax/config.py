@@ -86,7 +86,7 @@ class ModelConfig:
             )
         if self.refinement_steps > 1 and self.output == "acceleration":
             raise ValueError(
-                'refinement_steps > 1 needs output "correction", "descent" or "subspace": accelerations have one'
+                'refinement_steps > 1 needs output "correction", "descent" or "subspace", not "acceleration"'
             )
         if not self.edge_latents and self.features != "gradient":
             raise ValueError(
@@ -163,8 +163,9 @@ class TrainConfig:
     final_learning_rate: float = 1e-5  # end of the cosine
     warmup: int = 100  # steps of linear warm-up
     clip_norm: float = 1.0  # of the global gradient (HOOD)
-    # Train a start for the solver: with so many L-BFGS iterations behind the network a frame's optimum is found,
-    # from which gap and distance are measured, and the trajectory goes on. 0 trains a network of its own.
+    # Above 0: train a network that gives the solver its start. This many L-BFGS iterations after the network
+    # find the optimum of a frame. The loss measures gap and distance to it, and the trajectory goes on from it.
+    # 0: train a network that works without the solver.
     iterations: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment; more where a batch needs them
@@ -178,7 +179,7 @@ class TrainConfig:
     reset_displacement: float = 0.3  # [m] in one frame, likewise
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
-    # Energies of which passes count: all, the last one's, or each by the share of its gap that it leaves.
+    # Refinement steps in the loss: all alike, only the last, or each by the share of the gap that it leaves.
     refinement_weights: Literal["equal", "last", "contraction"] = "equal"
     max_skipped: int = 100  # non-finite updates skipped before training stops
     log_every: int = 100  # steps between lines of metrics.jsonl

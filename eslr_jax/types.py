@@ -106,8 +106,8 @@ class Threads:
 class Material:
     """Fabric of a garment; scalars, or one value per face (stretch), hinge (bending) or vertex (density).
 
-    A part that is None is not modelled: the energies are then those of an isotropic sheet with HOOD's bending.
-    Networks read the numbers of that sheet; beside a part these are its nearest.
+    Without `plate` and `threads`, the cloth is an isotropic sheet with HOOD's bending. Networks always read the
+    numbers of such a sheet. With `plate` or `threads`, these numbers describe the nearest isotropic sheet.
     """
 
     density: Float[Array, ...]  # [kg/m^2]
@@ -282,7 +282,7 @@ class PotentialTerms(NamedTuple):
 
 @struct.dataclass
 class Trajectory:
-    """A simulated garment; frame 0 is the scene's initial state, for which what a frame reports is zero."""
+    """A simulated garment. Frame 0 is the initial state; its energies, residual and iterations are zero."""
 
     positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]

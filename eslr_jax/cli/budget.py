@@ -49,7 +49,7 @@ def parse_share(text: str | None) -> float | None:
     except ValueError:
         value = 0.0
     if not 0 < value < 1:
-        raise ConfigError(f"--tolerance {text}: write a share of what a frame gains, such as 1% or 0.01")
+        raise ConfigError(f"--tolerance {text}: write a share of the initial gap, such as 1% or 0.01")
     return value
 
 

@@ -35,9 +35,9 @@ def evaluate(
         garments: Only these; the training garments if not given.
         clips: Only these; all of the split if not given.
         iterations: Solver iterations behind the network.
-        gap_frames: Frames of each clip from which the gap is measured; 0 leaves the gap out, which is most of the
-            time.
-        every: Of those, measure one in so many.
+        gap_frames: Number of frames of each clip in which the gap is measured. 0 skips the gap, which takes most
+            of the time.
+        every: Measure only every n-th of these frames.
         rollout_frames: Length of the free rollouts; clips are played back and forth.
         control: Take something away, to see what it does: weights that were never trained, a decoder of zeros,
             geodesic coordinates that are zero, or random ones.

@@ -41,8 +41,8 @@ def score(
 ) -> None:
     """Score anybody's simulation: optimality gap, energies, stretch, penetration, intersections.
 
-    Say what was simulated by a run of `eslr simulate`, or by garment, body and motion. The gap counts in our
-    energy; it is of the frame that each of the trajectory's own states leads to.
+    Describe the scene by a run of `eslr simulate`, or by garment, body and motion. The gap is measured in our
+    energy. Each frame is compared with the optimum that follows from the trajectory's own previous state.
 
     Args:
         file: The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in
@@ -56,7 +56,7 @@ def score(
         body: Body as for `eslr simulate`; anny if not given.
         vertices: Resolution of a bundled garment; 1k if not given.
         fabric: Fabric as for `eslr simulate`; cotton if not given.
-        every: Measure gap and intersections in one of so many frames.
+        every: Measure gap and intersections in every n-th frame.
         json_: Print as JSON.
     """
     from eslr_jax.evaluation.report import environment
@@ -191,7 +191,7 @@ def _figures(result: dict[str, Any]) -> dict[str, str]:
     """Return what a score has besides a run's report, as text."""
     rows = {
         "optimality gap": (
-            f"{100 * result['gap_relative_median']:.3g} % of what a frame has to gain, "
+            f"{100 * result['gap_relative_median']:.3g} % of the initial gap, "
             f"{100 * result['gap_relative_max']:.3g} % at most; {1e3 * result['gap_median_j']:.3g} mJ "
             f"(median of {result['gap_frames']} frames)"
         ),

@@ -100,8 +100,8 @@ def simulate(
             network alone.
         budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it,
             and keep to it while it runs.
-        tolerance: Optimality gap relative to what a frame gains, such as 1%: choose the fastest
-            simulator that keeps it, and let it stop each frame there. See `eslr calibrate`.
+        tolerance: Share of the initial gap that a frame may leave, such as 1%: choose the fastest simulator
+            that keeps it, and stop each frame there. See `eslr calibrate`.
         joint_map: JSON file of changes to the map of joints that `eslr joints` shows.
         motion_up: Axis that points up in a BVH motion.
         arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
@@ -113,8 +113,9 @@ def simulate(
         loop: How long to repeat the motion: frames or a time, such as 30s.
         settle: Frames before frame 0 in which the garment is put on: limbs come from the body's rest pose, and
             the last 10 hold the first pose. They are not kept. By default 35, and 0 for a network alone.
-        integrator: How time is stepped: bdf2 keeps swinging cloth in motion; euler, the paper's, loses two thirds
-            of its energy in a second. By default bdf2, and euler for a network alone, which was trained with it.
+        integrator: How time is stepped. bdf2 keeps swinging cloth in motion. With euler, the paper's integrator,
+            swinging cloth loses two thirds of its energy in a second. The default is bdf2, or euler for a
+            network alone, which was trained with it.
         substeps: Shorter steps in which every frame is simulated; 2 keeps layers apart that swing fast against
             each other. Iterations count for each of them.
         self_contact: Keep all layers of cloth apart, also within each garment of an outfit. By default layers of
@@ -259,7 +260,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
     whole, timing, scene = _run(method, scene, done, poses.positions.shape[0])
     if timing.compile_s > _LONG:
-        say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not")
+        say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
     count = kept.num_frames - settle
     try:

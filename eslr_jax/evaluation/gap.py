@@ -39,7 +39,7 @@ class OptimalityGap(NamedTuple):
 
     @property
     def initial_gap(self) -> Float[Array, " frames"]:
-        """What a frame has to gain [J]; a floor keeps shares of it finite."""
+        """The gap at the pushed-out inertial guess [J]; a floor keeps shares of it finite."""
         return jnp.maximum(self.guess - self.optimum, _LEAST_INITIAL_GAP)
 
     def share(self, energy: Float[Array, " frames"]) -> Float[Array, " frames"]:

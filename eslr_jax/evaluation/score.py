@@ -47,7 +47,7 @@ def score_trajectory(
         trajectory: Vertex positions [m], shape [frames, vertices, 3], in the order of the scene's garment; or a
             trajectory, whose velocities and friction loads then count.
         scene: What was simulated, of `prepare_scene`; it has as many frames.
-        poses: The whole body, see `trajectory_report`; also how the garment sits is then measured.
+        poses: The whole body, see `trajectory_report`. If given, `wear_report` measures how the garment sits.
         parts: Parts of the garment, see `trajectory_report`.
         outfit: Garments that are worn together, see `trajectory_report`.
         every: Frames between those whose gap and intersections are measured.
@@ -55,10 +55,10 @@ def score_trajectory(
     Returns:
         Plain values: those of `trajectory_report` without `iterations_mean`, with `poses` those of `wear_report`,
         and
-        - `pooled_stretch_p99`: the principal stretch that 99 % of the faces of all frames keep;
+        - `pooled_stretch_p99`: the principal stretch that 99 % of the faces of all frames stay below;
         - `gap_relative_median`, `gap_relative_max`: the optimality gap in our energy, from the trajectory's own
-          states, relative to what a frame has to gain; `gap_median_j`, `gap_mean_j` and `gap_p90_j` in joules;
-          `gap_frames`, the number of frames that it was measured in;
+          states, relative to the initial gap; `gap_median_j`, `gap_mean_j` and `gap_p90_j` in joules;
+          `gap_frames`, the number of frames in which the gap was measured;
         - `intersections_cloth`, `intersections_body`: pairs of triangles that intersect in the last frame, and,
           ending in `_max`, in the worst of the frames measured. None without the extra `score`. `garments` has
           those of the last frame that a garment takes part in.

@@ -67,10 +67,11 @@ def plan_scene(
 ) -> ScenePlan:
     """Decide what a scene models: only body faces that the garment can reach, and pins only if it has some.
 
-    Self-contact is modelled between two pieces that come close to each other; within one piece it has to be asked
-    for, by `self_contact` or, where it can meet itself, by `has_folds`. Networks are trained without it.
-    Its buffer starts small, since `simulate` enlarges it. A pure `rollout` needs `default_capacity` in its place,
-    or a look at the trajectory's status.
+    A piece is a connected component of the mesh. Self-contact is modelled between pieces that come close to each
+    other. Within one piece it is modelled only on request: always with `self_contact=True`, and with
+    `has_folds=True` if the piece can touch itself. Networks are trained without self-contact. The buffer of pairs
+    starts small, because `simulate` enlarges it. A pure `rollout` can't: replace `plan.self_contact` by
+    `default_capacity`, or check the status of the trajectory.
 
     Args:
         garment: A prepared garment.

@@ -66,8 +66,8 @@ def simulate_batch(
     materials = [material] * len(garments) if isinstance(material, Material) else list(material)
     if not len(garments) == len(poses) == len(materials):
         raise ConfigError(
-            f"{len(garments)} garments, {len(poses)} motions and {len(materials)} fabrics; give one motion, and "
-            "one fabric or as many, for the garments"
+            f"{len(garments)} garments, {len(poses)} motions and {len(materials)} fabrics; give one motion for "
+            "each garment, and one fabric for all or one for each"
         )
     devices = list(devices or [])
     mesh = Mesh(np.array(devices), (SCENES,)) if len(devices) > 1 else None
