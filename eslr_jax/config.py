@@ -38,9 +38,9 @@ class ModelConfig:
     embedding_size: int = 8  # open: k of the geodesic embedding
     embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
     features: Literal["hood", "gradient"] = "hood"  # HOOD's, or scaled ones with the potential's gradient
-    # "acceleration" changes the state's velocity; "correction" moves the inertial guess. "descent" adds the
-    # preconditioned gradient step and the last correction, each with a gate per vertex. "subspace" takes the
-    # combination of these three that minimises the potential.
+    # "acceleration" changes the state's velocity; "correction" moves the solver's initial guess. "descent" adds
+    # to that the preconditioned gradient step and the last correction, each with a gate per vertex. "subspace"
+    # takes the combination of these three that minimises the potential.
     output: Literal["acceleration", "correction", "descent", "subspace"] = "acceleration"
     output_scale: float = 1.0  # metres per unit of output, for corrections
     refinement_steps: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
@@ -94,7 +94,7 @@ class ModelConfig:
             )
         if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % 5):
             raise ValueError(
-                "hierarchical = true needs smoothing_steps = 0 and message_passing_steps in fives"
+                "hierarchical = true needs smoothing_steps = 0, and message_passing_steps a multiple of 5"
             )
         if self.hierarchical and not (self.update_body and self.edge_latents):
             raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
@@ -149,13 +149,14 @@ class SimConfig:
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
-    model: ModelConfig  # architecture: a table, or `base`, a name that `eslr info` knows, with changes
+    model: ModelConfig  # architecture: a name that `eslr info` knows, or a table with one as `base`
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
-    # Of the set "hood": which of its three readings, see physics.hood. "metric" has the constants of its tables.
+    # With energy_set "hood": which of the three variants of HOOD's losses, see physics.hood. "metric" has the
+    # constants of HOOD's tables.
     criterion: Criterion = "postcvpr"
     self_contact: bool = False  # layers of cloth keep apart, as in SceneOptions
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate; "hood" also of the horizon
@@ -170,13 +171,13 @@ class TrainConfig:
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment; more where a batch needs them
     horizon: int = 60  # longest trajectory [frames]
-    horizon_growth: int = 60  # steps per frame of horizon; trajectories with the schedule "hood"
+    horizon_growth: int = 60  # steps until the horizon grows by a frame; with schedule "hood", trajectories
     still_probability: float = 0.0  # share of trajectories on a body that stands still
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
-    shape_range: float = 0.0  # [standard deviations] of its shape coefficients, drawn evenly (HOOD: 3)
-    reset_stretch: float = 2.5  # a trajectory that stretches further starts anew
-    reset_displacement: float = 0.3  # [m] in one frame, likewise
+    shape_range: float = 0.0  # [standard deviations], bound of a body's uniform shape coefficients (HOOD: 3)
+    reset_stretch: float = 2.5  # a trajectory starts anew if its principal stretch exceeds this
+    reset_displacement: float = 0.3  # [m] along an axis in one frame, beyond which a trajectory starts anew
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
     # Refinement steps in the loss: all alike, only the last, or each by the share of the gap that it leaves.

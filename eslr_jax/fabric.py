@@ -37,6 +37,15 @@ class Described(NamedTuple):
     weave: Weave | None  # None: the sheet is all
 
 
+def worn_fabrics(texts: Sequence[str], stored: GarmentFile) -> tuple[str, ...]:
+    """Return the descriptions that hold for a garment; see `garment_material`.
+
+    Those for parts change what the file has, and one for the whole garment replaces it.
+    """
+    own = tuple(str(text) for text in stored.metadata.get("fabrics", ()))
+    return (*own, *texts) if all(":" in text for text in texts) else tuple(texts)
+
+
 def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile) -> Material:
     """Return the material that descriptions give to a garment.
 
@@ -50,7 +59,8 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
         texts: Descriptions, each for the whole garment or, as `PART:DESCRIPTION`, for one part. A description is
             a fabric's name, or numbers such as `density=0.2,lame_mu=23600`: `density` [kg/m^2], `lame_mu` and
             `lame_lambda` [Pa], `bending_stiffness` [J], `thickness` [m]; cotton's value where one is missing.
-            Without descriptions, those in the file, or else cotton.
+            In an outfit the name of a garment stands for all its parts. If none is for the whole garment, the
+            rest keeps those in the file, or else is cotton.
         garment: Prepared garment.
         stored: Garment file with the parts.
 
@@ -60,17 +70,16 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
     Raises:
         ConfigError: A fabric or a part is unknown, or a number is impossible.
     """
-    texts = tuple(texts) or tuple(str(text) for text in stored.metadata.get("fabrics", ()))
     whole, parts = Described(COTTON, None), {}
-    for text in texts:
+    for text in worn_fabrics(texts, stored):
         part, separator, rest = text.rpartition(":")
         if not separator:
             whole = describe_fabric(text)
-        elif stored.face_parts is None or part not in stored.part_names:
+        elif stored.face_parts is None or not (owned := _parts_of(part, stored)):
             known = ", ".join(stored.part_names) or "none"
             raise ConfigError(f"fabric {text!r}: the garment has no part {part!r}; parts: {known}")
         else:
-            parts[stored.part_names.index(part)] = describe_fabric(rest)
+            parts |= dict.fromkeys(owned, describe_fabric(rest))
     if not parts or stored.face_parts is None:
         sheet = whole.sheet
     else:
@@ -84,6 +93,16 @@ def garment_material(texts: Sequence[str], garment: Garment, stored: GarmentFile
     warp = warp_directions(garment, stored.corner_uvs)
     fabrics = [(np.ones_like(owners, bool), whole), *((owners == part, one) for part, one in parts.items())]
     return on_threads(sheet, garment, warp, fabrics)
+
+
+def _parts_of(name: str, stored: GarmentFile) -> list[int]:
+    """Return the numbers of the parts with a name: one, or all of a garment in an outfit."""
+    inner = f"{name}/" if name in stored.outfit else None
+    return [
+        number
+        for number, part in enumerate(stored.part_names)
+        if part == name or (inner is not None and part.startswith(inner))
+    ]
 
 
 def on_threads(

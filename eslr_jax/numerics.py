@@ -21,9 +21,13 @@ def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> F
         axis: Axis of the components.
         keepdims: Keep `axis` with length one.
     """
-    squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
-    is_zero = squared == 0
-    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
+    return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))
+
+
+def safe_sqrt(x: Float[Array, ...]) -> Float[Array, ...]:
+    """Return the square root, and zero with a zero gradient where `x` is not positive."""
+    is_positive = ~(x <= 0)  # NaN stays NaN
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 def safe_normalize(x: Float[Array, ...], axis: int = -1) -> Float[Array, ...]:
@@ -181,9 +185,9 @@ def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:
 def in_memory(*arrays: Float[ArrayLike, " rows"]) -> tuple[Array, ...]:
     """Return the arrays, JAX's or NumPy's, each computed once and stored before it is read.
 
-    For coefficients that hold a scalar of the scene: a loop on a CPU that reads a scalar from memory is not
-    vectorised by XLA, which took four fifths of an energy's time. It also keeps XLA from computing a gather
-    anew in each of its consumers.
+    Use it for coefficients that contain a scalar of the scene. XLA does not vectorise a loop on a CPU that reads
+    a scalar from memory; such loops took four fifths of an energy's time. It also keeps XLA from computing a
+    gather again in each of its consumers.
     """
     return jax.lax.optimization_barrier(tuple(jnp.asarray(array) for array in arrays))
 

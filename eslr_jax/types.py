@@ -17,6 +17,8 @@ from flax import struct
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.errors import ConfigError
+
 
 @struct.dataclass
 class PhysicsConstants:
@@ -54,7 +56,7 @@ class Garment:
     inverse_rest_frames: Float[Array, "faces 2 2"]  # inverse of D_m [1/m]
     hinges: Int[Array, "hinges 4"]  # edge start, edge end, opposite vertex left, opposite vertex right
     hinge_rest_areas: Float[Array, " hinges"]  # sum of the two rest areas [m^2], zero where padded
-    hinge_rest_angles: Float[Array, " hinges"]  # dihedral angle of the rest mesh [rad], zero is flat
+    hinge_rest_lengths: Float[Array, " hinges"]  # of the edge [m], zero where padded
     vertex_areas: Float[Array, " vertices"]  # a third of the incident rest areas [m^2], zero where padded
     senders: Int[Array, " edges"]  # directed mesh edges, both directions
     receivers: Int[Array, " edges"]  # sorted ascending
@@ -72,7 +74,7 @@ class Garment:
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
     coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
-    # Its lengths are those of `with_rest_positions`: what the host prepared for the shape before is refused.
+    # Made by `with_rest_positions`: what the host prepared for the former shape, such as a `Plate`, is refused.
     is_recut: bool = struct.field(pytree_node=False, default=False)
 
     @property
@@ -218,14 +220,18 @@ class SceneBody:
     surface: BodySurface
     positions: Float[Array, "frames surface_vertices 3"]  # [m], in the order of the surface
     has_skin: bool = struct.field(pytree_node=False, default=False)  # its vertices keep off the cloth's faces
-    is_sharp: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
+    has_tips: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
 
 
 @dataclasses.dataclass(frozen=True)
 class PairCapacity:
     """Size of the buffer of self-contact; static, so a change compiles anew."""
 
-    pairs: int  # rows for pairs of a vertex and a face
+    pairs: int  # rows for pairs of a vertex and a face, one or more
+
+    def __post_init__(self) -> None:
+        if self.pairs < 1:
+            raise ConfigError(f"a buffer for {self.pairs} pairs: give one row or more")
 
 
 @struct.dataclass
@@ -289,9 +295,9 @@ class Trajectory:
     friction_loads: Float[Array, "frames vertices"]  # normal forces that load the next frame's friction [N]
     terms: PotentialTerms  # energies that each frame ended with [J], shape [frames]
     residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame
-    iterations: Int[Array, " frames"]  # of the solver
+    iterations: Int[Array, " frames"]  # of the solver; with substeps, the most that one of them took
     status: Int[Array, ""]  # errors.Status bits
-    first_bad_frame: Int[Array, ""]  # -1 while status is OK
+    first_bad_frame: Int[Array, ""]  # row of the first frame with a status; -1 while status is OK
     pair_demand: Int[Array, " frames"] | None = None  # of `PairCapacity.pairs`; None without self-contact
 
     @property

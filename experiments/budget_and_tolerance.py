@@ -133,14 +133,21 @@ def main() -> None:
     path = arguments.out / "budget_and_tolerance.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     kept: dict[str, list[dict[str, Any]]] = {
-        part: [] if part in arguments.parts else known.get(part, []) for part in PARTS
+        part: [
+            row
+            for row in known.get(part, [])
+            if part not in arguments.parts or row["size"] not in arguments.sizes
+        ]
+        for part in PARTS
     }
+    about = dict(known.get("environments", {})) | dict.fromkeys(arguments.parts, environment())
     for size in arguments.sizes:
         cloths = {garment: load_garment(garment, vertices=size) for garment in garments}
+        tasks = tolerances if "tolerance" in arguments.parts else ()
         scenes = []
-        for cloth in cloths.values():  # one body surface for all clips, so one compilation
+        for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
-        for tolerance in tolerances if "tolerance" in arguments.parts else ():
+        for tolerance in tasks:
             row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
             kept["tolerance"].append(row)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
@@ -159,7 +166,7 @@ def main() -> None:
         "budget_ratio_median": float(np.median(ratios)) if ratios else None,
         "calibrated_on": calibration.device,
         "processor": device_name(),
-        **environment(),
+        "environments": about,
     }
     if ratios:
         print(f"time over budget, median: {np.median(ratios):.2f}")

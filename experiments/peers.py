@@ -4,13 +4,14 @@
     python experiments/peers.py --scenes tshirt_10k      # joins the scenes that the file already holds
     python experiments/peers.py --smoke --out DIR
 
-All methods step the same frame one after the other, then all the next one, so that whatever disturbs the machine
-disturbs all; times are medians over frames, kernels compiled and first frames run before. `frame_cpu_ms` counts
-processor time: Newton uses one core, ours all that it gets, so give the process one core to compare them
+The methods are timed alternately, frame by frame, so that whatever disturbs the machine disturbs all of them.
+Times are medians over frames, after kernels are compiled and first frames are run. `frame_cpu_ms` is CPU time:
+Newton uses one core, and ours uses all that it gets, so give the process one core to compare them
 (`taskset -c 0` on Linux). Stretch, penetration and intersections are those of the free rollout. The gap is
-teacher-forced: one frame from states of our near-optimal rollout, potential of our definition minus its minimum,
-over the initial gap. A method with substeps solves a finer problem than that; the row of our own solver with
-substeps shows what this alone costs. The gap on its own rollout is that of the frames that a method simulated.
+teacher-forced: every frame starts from a state of our near-optimal rollout, and its gap in our potential is
+relative to the initial gap. A method with substeps solves a finer problem; the row of our own solver with
+substeps shows the gap that substeps alone cause. The gap on its own rollout is that of the frames that a method
+simulated.
 
 Blender can only run through from a start at rest: it comes after the others, and has no teacher-forced gap.
 Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a Python with `bpy`

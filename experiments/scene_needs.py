@@ -2,7 +2,7 @@
 
     python experiments/scene_needs.py [--smoke] [--out DIR]
 
-Two scenes that differ in one part are stepped in turns by the same solver. Writes scene_needs.json.
+The same solver steps two scenes that differ in one part, and they are timed alternately. Writes scene_needs.json.
 """
 
 from __future__ import annotations

@@ -84,14 +84,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--garments", nargs="+", default=["tshirt"])
-    parser.add_argument("--starts", type=int, default=1, help="of the rollouts with self-contact")
+    parser.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])
+    parser.add_argument("--starts", type=int, default=3, help="of the rollouts with self-contact")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="T-shirt at 1k, one clip, six frames")
     arguments = parser.parse_args()
     clips, garments, frames = load_splits()["motions"]["test"], arguments.garments, FRAMES
     if arguments.smoke:
         clips, garments, frames, arguments.vertices = clips[:1], ["tshirt"], 6, "1k"
+        arguments.starts = 1
     rows = []
     for garment in garments:
         for clip in clips:

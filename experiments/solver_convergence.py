@@ -6,9 +6,9 @@
     python experiments/solver_convergence.py --smoke --out DIR
 
 Frames are taken from a solved rollout. Each is solved by L-BFGS with 5 to 200 iterations and four
-preconditioners, and by projected Newton from two starts: the solver's initial guess, and the cloth at rest where
-it was, brought near a minimum by L-BFGS. The relative gap is (E - E*) / (E_0 - E*) in float64, where E_0 is the
-potential of the pushed-out inertial guess and E* the lowest potential that any method found.
+preconditioners, and by projected Newton from two starts: the solver's initial guess, and the result of L-BFGS
+from the positions at the beginning of the frame. The relative gap is (E - E*) / (E_0 - E*) in float64, where
+E_0 is the potential of the pushed-out inertial guess and E* the lowest potential that any method found.
 
 Scenes of solver_convergence.json that are not measured anew stay as they are.
 """

@@ -7,8 +7,8 @@
     python experiments/speed_vs_error.py --smoke --out DIR
 
 Every method starts from the same states: those of a near-optimal rollout on a test clip. A method's time has a
-fixed part (contacts, network) and a part per L-BFGS iteration; both are measured in turns. Free rollouts follow
-for a few numbers of iterations. `peers.py` says what the peers are and how they are measured.
+fixed part (contacts, network) and a part per L-BFGS iteration; methods are timed alternately. Free rollouts
+follow for a few numbers of iterations. `peers.py` says what the peers are and how they are measured.
 
 Writes speed_vs_error.json and .png after every size.
 """

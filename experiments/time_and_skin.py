@@ -8,8 +8,8 @@ triangles of cloth and body, and of cloth and cloth. Frames in which the body in
 the cloth are told apart: there two limbs pinch it.
 
 Time: T-shirt and dress on three clips against BDF2 at 1/960 s, by both integrators with one to eight steps a
-frame. All begin with the same settled cloth. The cost is processor time, which other jobs do not change much;
-null where the program was compiled meanwhile.
+frame. All begin with the same settled cloth. The cost is CPU time, which other jobs do not change much; it is
+null where the program was compiled during the measurement.
 
 Rows of time_and_skin.json stay until they are measured again.
 """

@@ -33,7 +33,7 @@ def make_sheet(rows=5, columns=6, spacing=0.05, *, seed=0, jitter=0.2):
     return positions.reshape(-1, 3), grid_faces(rows, columns)
 
 
-def make_garment(positions, faces, *, is_pinned=None) -> Garment:
+def make_garment(positions, faces, *, is_pinned=None, sewn_positions=None) -> Garment:
     """Return a garment that one joint carries."""
     ones = np.ones((len(positions), 1))
     return prepare_garment(
@@ -42,6 +42,7 @@ def make_garment(positions, faces, *, is_pinned=None) -> Garment:
         skin_weights=ones,
         skin_indices=np.zeros_like(ones, int),
         is_pinned=is_pinned,
+        sewn_positions=sewn_positions,
         allow_components=True,
     )
 

@@ -350,7 +350,7 @@ def write_bvh(path, motion, *, names=None, unit=1.0, axes=None, order="ZXY"):
     path.write_text("\n".join(lines) + "\n")
 
 
-def write_walker(character, shirt, body, *, size=1.0):
+def write_walker(character, shirt, body, *, size=1.0, start_poses=0):
     """Write the bundled body as a character of Mixamo becomes in Blender, walking, and its T-shirt as OBJ.
 
     Args:
@@ -358,10 +358,14 @@ def write_walker(character, shirt, body, *, size=1.0):
         shirt: The OBJ file [m].
         body: The bundled body.
         size: Factor on all lengths of the character.
+        start_poses: Frames of its rest pose before the walk, from which it jumps.
     """
     motion = skeleton_motion(load_motion(), body)
     skeleton = body_skeleton(body)
     skeleton = dataclasses.replace(skeleton, rest_positions=size * skeleton.rest_positions)
+    turns = np.concatenate([np.tile(np.eye(3), (start_poses, len(skeleton), 1, 1)), motion.rotations[:8]])
+    away = body_skeleton(body).rest_positions + np.array([1.5, 0.0, 0.0])
+    places = np.concatenate([np.tile(away, (start_poses, 1, 1)), motion.positions[:8]])
     order = np.argsort(-np.asarray(body.skin_weights), axis=1)[:, :4]
     weights = np.take_along_axis(np.asarray(body.skin_weights, np.float64), order, axis=1)
     write_character(
@@ -372,7 +376,7 @@ def write_walker(character, shirt, body, *, size=1.0):
         weights / weights.sum(axis=1, keepdims=True),
         np.take_along_axis(np.asarray(body.skin_indices), order, axis=1),
         names=[f"mixamorig:{MIXAMO_FROM_CMU.get(name, name)}" for name in body.joint_names],
-        motion=(motion.rotations[:8], size * motion.positions[:8]),
+        motion=(turns, size * places),
         frames=Rotation.from_rotvec(np.random.default_rng(0).normal(size=(31, 3))).as_matrix(),
         fps=motion.fps,
     )

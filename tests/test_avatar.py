@@ -51,6 +51,23 @@ def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body)
 
 
 @pytest.mark.slow
+def test_a_skipped_start_pose_is_in_the_report_and_said_with_a_point_cache(tmp_path, body):
+    character = tmp_path / "avatar.glb"
+    write_walker(character, tmp_path / "shirt.obj", body, start_poses=2)
+    result = eslr(
+        "simulate", "--body", character, "--simulator", "physics", "--frames", 3, "--iterations", 5,
+        "--settle", 0, "--no-pictures", "--json", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    skipped = 2 / load_motion().fps
+    assert json.loads(result.stdout)["motion_start_s"] == pytest.approx(skipped, rel=1e-3)
+    result = eslr("export", tmp_path / "out", "--out", tmp_path / "shirt.pc2")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == str(tmp_path / "shirt.pc2")
+    assert f"is {skipped:.3f} s after the first frame of the animation" in " ".join(result.stderr.split())
+
+
+@pytest.mark.slow
 def test_a_bundled_garment_is_carried_to_a_new_character_with_a_line_that_says_so(avatar, tmp_path):
     out, words = tmp_path / "out", ("--simulator", "physics", "--frames", 4, "--iterations", 20)
     result = eslr(

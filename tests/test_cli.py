@@ -1,5 +1,7 @@
 """The command line as a user meets it."""
 
+import dataclasses
+import inspect
 import json
 import os
 import re
@@ -11,7 +13,10 @@ import pytest
 import trimesh
 from garment_files import scanned_tshirt
 
-from eslr_jax.errors import ConfigError
+from eslr_jax.assets import load_garment_file
+from eslr_jax.errors import AssetError, ConfigError, MotionError
+from eslr_jax.fit.options import FitOptions
+from eslr_jax.io.garment import read_garment_npz
 
 
 def eslr(*arguments, cwd=None):
@@ -216,10 +221,12 @@ def test_scanned_shirt_to_a_stable_simulation_in_one_command(tmp_path, body):
 def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
     scan = scanned_tshirt(tmp_path / "shirt.obj", body)
     options = ("--pin", "loop:top", "--fabric", "silk", "front:denim", "--json")
+    (tmp_path / "fitted.png").write_bytes(b"texture")
     result = eslr("fit", scan, "--out", tmp_path / "fitted.npz", *options)
     assert result.returncode == 0, result.stderr
+    assert (tmp_path / "fitted.png").read_bytes() == b"texture"
     assert json.loads(result.stdout)["pinned"] > 10
-    assert (tmp_path / "fitted.png").stat().st_size > 10_000
+    assert (tmp_path / "fitted_fit.png").stat().st_size > 10_000
     run = ("--simulator", "physics", "--frames", 4, "--no-pictures", "--json", "--out", tmp_path / "run")
     result = eslr("simulate", "--garment", tmp_path / "fitted.npz", *run)
     assert result.returncode == 0, result.stderr
@@ -227,6 +234,88 @@ def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
     assert report["fabric"] == ["silk", "front:denim"]
     assert report["finite"]
     assert (tmp_path / "run" / "garment.npz").exists()
+
+
+def test_fit_does_not_write_over_what_it_reads(tmp_path):
+    from eslr_jax.cli.garments import fit
+
+    np.savez(tmp_path / "mesh.npz", positions=np.eye(3), faces=np.arange(3)[None])
+    before = (tmp_path / "mesh.npz").read_bytes()
+    with pytest.raises(AssetError, match="a file that is read"):
+        fit(str(tmp_path / "mesh.npz"), tmp_path / "." / "mesh.npz")
+    assert (tmp_path / "mesh.npz").read_bytes() == before
+
+
+def test_a_bundled_garment_takes_no_options_of_a_fit(tmp_path):
+    from eslr_jax.cli.garments import fit
+
+    options = FitOptions(pin=("none",), edge_length=0.01)
+    with pytest.raises(ConfigError, match=r"pants is bundled.*leave out --edge-length, --pin"):
+        fit("pants", tmp_path / "a.npz", options=options)
+
+
+def test_a_garment_is_fitted_to_a_shape_of_the_body(tmp_path, capsys):
+    from eslr_jax.cli.garments import fit
+
+    fit("tank", tmp_path / "a.npz", betas=(2.0,), picture=False)
+    fitted, usual = read_garment_npz(tmp_path / "a.npz"), load_garment_file("tank")
+    assert np.ptp(fitted.rest_positions[:, 1]) > 1.02 * np.ptp(usual.rest_positions[:, 1])
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "a.npz")
+    with pytest.raises(ConfigError, match="leave out its unit"):
+        fit("tank", tmp_path / "a.npz", body_units="cm", picture=False)
+
+
+def test_no_iterations_are_those_of_a_network_alone():
+    from eslr_jax.cli.options import Options
+    from eslr_jax.cli.simulate import _choose_method, simulate
+
+    usual = {name: option.default for name, option in inspect.signature(simulate).parameters.items()}
+    options = Options(**{field.name: usual[field.name] for field in dataclasses.fields(Options)})
+    for given, expected in (
+        ({"iterations": 0}, ("network", 0)),
+        ({"iterations": 7}, ("physics", 7)),
+        ({"iterations": 0, "simulator": "physics"}, ("physics", 0)),
+    ):
+        method = _choose_method(dataclasses.replace(options, **given), (None, None), 1000, None)
+        assert (method.simulator, method.config.iterations) == expected
+
+
+BVH_OF_BONES = """HIERARCHY
+ROOT Bone.000
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Bone.001
+  {
+    OFFSET 0 1 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0 1 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0333
+0 0 0 0 0 0 0 0 0
+0 0 0 0 0 0 0 0 0
+"""
+
+
+def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, capsys):
+    from eslr_jax.cli.bodies import joints
+
+    (tmp_path / "a.bvh").write_text(BVH_OF_BONES)
+    joints(str(tmp_path / "a.bvh"), out=tmp_path / "map.json")
+    values = json.loads((tmp_path / "map.json").read_text())
+    assert values["LeftArm"] == ""
+    assert "LeftArm" in capsys.readouterr().out
+    joints("cmu_016_32", json_=True)
+    values = json.loads(capsys.readouterr().out)
+    assert values["LeftArm"] == "LeftArm"
+    with pytest.raises(MotionError, match="needs no joint map"):
+        joints("turn")
 
 
 def test_broken_motion_is_refused(tmp_path):

@@ -9,6 +9,7 @@ import trimesh
 from chromium import CHROMIUM, launch
 
 from eslr_jax.io.run import read_run
+from eslr_jax.physics.materials import fabric_material
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
@@ -77,10 +78,24 @@ def player(tmp_path_factory):
     assert not player.thread.is_alive()
 
 
-def test_status_tells_time_and_tolerance(player):
-    status = player.live.controls["status"].content
-    assert "ms a frame" in status
-    assert "optimum" in status or "tolerance" in status
+def test_status_tells_time_and_the_gap_of_the_frame_that_is_shown(player, monkeypatch):
+    from eslr_jax.viewer import live
+
+    tell, told = live._tell, []
+
+    def spy(page, cast, report, tolerance):
+        tell(page, cast, report, tolerance)
+        told.append((100 * float(report.gap_bound), 100 * tolerance, page.controls["status"].content))
+
+    monkeypatch.setattr(live, "_tell", spy)
+    player.wait(8)
+    for gap, tolerance, status in told:
+        shown, verdict = status.split("gap below ")[1].split(" %: ")
+        assert float(shown) == pytest.approx(gap, rel=0.051), "two digits"
+        kept = f"within {tolerance:g} % of the optimum"
+        assert verdict == (kept if gap <= tolerance else "stopped before the tolerance")
+        assert float(status.split(" ms a frame")[0].split()[-1]) > 0
+    assert len(told) >= 7
 
 
 def test_wind_blows_and_a_fabric_falls_otherwise(player):
@@ -134,10 +149,10 @@ def test_a_recording_is_a_run(player):
     player.wait(6)
     player.live.controls["record"].value = False
     player.wait(3)
-    run = read_run(player.live.out)
+    run = read_run(player.live.out / "1")
     assert 6 <= run.trajectory.num_frames <= 8
     assert run.report["motion"] == "turn"
-    assert trimesh.load(player.live.out / "animation.glb").geometry
+    assert trimesh.load(player.live.out / "1" / "animation.glb").geometry
 
 
 def test_a_minute_is_recorded_at_most(player, monkeypatch):
@@ -145,7 +160,31 @@ def test_a_minute_is_recorded_at_most(player, monkeypatch):
     player.live.controls["record"].value = True
     player.until(lambda: not player.live.controls["record"].value)
     player.wait(1)
-    assert read_run(player.live.out).trajectory.num_frames == 4
+    assert read_run(player.live.out / "2").trajectory.num_frames == 4
+
+
+def test_a_recording_ends_with_the_fabric_wind_and_garment_that_it_shows(player):
+    live, controls = player.live, player.live.controls
+
+    def change(control, value):
+        controls["record"].value = True
+        player.until(lambda: len(live.recorded) >= 3)
+        control.value = value
+        player.until(lambda: not controls["record"].value and not live.recorded)
+
+    change(controls["wind"], 5.0)
+    player.wait(1)
+    assert read_run(live.out / "3").report["wind_m_s"] == [0.0, 0.0, 0.0]
+    change(controls["fabric"], "denim")
+    player.wait(1)
+    run = read_run(live.out / "4")
+    assert run.report["wind_m_s"] == [0.0, 0.0, 5.0]
+    np.testing.assert_allclose(run.trajectory.material.density, fabric_material("cotton").density, rtol=1e-6)
+    change(controls["garments"][1], "tshirt")  # which does not load, over itself
+    controls["garments"][1].value = "nothing"
+    player.wait(1)
+    assert read_run(live.out / "5").trajectory.num_frames >= 3
+    controls["wind"].value, controls["fabric"].value = 0.0, "cotton"
 
 
 def test_what_does_not_load_is_said_and_the_choice_before_plays_on(player):

@@ -1,20 +1,26 @@
 """What a scene leaves out must be what it does not need."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_garment
+from draped_ball import drifting_ball, square
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.geometry.closest import closest_points
+from eslr_jax.physics.materials import COTTON, constants_for, fabric_material
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.scene.build import build_scene, safe_plan
-from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene, prepare_scenes
-from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.scene.plan import SceneOptions, first_frames, plan_scene, prepare_scene, prepare_scenes
+from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.types import PhysicsConstants
 
 
 def test_frame_zero_is_clear_of_the_body(small_scene):
@@ -42,6 +48,50 @@ def test_what_is_not_asked_for_is_absent(small_garment, small_poses):
         ),
         atol=0.01,
     )
+
+
+def test_a_garment_that_hangs_on_joints_of_another_body_is_refused(small_garment, small_poses):
+    joints = small_poses.joint_transforms.shape[1]
+    stranger = small_garment.replace(skin_indices=small_garment.skin_indices.at[7].set(joints))
+    with pytest.raises(MeshError, match=f"was fitted to another body: it hangs on joint {joints}"):
+        prepare_scene(stranger, small_poses)
+
+
+@pytest.mark.parametrize("options", [{"integrator": "Euler"}, {"ground": "none"}])
+def test_a_misspelt_option_is_refused(small_garment, small_poses, options):
+    (name,) = options
+    with pytest.raises(ConfigError, match=f"{name} is .*give one of"):
+        prepare_scene(small_garment, small_poses, options=SceneOptions(**options))
+
+
+def test_contacts_are_as_stiff_as_the_fabric_asks_for_with_any_plan(small_garment, small_poses):
+    denim = fabric_material("denim")
+    expected = float(constants_for(denim).collision_stiffness)
+    assert expected > 5 * float(PhysicsConstants().collision_stiffness)
+    for plan in (safe_plan(small_poses), plan_scene(small_garment, small_poses)):
+        scene = build_scene(small_garment, small_poses, denim, plan)
+        assert float(scene.constants.collision_stiffness) == pytest.approx(expected)
+
+
+def test_a_body_with_tips_keeps_faces_off_them(small_garment, small_poses):
+    scene = prepare_scene(small_garment, small_poses, options=SceneOptions(has_tips=True))
+    problem = jax.jit(first_problem)(scene)
+    assert problem.body.tips is not None
+    assert float(jnp.sum(jnp.abs(problem.body.tips.side))) > 0
+
+
+def test_scenes_with_and_without_pieces_can_be_stacked():
+    layer = square()
+    positions, faces = np.asarray(layer.rest_positions), np.asarray(layer.faces)
+    one = make_garment(positions, faces)
+    above = positions + np.array([0, 0.01, 0])
+    two = make_garment(np.concatenate([positions, above]), np.concatenate([faces, faces + len(positions)]))
+    motion = drifting_ball(4)
+    scenes = prepare_scenes(
+        [one, two], [motion, motion], [COTTON, COTTON], options=SceneOptions(has_folds=True)
+    )
+    assert [scene.pieces for scene in scenes] == [None, None]
+    assert all(scene.self_contact is not None for scene in scenes)
 
 
 def test_what_a_plan_leaves_out_changes_no_force(small_garment, small_poses, small_scene, small_trajectory):

@@ -23,6 +23,7 @@ from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions, Scale
 from eslr_jax.fit.transfer import transfer_garment
+from eslr_jax.fit.wearer import check_wearer, wearer_entry
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.refine import refine
@@ -42,7 +43,7 @@ from eslr_jax.io.garment import (
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_body, read_gltf_motion
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.skeleton import SkeletonMotion
+from eslr_jax.io.skeleton import Skeleton, SkeletonMotion
 from eslr_jax.io.smpl import is_smpl_model, read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.io.weights import read_weights
 from eslr_jax.types import Body, Garment
@@ -56,8 +57,11 @@ _REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices,
 
 
 def _is_path(name: str) -> bool:
-    """Tell a path from a name: it has a separator or a suffix, or exists."""
-    return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).exists()
+    """Tell a path from a name: it has a separator or a suffix, or is a file.
+
+    A folder is none, such as the one of a run that has the name of its garment.
+    """
+    return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).is_file()
 
 
 def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Sequence[float] = ()) -> Body:
@@ -140,9 +144,9 @@ def load_garment(
     Args:
         name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
             or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
-        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
-        body: Body that is to wear it: a mesh is fitted to it, a bundled garment carried to it; by default the
-            bundled one.
+        vertices: Resolution of a bundled garment; 50k and 200k are subdivisions of its 4k mesh.
+        body: Body that wears it, by default the bundled one. A mesh is fitted to this body, and a bundled garment
+            is transferred to it.
         fit: Options of the fit; everything is recognised by default.
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
         cache: Keep the result for the next time.
@@ -177,6 +181,7 @@ def load_garment_file(
         on_source: Function that is told of a mesh before it is fitted.
     """
     if not _is_path(str(name)):
+        _refuse_fit(str(name), fit or FitOptions())
         stored = read_garment_npz(
             find_asset("garment", f"{name}_{'4k' if vertices in _REFINED else vertices}")
         )
@@ -184,20 +189,32 @@ def load_garment_file(
         return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
     path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
     if path.is_file() and is_garment_file(path):
-        return read_garment_npz(path)
+        stored = read_garment_npz(path)
+        if body is not None:
+            check_wearer(stored, body, str(name))
+        return stored
     source = read_garment_source(name)
     if on_source is not None:
         on_source(source)
     rig, options = load_body() if body is None else body, fit or FitOptions()
     if not cache:
         return fit_garment(source, rig, options)
-    key = content_key("fit", path.read_bytes(), str(name), options, *_body_arrays(rig))
+    key = content_key("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
     arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
     return garment_from_arrays(arrays, source.name)
 
 
+def _refuse_fit(name: str, options: FitOptions) -> None:
+    """Raise a ConfigError if a bundled garment is given an option of a fit, except its scale."""
+    usual = vars(FitOptions()) | {"scale": options.scale}
+    given = [field for field, value in vars(options).items() if value != usual[field]]
+    if given:
+        names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
+        raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
+
+
 def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:
-    """Return a bundled garment on a body; the bundled one wears it as it is."""
+    """Return a bundled garment on a body: as stored on the bundled body, transferred to any other."""
     if body is None:
         return stored
     own = load_body()
@@ -206,7 +223,7 @@ def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: boo
         and body.rest_positions.shape == own.rest_positions.shape
         and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)
     ):
-        return stored
+        return dataclasses.replace(stored, metadata=stored.metadata | wearer_entry(own))  # its run keeps it
     if not cache:
         return transfer_garment(stored, own, body, scale=scale)
     bends = () if body.pose_directions is None else (np.asarray(body.pose_directions),)
@@ -334,19 +351,21 @@ def load_motion(
     if text in PROCEDURAL:
         return make_procedural(text, load_body() if body is None else body)
     file, _, clip = text.partition("#")
-    if not _is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file)):
+    if _is_archived(text):
         motion = _bundled_motion(text)
         if body is None or (_is_made_for(motion, body, is_bundled=not _is_path(text)) and not joint_map):
             return motion
         # An archive holds no skeleton, so that of the bundled body is used.
         return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
-    source, skipped = skip_start_pose(read_skeleton_motion(file, clip))
+    whole = read_skeleton_motion(file, clip)
+    source, skipped = skip_start_pose(whole)
     if skipped:
         warnings.warn(skipped, stacklevel=2)
     is_bvh = Path(file).suffix.lower() == ".bvh"
-    return make_motion(
+    motion = make_motion(
         source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
     )
+    return dataclasses.replace(motion, start=(len(whole.positions) - len(source.positions)) / source.fps)
 
 
 def own_motion(body: str) -> str:
@@ -364,6 +383,33 @@ def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
         return False
     rest = np.asarray(body.joint_rest_positions)
     return not is_bundled or np.allclose(rest, np.asarray(load_body().joint_rest_positions), atol=1e-4)
+
+
+def motion_skeleton(name: str) -> Skeleton:
+    """Return the skeleton whose joints a body follows in a motion.
+
+    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body.
+
+    Args:
+        name: See `load_motion`.
+
+    Raises:
+        AssetError: There is no such motion, or the file is damaged.
+        MotionError: The motion is computed for every body, or it is for another skeleton than its archive has.
+        MissingExtraError: The file needs an extra that is not installed.
+    """
+    if name in PROCEDURAL:
+        raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
+    if _is_archived(name):
+        return skeleton_motion(_bundled_motion(name), load_body()).skeleton
+    file, _, clip = name.partition("#")
+    return read_skeleton_motion(file, clip).skeleton
+
+
+def _is_archived(text: str) -> bool:
+    """Tell a clip of the bundled format, by its name or in a user's archive, from a motion with its skeleton."""
+    file = text.partition("#")[0]
+    return not _is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file))
 
 
 def _is_amass(file: str) -> bool:

@@ -1,4 +1,4 @@
-"""How the rest pose of one rig stands to that of another (host)."""
+"""Scale and rotations between the rest poses of two rigs (host)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def match_parts(
 
 
 def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float | None:
-    """Return how many times larger a rig is than the same rig in other units; None if it is another rig.
+    """Return the metres per unit of the source if it is the body's rig in other units; None for another rig.
 
     Args:
         target: Joints of the body at rest [m].
@@ -121,7 +121,8 @@ def _bone(skeleton: Skeleton, parts: Parts, start: Part, end: Part) -> NDArray:
 def _torso_turn(target: Skeleton, ours: Parts, source: Skeleton, theirs: Parts) -> NDArray:
     """Return the rotation from the body's rest torso to the source's, shape [3, 3].
 
-    It is a quarter turn if one comes near: two rest poses that stand alike still lean by some degrees.
+    If a combination of quarter turns is near this rotation, that combination is returned: two rest poses that
+    stand alike still lean by some degrees.
     """
     one, other = torso_axes(target, ours), torso_axes(source, theirs)
     if one is None or other is None:

@@ -21,9 +21,9 @@ from eslr_jax.io.palette import BODY_COLORS, Color, garment_color
 _SKIN, _TOP, _SHORTS = 0, 1, 2
 _NAMES = ("skin", "top", "shorts")
 _LEG = 0.42  # share of the thigh that the shorts cover
-_STRAP = 0.8  # of the distance from the middle to a shoulder joint: where the top ends
-_ARMHOLE = 0.75  # of that distance beneath the shoulder joints: how low the armholes reach
-_NECKLINE = 0.45  # of that distance: radius of the neckline
+_STRAP = 0.8  # half width of the top at the shoulders, over half the distance of the shoulder joints
+_ARMHOLE = 0.75  # depth of the armholes below the shoulder joints, over the same length
+_NECKLINE = 0.45  # radius of the neckline, over the same length
 _LIMB = 0.1  # [m] over which the weight of a limb goes from none to one
 _SMOOTHINGS = 6  # of the border of a limb, over the mesh
 

@@ -176,8 +176,9 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
 def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
     """Return the joint of the source that each joint of a rig follows.
 
-    Joints of the same part follow each other, and chains of different length share evenly. A joint of no known
-    part follows the joint of its name. Joints without a counterpart are left out: they rest on their parent.
+    A joint follows a joint of the same part; if two chains differ in length, their joints are matched in
+    proportion. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
+    out, and move with their parent.
     """
     if target.joint_names == source.joint_names:
         return {name: name for name in target.joint_names}
@@ -213,13 +214,13 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
     return values
 
 
-def complete_map(
+def change_map(
     target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """Return the joint map between two rigs, with a user's changes.
+    """Return the joint map between two rigs, with a user's changes, however few joints are in it.
 
     Raises:
-        MotionError: A changed joint is not there, or nothing maps.
+        MotionError: A changed joint is not there.
     """
     result = map_joints(target, source)
     for ours, theirs in (changes or {}).items():
@@ -227,11 +228,23 @@ def complete_map(
         if theirs:
             _check_name(theirs, source.joint_names, "the motion")
         result[ours] = theirs
-    result = {name: result[name] for name in target.joint_names if result.get(name)}
+    return {name: result[name] for name in target.joint_names if result.get(name)}
+
+
+def complete_map(
+    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return the joint map by which one rig follows another; see `change_map`.
+
+    Raises:
+        MotionError: A changed joint is not there, or nothing maps.
+    """
+    result = change_map(target, source, changes)
     if len(result) < min(2, len(target)):  # the hips are always found
         raise MotionError(
             f"no joint of the motion ({', '.join(source.joint_names[:4])}, ...) is known to this body "
-            f"({', '.join(target.joint_names[:4])}, ...); give a joint map"
+            f"({', '.join(target.joint_names[:4])}, ...); write a map with eslr "
+            "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
         )
     return result
 

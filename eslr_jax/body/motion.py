@@ -33,6 +33,7 @@ class Motion:
     fps: float
     joint_names: tuple[str, ...]
     arm_abduction: float = ARM_ABDUCTION  # [degrees] that posing adds to both arms by default
+    start: float = 0.0  # time of its first frame in the file that it comes from [s]
 
     def __post_init__(self) -> None:
         """Check the arrays.

@@ -1,4 +1,4 @@
-"""From what a file holds to what is simulated: a rigged mesh to a body, a moving skeleton to a motion (host)."""
+"""Convert what a file holds for simulation: a rigged mesh to a body, a moving skeleton to a motion (host)."""
 
 from __future__ import annotations
 
@@ -260,7 +260,7 @@ def _stands_along_z(motion: SkeletonMotion) -> bool:
 
 
 def _is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
-    """Tell whether a motion holds parameters of the body model that the body is of."""
+    """Tell whether a motion holds pose parameters of the body's own body model, such as SMPL."""
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
     return source.root_axes is not None and len(shared) >= MODEL_JOINTS
 

@@ -20,10 +20,10 @@ from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.types import Body, BodyMotion
 
-_START_SECONDS = 1.0  # in which a pose that does not belong to the motion is looked for
+_START_SECONDS = 1.0  # the start of a motion, which is searched for a pose that does not belong to it
 _JUMP = 0.08  # of the skeleton's size: least step of a joint that counts as a jump
-_FAR_MORE = 3.0  # times any other step
-_STEPS_AFTER = 5  # of a motion, by which a jump is judged
+_FAR_MORE = 3.0  # a jump is at least this many times as long as every other step
+_STEPS_AFTER = 5  # least number of steps after a jump
 SETTLE_FRAMES = 35  # in which a garment is put on: 25 for the limbs, and those that hold the first pose
 _HELD = 10  # frames of settling that hold the first pose
 _FEWEST_MOVING = 15  # frames in which limbs may come from the rest pose; fewer would be a jerk
@@ -33,7 +33,7 @@ _BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
 
 
 def num_simulated_frames(motion: Motion, fps: float = 30.0) -> int:
-    """Return how many frames of a motion are simulated, which is at another rate than the file's."""
+    """Return the number of frames of a motion after resampling to the rate of the simulation."""
     return count_resampled(len(motion.rotations), motion.fps, fps)
 
 
@@ -82,7 +82,10 @@ def cut_start(motion: Motion, seconds: float) -> Motion:
     if not 0 <= first <= len(motion.rotations) - 2:
         raise MotionError(f"motion {motion.name} can't start at {seconds:g} s: it is {length:.2f} s long")
     return dataclasses.replace(
-        motion, rotations=motion.rotations[first:], translations=motion.translations[first:]
+        motion,
+        rotations=motion.rotations[first:],
+        translations=motion.translations[first:],
+        start=motion.start + first / motion.fps,
     )
 
 
@@ -140,12 +143,12 @@ def check_length(poses: BodyMotion) -> None:
 
 
 def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) -> BodyMotion:
-    """Return a moving body with frames before its first, in which a garment comes to rest on it.
+    """Return a moving body with frames before its first one, in which a garment comes to rest on it.
 
-    The limbs come from the rest pose of the body, for which its garments are made, and the last frames hold the
-    first pose. A garment that begins on the first pose has its sleeves in its trunk where arms hang down. All
-    the while the body glides over the floor at the speed of the motion's first step, so that cloth which has
-    settled is as fast as the body when the motion begins.
+    In these frames the limbs move from the body's rest pose, for which its garments are made, to the first pose;
+    the last frames hold the first pose. Without them, the sleeves of a garment would start inside its trunk where
+    arms hang down. The body also glides over the floor at the speed of the motion's first step. So the settled
+    cloth is as fast as the body when the motion begins.
 
     Args:
         poses: The body in motion.
@@ -186,9 +189,10 @@ def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
 
 @partial(jax.jit, static_argnames="num_frames")  # outside jit, every operation is a program of its own
 def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
-    """Return a body that glides up to its first frame, in the first of limbs and then in that frame's pose.
+    """Return a motion with frames before it, in which the body glides to its first frame.
 
-    Where a limb would be below the lowest point of that pose, the body is lifted.
+    The body has the poses of `limbs`, if given, and then the pose of the first frame. Where a limb would be below
+    the lowest point of the first frame, the body is lifted.
     """
     before = tuple(jnp.repeat(track[:1], num_frames, axis=0) for track in motion)
     if limbs is not None:

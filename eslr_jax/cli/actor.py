@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 from eslr_jax.cli.options import Options
 from eslr_jax.errors import ConfigError
 
+if TYPE_CHECKING:
+    from eslr_jax.types import Body, BodyMotion
+
 FPS = 30.0  # of the simulation
 
 
-def load_actor(options: Options) -> tuple[Any, Any, str]:
-    """Load a body and set it in motion; return both, and the name of the motion."""
+class Actor(NamedTuple):
+    """A body, and how it moves."""
+
+    rig: Body
+    poses: BodyMotion
+    motion: str  # its name
+    start: float  # time of the first frame in the motion's file [s]
+
+
+def load_actor(options: Options) -> Actor:
+    """Load a body and set it in motion."""
     from eslr_jax.assets import load_body, load_motion
     from eslr_jax.assets.load import own_motion
     from eslr_jax.body.joints import read_joint_map
@@ -36,7 +48,7 @@ def load_actor(options: Options) -> tuple[Any, Any, str]:
             if value is not None:
                 raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out {option}")
         sequence = read_mesh_sequence(body, fps=options.body_fps)
-        return *pose_sequence(sequence, num_frames=options.frames, units=options.body_units), body
+        return Actor(*pose_sequence(sequence, num_frames=options.frames, units=options.body_units), body, 0.0)
     if options.body_fps is not None:
         raise ConfigError(f"--body-fps is for bodies that are moving meshes, which {body} is not")
     rig = load_body(body, units=options.body_units, betas=options.betas)
@@ -47,15 +59,5 @@ def load_actor(options: Options) -> tuple[Any, Any, str]:
         clip = cut_start(clip, parse_seconds(options.start, FPS, option="--start"))
     if options.loop is not None:
         clip = loop_motion(clip, parse_seconds(options.loop, FPS, option="--loop"))
-    return rig, pose_body(rig, clip, num_frames=options.frames, arm_abduction=options.arm_abduction), motion
-
-
-def check_skin(garment: str, cloth, rig) -> None:
-    """Refuse a fitted garment that hangs on the joints of another body."""
-    import numpy as np
-
-    if int(np.asarray(cloth.skin_indices).max()) >= len(rig.joint_names):
-        raise ConfigError(
-            f"{garment} was fitted to another body; give the mesh it was fitted from, or carry that mesh to this "
-            "body with eslr fit --made-for"
-        )
+    poses = pose_body(rig, clip, num_frames=options.frames, arm_abduction=options.arm_abduction)
+    return Actor(rig, poses, motion, clip.start)

@@ -24,23 +24,22 @@ def joints(
     """Show which joint of a motion each joint of a body follows.
 
     Args:
-        motion: A motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), or glTF.
+        motion: Name of a bundled motion, or a motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl), or glTF.
         body: Name of a bundled body, or a body file.
         joint_map: JSON file of changes: a joint of the body to one of the motion, "" to keep it still.
         out: File to write the map to; change it and give it to `eslr simulate --joint-map`.
         json_: Print as JSON.
     """
     from eslr_jax.assets import load_body
-    from eslr_jax.assets.load import read_skeleton_motion
-    from eslr_jax.body.joints import complete_map, read_joint_map
+    from eslr_jax.assets.load import motion_skeleton
+    from eslr_jax.body.joints import change_map, read_joint_map
     from eslr_jax.body.rig import body_skeleton
     from eslr_jax.io.atomic import atomic_write
 
     target = body_skeleton(load_body(body))
-    file, _, clip = motion.partition("#")
-    source = read_skeleton_motion(file, clip).skeleton
+    source = motion_skeleton(motion)
     changes = None if joint_map is None else read_joint_map(joint_map)
-    found = complete_map(target, source, changes)
+    found = change_map(target, source, changes)
     values = {name: found.get(name, "") for name in target.joint_names}
     if out is not None:
         with atomic_write(out) as temporary:

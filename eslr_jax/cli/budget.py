@@ -56,12 +56,12 @@ def parse_share(text: str | None) -> float | None:
 def parse_request(
     budget: str | None, tolerance: str | None, *, is_chosen: bool
 ) -> tuple[float | None, float | None]:
-    """Return the budget [ms] or the tolerance by which a simulator shall be chosen; neither where one is named.
+    """Return the budget [ms] or the tolerance that chooses the simulator; neither if a simulator is named.
 
     Args:
-        budget: As on the command line.
-        tolerance: The same.
-        is_chosen: Nothing on the command line names a simulator.
+        budget: Text of the command line.
+        tolerance: Text of the command line.
+        is_chosen: Choose the simulator, because the command line names none.
 
     Raises:
         ConfigError: One of them can't be read, both are given, or one of them and a simulator.
@@ -77,7 +77,7 @@ def parse_request(
 
 
 def describe_load(num_vertices: int, num_frames: int, frame_ms: float) -> str:
-    """Return what a simulation takes, by the calibration of this device.
+    """Return the expected time and memory of a simulation, as text.
 
     Args:
         num_vertices: Of the garment.

@@ -24,6 +24,8 @@ def fit(
     garment: tyro.conf.Positional[str],
     out: Path,
     body: str = "anny",
+    body_units: str | None = None,
+    betas: tuple[float, ...] = (),
     made_for: str | None = None,
     options: Annotated[FitOptions, tyro.conf.arg(name="")] = FitOptions(),  # noqa: B008 - frozen
     fabric: tuple[str, ...] = (),
@@ -38,10 +40,12 @@ def fit(
     Args:
         garment: A mesh (obj, ply, stl, glb, npz), FILE.pkl#NAME of HOOD's garments, or the name of a bundled
             garment for another body than the bundled one.
-        out: The garment file to write, such as shirt.npz.
+        out: The garment file to write, such as shirt.npz; the picture is then shirt_fit.png.
         body: Name of a bundled body, or a body file.
+        body_units: Unit of the body's file: m, cm, mm, in or ft; recognised if not given.
+        betas: Shape of a body with shapes, in standard deviations.
         made_for: The body that the mesh was modelled on, if that is another one: a name or a file.
-        options: What is given instead of recognised.
+        options: Settings that replace what is recognised from the mesh.
         fabric: Fabric as for `eslr simulate`; it is kept in the file.
         picture: Render the picture (extra `render`).
         json_: Print the report as JSON.
@@ -58,6 +62,9 @@ def fit(
             f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh that it was "
             "fitted from"
         )
+    for given in (garment, body, made_for):
+        if given is not None and Path(given).is_file() and Path(given).resolve() == out.resolve():
+            raise AssetError(f"--out {out} is a file that is read, which would be lost; name another")
     use_compile_cache()
 
     def describe_source(source) -> None:
@@ -66,7 +73,7 @@ def fit(
             say(text)
 
     with waiting("fitting"):
-        rig = load_body(body)
+        rig = load_body(body, units=body_units, betas=betas)
         if made_for is None:
             stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
         else:
@@ -80,8 +87,9 @@ def fit(
         stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
         garment_material(fabric, prepare_stored(stored, name=Path(garment).name), stored)
     write_garment_npz(out, stored)
-    if picture:
-        _write_before_and_after(out.with_suffix(".png"), stored, rig)
+    # The name of the file alone may be that of the garment's texture.
+    drawn = out.with_name(f"{out.stem}_fit.png")
+    has_picture = picture and _write_before_and_after(drawn, stored, rig)
     if json_:
         print(json.dumps(report, indent=2))
         for text in report.get("warnings", ()):
@@ -89,6 +97,8 @@ def fit(
     else:
         print(describe_fit(report) if "fit" in stored.metadata else describe_transfer(report))
         print(out)
+        if has_picture:
+            print(drawn)
 
 
 def _carry(garment: str, bodies: tuple[Body, Body], options: FitOptions, on_source: Callable) -> GarmentFile:
@@ -108,8 +118,8 @@ def _carry(garment: str, bodies: tuple[Body, Body], options: FitOptions, on_sour
     return fit_garment(source, bodies[0], options, made_for=bodies[1])
 
 
-def _write_before_and_after(path: Path, stored, rig) -> None:
-    """Render the garment before and after the fit, or say that the extra `render` is missing."""
+def _write_before_and_after(path: Path, stored, rig) -> bool:
+    """Render the garment before and after the fit, or say that the extra `render` is missing and return False."""
     import numpy as np
 
     from eslr_jax.render import render_frame, side_by_side, write_png
@@ -131,5 +141,6 @@ def _write_before_and_after(path: Path, stored, rig) -> None:
             ]
     except MissingExtraError as error:
         say(f"no picture: {error}")
-        return
+        return False
     write_png(path, side_by_side(pictures, ("before", "after")))
+    return True

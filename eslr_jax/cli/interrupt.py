@@ -1,4 +1,4 @@
-"""Ctrl-C at once, where nothing is lost; see `simulation.interrupt` for where something is."""
+"""End at once on Ctrl-C; `simulation.interrupt` handles Ctrl-C where finished frames would be lost."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _PATIENCE = 1.0  # [s] in which Python may end by itself
 def leave_at_once() -> Iterator[None]:
     """Let Ctrl-C end the program also while it compiles.
 
-    Python handles a signal between two of its own instructions, but a compilation is a single one. A thread
-    therefore waits for the signal, and ends the process if Python has not done so within a second. Where a
-    function other than Python's own handles Ctrl-C, it leaves the process alone. An interrupt that Python drops,
-    since it came while an object was deleted, is not printed: the thread acts on it.
+    Python handles a signal between two of its own instructions, and a compilation is a single instruction. So a
+    thread waits for the signal, and ends the process if Python has not ended it within a second. While another
+    handler than Python's own is set for Ctrl-C, the thread does nothing. If Ctrl-C comes while Python deletes an
+    object, Python drops the interrupt with a message; the message is suppressed, because the thread acts on it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""What the options of `eslr simulate` say of the simulation, and what `--resume` makes of them."""
+"""The options of `eslr simulate` that define a simulation, and how `--resume` restores them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def interrupted_record(
 def read_interrupted(
     out: Path, given: Options
 ) -> tuple[Trajectory, Options, Choice | None, PairCapacity | None]:
-    """Read an interrupted simulation; options that are not given are its own.
+    """Read an interrupted simulation with its own options; a given option must agree with them.
 
     Args:
         out: Its folder.

@@ -34,7 +34,7 @@ def play(
         body: Name of a bundled body, or a SMPL model or a skinned character (glTF).
         betas: Shape of the body at first, in standard deviations; the page has sliders.
         vertices: Resolution of a bundled garment.
-        out: Folder for recordings, which are runs like those of `eslr simulate`.
+        out: Folder for recordings. Each is a run like those of `eslr simulate`, in a folder 1, 2, and so on.
         port: Port of the page, or the next free one.
         host: Address to listen on; 0.0.0.0 shows it to the whole network.
         opens: Open the page in the browser, if this is a terminal with a screen. Its address is printed anyway.

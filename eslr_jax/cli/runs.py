@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from eslr_jax.cli.console import app, progress
+from eslr_jax.cli.console import app, progress, say
 from eslr_jax.cli.moment import parse_seconds
 from eslr_jax.errors import AssetError, ConfigError
 
@@ -73,7 +73,7 @@ def render(
         zoom: How many times larger than with the whole body in the picture; above 1 it looks at the garment.
         at: Render one picture of this moment: a frame, such as 375, or a time, such as 12.5s.
         width: Width of one picture [pixels]; its height follows.
-        frames: Only the first so many frames of a film, or so many pictures of a sheet.
+        frames: Number of frames of a film, from the first on, or number of pictures of a contact sheet.
         samples: Camera rays per pixel.
     """
     from eslr_jax.evaluation.fields import run_field
@@ -190,9 +190,16 @@ def export(
     from eslr_jax.io.export import export_trajectory
     from eslr_jax.io.garment import read_garment_npz
     from eslr_jax.io.trajectory import read_trajectory
+    from eslr_jax.io.unfinished import NAME
 
     file = run / "trajectory.npz" if run.is_dir() else run
+    own = (file, *map(file.with_name, ("garment.npz", "report.json", NAME)))
+    if out.resolve() in [path.resolve() for path in own]:
+        raise AssetError(f"--out {out} is a file of the run itself, which would be lost; name another")
     trajectory = read_trajectory(file)
     beside = file.with_name("garment.npz")
     garment = read_garment_npz(beside) if beside.is_file() else None
     print(export_trajectory(trajectory, out, garment=garment, format=format_, content=content))
+    start = trajectory.metadata.get("motion_start_s")
+    if isinstance(start, float) and start > 0:
+        say(f"frame 0 of {out} is {start:.3f} s after the first frame of the animation in the motion's file")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import numpy as np
 import tyro
 
-from eslr_jax.cli.actor import check_skin, load_actor
+from eslr_jax.cli.actor import load_actor
 from eslr_jax.cli.console import app, print_report, say, use_compile_cache, waiting
 from eslr_jax.cli.options import DEFAULT_GARMENT, Options
 from eslr_jax.errors import ConfigError, MeshError, MotionError
@@ -47,8 +47,8 @@ def score(
     Args:
         file: The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in
             their order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a
-            folder of OBJ or PLY files. The meshes of a .glb with several are the garments of an outfit, by name;
-            FILE.glb#NAME is one of them. Or a run of `eslr simulate`, which tells its own scene.
+            folder of OBJ or PLY files. If a .glb has several meshes, they are the garments of an outfit, by name;
+            FILE.glb#NAME picks one. A run of `eslr simulate` also works, and holds its own scene.
         run: Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
         garment: Name of a bundled garment, or a mesh file; tshirt if not given. Give it again for what is worn
             over it, as for `eslr simulate`.
@@ -160,13 +160,12 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
     values.update(given, garment=files, frames=len(sequences[0].positions))
     options = Options(**values)
-    rig, poses, motion = load_actor(options)
+    rig, poses, motion, _ = load_actor(options)
     garments = [load_garment_file(file, vertices=options.vertices, body=rig) for file in files]
     stored, label = wear_together(garments, files), "+".join(files)
     by_name = dict(zip(garment_names(files), garments, strict=True))
     positions = in_outfit_order(sequences, stored, by_name)
     cloth = prepare_stored(stored, name=label)
-    check_skin(label, cloth, rig)
     scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
     _check_sequence(sequences[0], positions, scene)
     return _Task(positions, scene, poses, stored, {"garment": label, "motion": motion, "body": options.body})

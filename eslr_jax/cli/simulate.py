@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from eslr_jax.cli.actor import check_skin, load_actor
+from eslr_jax.cli.actor import load_actor
 from eslr_jax.cli.budget import describe_load, parse_request
 from eslr_jax.cli.console import app, print_report, progress, say, use_compile_cache, waiting
 from eslr_jax.cli.interrupt import EXIT_CODE
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from eslr_jax.simulation.simulate import Simulation
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
-ITERATIONS = 100  # of the solver alone: 0.002 % above the optimum in the median, 1k
-BEHIND_NETWORK = 10  # likewise behind a network
-_LONG = 5.0  # [s] of waiting for the compiler, from which on it is told
-_KEPT = 1.2  # times a budget, from which on it counts as missed
+ITERATIONS = 100  # of the solver alone: at 1k they leave a median gap of 0.002 %
+BEHIND_NETWORK = 10  # of the solver after a network
+_LONG = 5.0  # [s]; a longer wait for the compiler is reported
+_KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
 
 
 @app.command
@@ -76,48 +76,50 @@ def simulate(
 ) -> None:
     """Simulate a garment on a moving body; write trajectory, animation, pictures and a report.
 
-    The fastest within a tolerance of 1 % is chosen, unless a budget, another tolerance or a simulator is given.
-    Ctrl-C keeps the frames that are done, and --resume goes on from them.
+    By default the fastest simulator that keeps a tolerance of 1 % is chosen; give a budget, another tolerance or
+    a simulator to change this. Ctrl-C keeps the frames that are done, and --resume goes on from them.
 
     Args:
-        garment: Name of a bundled garment (see `eslr assets`), which is carried to any body, or a mesh file,
-            which is fitted to the body first; see `eslr fit` where recognition fails. Give it again for
-            what is worn over it, as in --garment pants --garment tshirt. A T-shirt if not given.
+        garment: Name of a bundled garment (see `eslr assets`), which is transferred to the body, or a mesh file,
+            which is fitted to the body; see `eslr fit` if the fit goes wrong. Repeat the option for an outfit,
+            the innermost garment first, as in --garment pants --garment tshirt. By default a T-shirt.
         motion: Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO
             (.pkl), glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
             cmu_016_32.
         body: Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
             character (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files).
-        simulator: The solver alone (physics), or with a trained network in front (network).
+        simulator: physics is the solver alone; network is a trained network, from whose prediction the solver
+            starts.
         model: Name of a bundled network or an exported file; the default network if a network is asked for and
             none is named.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
-            density=0.2,bending_stiffness=1e-5 or flexural_rigidity=5e-6; behind PART: for one part of the
-            garment. Cotton if not given.
+            density=0.2,bending_stiffness=1e-5 or flexural_rigidity=5e-6. PART:FABRIC is the fabric of one part
+            or of one garment of an outfit; the rest keeps its own. By default that of the fitted file, or cotton.
         frames: Simulate this many frames, the start included; all if not given.
-        iterations: Iterations of the solver per frame. By default 100, or 10 behind a network; 0 leaves the
-            network alone.
-        budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum within it,
-            and keep to it while it runs.
+        iterations: Solver iterations per frame: by default 100, or 10 after a network. With 0 the network
+            simulates without the solver.
+        budget: Time per frame, such as 20ms: choose the simulator that comes closest to the optimum in this time,
+            and adapt its iterations during the run so that frames keep the budget.
         tolerance: Share of the initial gap that a frame may leave, such as 1%: choose the fastest simulator
             that keeps it, and stop each frame there. See `eslr calibrate`.
         joint_map: JSON file of changes to the map of joints that `eslr joints` shows.
         motion_up: Axis that points up in a BVH motion.
-        arm_abduction: Degrees by which both arms are lifted from the motion's; by default 12 for motions of
-            another body and 0 for the body's own.
+        arm_abduction: Degrees by which both arms are lifted; by default 12 for the motion of another body, and 0
+            for the body's own motion.
         body_fps: Frames per second of a body that is a moving mesh.
-        body_units: Unit of the body's file: m, cm, mm, in or ft; recognised if not given.
+        body_units: Unit of the body's file: m, dm, cm, mm, in, ft, or metres per unit; recognised if not given.
         betas: Shape of a SMPL body, in standard deviations.
         start: Where to begin in the motion: a frame, such as 375, or a time, such as 12.5s.
         loop: How long to repeat the motion: frames or a time, such as 30s.
-        settle: Frames before frame 0 in which the garment is put on: limbs come from the body's rest pose, and
-            the last 10 hold the first pose. They are not kept. By default 35, and 0 for a network alone.
+        settle: Frames before frame 0 in which the garment settles: the limbs move from the body's rest pose to
+            the first pose, which the last 10 frames hold. These frames are not kept. By default 35, or 0 for a
+            network alone.
         integrator: How time is stepped. bdf2 keeps swinging cloth in motion. With euler, the paper's integrator,
             swinging cloth loses two thirds of its energy in a second. The default is bdf2, or euler for a
             network alone, which was trained with it.
-        substeps: Shorter steps in which every frame is simulated; 2 keeps layers apart that swing fast against
-            each other. Iterations count for each of them.
+        substeps: Number of shorter steps per frame; 2 keeps layers apart that swing fast against each other.
+            The iterations are those of each substep.
         self_contact: Keep all layers of cloth apart, also within each garment of an outfit. By default layers of
             one garment are kept apart where they can meet, and the garments of an outfit from each other.
         no_self_contact: Let layers of cloth pass through each other.
@@ -188,7 +190,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.evaluation.report import start_crossing
     from eslr_jax.evaluation.words import describe_start
-    from eslr_jax.fabric import beyond_training, garment_material
+    from eslr_jax.fabric import beyond_training, garment_material, worn_fabrics
     from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.run import ClothTrack, scene_record, write_run
@@ -206,7 +208,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     names = options.garment or (DEFAULT_GARMENT,)
     label = "+".join(names)
     with waiting("preparing garment, body and motion"):
-        rig, poses, motion = load_actor(options)
+        rig, poses, motion, motion_start = load_actor(options)
         garments = [
             load_garment_file(
                 name,
@@ -221,7 +223,6 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         method = _choose_method(options, request, num_vertices, choice)
         cloth = prepare_stored(stored, name=label, **method.garment_options)
         material = garment_material(options.fabric, cloth, stored)
-        check_skin(label, cloth, rig)
         settle = options.settle
         if settle is None:
             settle = SETTLE_FRAMES if method.config.iterations else 0
@@ -286,8 +287,9 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
             "garment": label,
-            "fabric": list(options.fabric or stored.metadata.get("fabrics", ())) or ["cotton"],
+            "fabric": list(worn_fabrics(options.fabric, stored)) or ["cotton"],
             "motion": motion,
+            "motion_start_s": motion_start,
             **scene_record(scene),
             "settle": settle,
             "wind_m_s": options.wind,
@@ -333,7 +335,7 @@ def _choose_method(
         simulator = "physics" if choice.method == SOLVER else "network"
         model = None if choice.method == SOLVER else choice.method
         iterations = choice.iterations
-    simulator = simulator or ("physics" if iterations is not None and model is None else "network")
+    simulator = simulator or ("physics" if iterations and model is None else "network")
     params, architecture = None, None
     if simulator == "network":
         model = model or default_model()

@@ -1,4 +1,4 @@
-"""On which side a vertex belongs of a face that its own cloth already passes through."""
+"""The side of a face on which a vertex belongs, where cloth already intersects itself."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.numerics import Vector3, pierces, safe_normalize, vertex_normals
 from eslr_jax.types import Garment
 
-# Of a direction along a normal (cosine) at rest, below which it says nothing. A T-shirt's sleeve and trunk, which
-# cross at the armpit where an arm hangs down, have .2 to 1.2 for the sum of both.
+# Least cosine between a pair's line and a normal in the rest mesh; below it that mesh does not tell the side. For
+# sleeve and trunk of a T-shirt, which intersect at the armpit of a hanging arm, the sum of both is .2 to 1.2.
 _LEAST_COSINE = 0.2
-# [m] between a vertex and a face; farther apart, other layers may lie between them, and in a fold that is wrapped
-# around another one they are then on the other side than at rest.
+# [m]; largest distance between vertex and face at which the rest mesh tells the side. Farther apart, other layers
+# may lie between them, and in a fold that is wrapped around another one the side then differs from that at rest.
 _NEXT_LAYER = 0.02
-# [m] between a vertex and a face at rest. Beyond it the rest mesh says nothing: the walls of a pleat, far apart
-# around the body at rest, may meet with either side, and one that takes the wrong side tears its neighbours. See
+# [m]; largest distance at rest at which the rest mesh tells the side. The walls of a pleat are far apart around
+# the body at rest, and may meet on either side; a pair with the wrong side tears the cloth around it. See
 # `experiments/tried.md`.
 _REST_REACH = 0.06
 
@@ -26,11 +26,11 @@ def sides_where_crossed(
     side: Float[Array, " pairs"],
     garment: Garment,
 ) -> Float[Array, " pairs"]:
-    """Return the sides of pairs; those that pass through each other, and are close, have the rest mesh's.
+    """Return the sides of pairs; a close pair that intersects gets its side in the rest mesh.
 
-    All others stay as they are. Where a pair crosses, whatever keeps it so would lock it. Of those that are
-    farther apart, now or at rest, or that the rest mesh says nothing about, nobody knows the side: they are left
-    out, and may slide free.
+    Pairs that don't intersect keep their side. A pair that intersects must not keep its present side, which would
+    lock the intersection. If it is farther apart, now or at rest, or if the rest mesh does not tell its side, the
+    side is unknown: it gets zero, so the pair is left out and may slide free.
 
     Args:
         position: Vertices [m].
@@ -54,8 +54,9 @@ def _sides_at_rest(
 ) -> Float[Array, " pairs"]:
     """Return the sides of pairs in the rest mesh, zero where they are not clear.
 
-    Along the line from the face to the vertex: in front where the normals look at each other, behind where they
-    look away from each other. Layers that look the same way are on the side that the line points to.
+    The line from the face to the vertex tells the side. The vertex is in front if the normals of both point at
+    each other, and behind if they point away from each other. If both point the same way, the vertex is on the
+    side to which the line points.
     """
     rest = garment.rest_positions
     corner = rest[corners]  # [pairs, 3, 3]

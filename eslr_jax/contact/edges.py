@@ -1,4 +1,4 @@
-"""Edges of the cloth over edges of the body, where both may cross between vertices that keep off each other."""
+"""Contacts of the cloth's edges with the body's edges, which contacts of vertices miss."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from eslr_jax.contact.search import following_vertices
 from eslr_jax.numerics import dot3, safe_normalize, sub3
 from eslr_jax.types import BodySurface, Contacts, Garment
 
-_BESIDE = 0.01  # [m] beside a place of the body, up to which cloth is over it; time_and_skin.py chose it
-_UNDER = 0.02  # [m] that skin may already be through; beyond it the cloth belongs to another limb
-_LOOKED_AT = 4  # edges of the cloth for every crossing that is kept
+_BESIDE = 0.01  # [m] sideways from a place of the body, within which cloth is over it; by time_and_skin.py
+_UNDER = 0.02  # [m] that cloth may already be under the skin; deeper cloth belongs to another limb
+_LOOKED_AT = 4  # edges of the cloth that are tested per crossing that is kept
 
 
 class Cloth(NamedTuple):
@@ -69,11 +69,11 @@ def find_crossings(
     garment: Garment,
     surface: BodySurface,
 ) -> Crossings:
-    """Return where edges of the body leave the cloth faces over their ends, and the cloth is lower than there.
+    """Return where edges of cloth and body cross, and the cloth is lower than over the ends of the body's edge.
 
-    The nearest face over an end of an edge says which edges of the other mesh it may cross: three. Edges of the
-    body find the cloth's, and edges of the cloth the body's; where one mesh is finer, the middle of the other's
-    edges is found from it alone. Every edge is looked at from both ends.
+    An edge is tested against the three edges of the other mesh's face that is nearest to one of its ends. The
+    search starts from edges of the body and from edges of the cloth: only the edges of the finer mesh find the
+    middle of a long edge of the other. Every edge is tested from both ends.
 
     Args:
         cloth: Vertices of the garment.
@@ -84,7 +84,7 @@ def find_crossings(
         surface: Edges of the body.
 
     Returns:
-        A third as many rows as there are vertices to start from, those with the least clearance.
+        The crossings with the least clearance, a third as many as there are body vertices to start from.
     """
     count = -(-over[0].shape[0] // 3)
     found = [_from_body(over, surface), _from_cloth(nearest, garment, surface, _LOOKED_AT * count)]

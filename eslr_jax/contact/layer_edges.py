@@ -1,4 +1,4 @@
-"""Edges of one layer of cloth over edges of another, where both may cross between vertices that keep apart."""
+"""Contacts between edges of two layers of cloth, which contacts of vertices and faces miss."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class LayerPairs:
     """
 
     corners: Int[Array, "pairs 4"]  # a vertex and the face's three, or both ends of one edge and of the other
-    # Of the corners, in the offset between the two nearest places at t: positive on the vertex or the first edge,
-    # where they add up to one, and negative on the face or the second edge.
+    # Weights of the corners in the offset between the two nearest places at t: those of the vertex or of the
+    # first edge add up to one, those of the face or of the second edge to minus one.
     weights: Float[Array, "pairs 4"]
     side: Float[Array, " pairs"]  # 1 where the first place is kept along the normal, -1 against it
     areas: Float[Array, " pairs"]  # of cloth that a pair stands for [m^2]
@@ -41,11 +41,11 @@ def with_edges(
     faces: FacePairs,
     garment: Garment,
 ) -> LayerPairs:
-    """Return pairs of vertices and faces, with those of edges that cross behind them.
+    """Return pairs of vertices and faces, followed by pairs of edges that cross.
 
-    Vertices that keep off faces don't keep two edges from each other. The edges around a vertex may cross the
-    three of a face that it is paired with; on which side of them they belong is the pair's. The rows of edges are
-    the lowest, half as many as there are of vertices and faces: there is no buffer that could run over.
+    Pairs of vertices and faces don't keep two edges apart. The edges around each vertex are tested against the
+    three edges of the face that it is paired with, and take the side of that pair. Pairs of edges with the least
+    height are kept, half as many as there are rows of vertices and faces, so no buffer can overflow.
 
     Args:
         position: Vertices at t [m], shape [vertices, 3].
@@ -144,16 +144,16 @@ def _over(
     ends: tuple[Int[Array, ...], ...],
     up: Float[Array, "3 ..."],
 ) -> tuple[Float[Array, ...], Float[Array, "4 ..."], Float[Array, ...]]:
-    """Return how high edges are over others, at t or t + 1, the lower one [m], weights of the ends, and the side.
+    """Return heights of edges over others [m], the lower of t and t + 1, weights of the ends, and sides.
 
-    The height is infinite where two edges don't cross, or cross steeply to the layers, or are far from each
-    other.
+    The height is infinite where two edges don't cross or are far apart, and where their common normal is far from
+    `up`.
 
     Args:
         now: Vertices at t [m], by components.
         ahead: At t + 1.
-        ends: Vertices: the ends of the one, and of the other.
-        up: Direction in which the one belongs from the other; zero where nobody knows.
+        ends: Vertices: both ends of the first edge, then both ends of the second one.
+        up: Direction from the second edge to the side on which the first one belongs; zero if unknown.
     """
     a, b, c, d = (tuple(now[:, end]) for end in ends)
     first, second, is_crossing = cross_lines((a, b), (c, d))

@@ -115,11 +115,11 @@ def find_both_sides(
 ) -> tuple[Contacts, Contacts]:
     """Return the nearest contacts, and those with the part of the body that faces them across the cloth.
 
-    Cloth between two thighs, or between an arm and the chest, touches both. With the nearest alone the other
-    limb sweeps over a vertex and then pushes it out on its far side. Where no part of the body faces a vertex
-    from within reach, the opposing contact is not near and names any face.
+    Cloth between two thighs, or between an arm and the chest, touches both. With the nearest contact alone, the
+    other limb would sweep over a vertex and then push it out on its far side. If no part of the body within reach
+    faces a vertex, `is_near` of its opposing contact is false, and the contact's face is arbitrary.
 
-    Cloth that is thrown, by more than the contact radius in a frame, touches the body where its path meets it.
+    Thrown cloth moves by more than the contact radius in a frame. It touches the body where its path meets it.
 
     Args:
         position: Garment vertices at t [m].
@@ -189,13 +189,13 @@ def _nearest_on_path(
     surface: BodySurface,
     blocks: Int[Array, "blocks rows"],
 ) -> tuple[Int[Array, " vertices"], Float[Array, "vertices 3"]]:
-    """Return the nearest face of every vertex, and how far along its path that was looked for [m].
+    """Return the nearest face of every vertex, and the offset [m] to the place on its path where it was found.
 
-    That is nowhere along it, unless the vertex is thrown: then it is where its path, as the body sees it, first
-    comes close to the body, or ends near it. The nearest point at t says nothing of a body that lies half a
-    metre ahead, nor of a rod on the way. From every place that is searched the vertex may go on by the distance
-    found there, and meets nothing (Hart 1996, Sphere Tracing). The whole surface is searched anew, in the same
-    compiled loop, only in frames with thrown cloth.
+    The offset is zero, except for a thrown vertex whose path, relative to the body, comes close to the body or
+    ends near it: the nearest point at t tells nothing of a body half a metre ahead, or of a rod on the way. From
+    each place that is searched, the vertex can move on by the distance found there without meeting anything (Hart
+    1996, Sphere Tracing). Only frames with thrown cloth search the whole surface again, in the same compiled
+    loop.
     """
     moves = step.next_positions - step.positions
 
@@ -275,8 +275,8 @@ def _contacts_at(
 ) -> Contacts:
     """Carry located body points to t + 1, with their tangent planes.
 
-    Where the surface ends, cloth beyond its boundary is not in contact: the tangent plane there says nothing, and
-    the nearest point of the whole body, which the surface is a part of, is another one.
+    The surface is only a part of the body. Cloth beyond its boundary is not in contact with it, because another
+    point of the whole body is nearer.
     """
     found = interpolate(jnp.concatenate(step, axis=1), location, surface)
     points, next_points, normal, next_normal = jnp.split(found, 4, axis=1)

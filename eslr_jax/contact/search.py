@@ -54,8 +54,8 @@ class _Patches(NamedTuple):
 class _Nearest(NamedTuple):
     """The two nearest vertices so far.
 
-    A squared distance stands as the bits of its float32, with the vertex in the lowest of them: as integers they
-    order like the distances, so that one minimum tells both the distance and whose it is.
+    An entry holds the bits of a squared distance in float32, with the number of the vertex in the lowest bits.
+    Such integers have the order of the distances, so one minimum gives the distance and the vertex.
     """
 
     first: Int[Array, "*shape"]
@@ -63,7 +63,7 @@ class _Nearest(NamedTuple):
 
 
 Exclusion = Callable[[_Groups, Vector3, Vector3], Bool[Array, "pairs rows"]]
-"""From points, and one candidate with its normal for each group of them, to where it does not count."""
+"""A function of points, and of one candidate with its normal per group; returns where it does not count."""
 
 
 @jax.jit  # traced once for the start of a scene and for its steps

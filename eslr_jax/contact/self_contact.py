@@ -25,9 +25,9 @@ from eslr_jax.numerics import (
 )
 from eslr_jax.types import Garment, PairCapacity
 
-TIP_RADIUS = 0.06  # [m] within which the vertices of a sharp body see the cloth
-# [m] within which layers see each other: they may approach by this much in a frame. At 0.02 the walls of a pleat
-# that closes at a metre a second passed through each other unseen (hard case `layers`).
+TIP_RADIUS = 0.06  # [m] within which vertices of a body with tips are paired with the cloth
+# [m] within which layers are paired: they may approach by this much in a frame. At 0.02 the walls of a pleat that
+# closes at a metre a second were not paired and passed through each other (hard case `layers`).
 SEARCH_RADIUS = 0.04
 # [m] within which a pair is kept even if it doesn't seem to approach. With ContourCraft's 0.01 the walls of fast
 # folds, which the inertial guess sees moving apart, passed through each other: `layers` of the hard cases.
@@ -40,11 +40,11 @@ _BLOCK_PAIRS = (
     2048  # pairs of blocks that are looked at together; what is read of them then stays in the cache
 )
 _CANDIDATES = 1024  # pairs of a point and a face that are tested exactly at a time
-PAIRS_PER_VERTEX = 8  # rows that hold any cloth in the hard cases, a mean over vertices; the most was 6.9
-_FEWEST_PAIRS = 64  # rows to begin with, at least
-_BEGINNING = 8  # vertices for a row to begin with: a walking T-shirt has a pair for 20 to 130 vertices
-_PIECES_BEGINNING = 2  # likewise for layers of several pieces; a skirt over trousers has a pair for 2.6
-PAIRS_PER_TIP = 12  # likewise for tips, over the vertices of both; cloth bunched around a needle took 8.3
+PAIRS_PER_VERTEX = 8  # rows per vertex, enough for all cloth in the hard cases, which needs at most 6.9
+_FEWEST_PAIRS = 64  # least number of rows of the first buffer
+_BEGINNING = 8  # vertices per row of the first buffer; a walking T-shirt has a pair per 20 to 130 vertices
+_PIECES_BEGINNING = 2  # the same for several pieces; a skirt over trousers has a pair per 2.6 vertices
+PAIRS_PER_TIP = 12  # rows per vertex of cloth and body for tips; cloth bunched around a needle needed 8.3
 
 
 @struct.dataclass
@@ -139,8 +139,8 @@ def find_tip_contacts(
 ) -> TipPairs:
     """Pair every body vertex with the faces of the cloth that it could touch during the frame.
 
-    The nearest body point of every cloth vertex misses a tip that is finer than the cloth's mesh. The body's
-    own vertices see the faces.
+    Contacts of the cloth's vertices miss a tip that is finer than the cloth's mesh. So the body's vertices are
+    paired with faces of the cloth.
 
     Args:
         position: Cloth vertices at t [m], shape [vertices, 3].
@@ -197,7 +197,7 @@ class _FaceTable(NamedTuple):
 
 def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
-    # What is found has no derivative, where it is found has one.
+    # The choice of pairs has no derivative; their places on the faces have one.
     still = cloth._replace(ends=jax.lax.stop_gradient(cloth.ends))
     point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
     pairs = _exactly(point, face, points, cloth, radius)
@@ -219,8 +219,8 @@ def _search(
 ) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"], Int[Array, ""]]:
     """Return points and faces of the pairs, and their number, which may be more than there are rows.
 
-    First boxes around blocks of points against boxes around blocks of faces, then every point against every face
-    in two such blocks by a cheap test that loses none, then exactly.
+    Three tests narrow the pairs down: boxes around blocks of points against boxes around blocks of faces; every
+    point against every face of two such blocks, by a cheap test that misses no pair; and an exact test.
     """
     garment = cloth.garment
     table = _face_table(cloth)
@@ -257,7 +257,7 @@ def _search(
 def _append(
     found: tuple[Array, Array, Array], rows: tuple[Array, Array], is_pair: Bool[Array, " rows"], capacity: int
 ) -> tuple[Array, Array, Array]:
-    """Return points, faces and their number with some more behind; beyond the capacity they are counted alone."""
+    """Append points and faces of pairs; those beyond the capacity are counted, but not stored."""
     *before, count = found
     slot = jnp.where(is_pair, count + jnp.cumsum(is_pair, dtype=jnp.int32) - 1, capacity)
     point, face = (old.at[slot].set(new, mode="drop") for old, new in zip(before, rows, strict=True))
@@ -319,8 +319,8 @@ def _candidates(
 ) -> Int[Array, "pairs rows"]:
     """Return for every point which faces of a block may be its partners, as bits.
 
-    The point stands over the face: sideways it is beyond no edge by more than its slope allows. It is near, or
-    comes near. Faces that hold it are no partners.
+    A partner is a face that the point lies over, or misses sideways by at most `_MAX_SLOPE` times its height. The
+    point is near at t or at the prediction, and not a corner of the face.
 
     Args:
         ids: Points.

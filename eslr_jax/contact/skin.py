@@ -1,4 +1,4 @@
-"""Skin under the cloth: where the body would show between the cloth's vertices, through faces and folds."""
+"""Contacts of skin with faces and edges of the cloth, through which the body would show between vertices."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def find_skin_contacts(
     surface: BodySurface,
     garment: Garment,
 ) -> SkinContacts:
-    """Return the places of the body that the cloth's faces and edges are about to cut.
+    """Return the places of the body that faces and edges of the cloth are about to intersect.
 
-    Vertices of the cloth keep off the body, but between them a face may cut a knee, and a fold an edge of the
-    body. The rows are the places that are least far below the cloth, three vertices of the body to a crossing of
-    edges: there is no buffer that could run over.
+    Contacts keep the cloth's vertices off the body, but between them a face may cut a knee, and a fold may cut an
+    edge of the body. The places with the least clearance are kept, three body vertices per crossing of edges.
+    Their number is fixed, so no buffer can overflow.
 
     Args:
         cloth: Cloth vertices at t [m], and a guess of them at t + 1, such as the inertial one.
@@ -146,10 +146,10 @@ def _nearest_vertices(
     nearest: Contacts,
     surface: BodySurface,
 ) -> Int[Array, " surface_vertices"]:
-    """Return a near cloth vertex of every body vertex.
+    """Return a near cloth vertex for every body vertex.
 
-    A cloth vertex begins at the corners of the body face that it is nearest to; body vertices then take over
-    what is nearest of their neighbours', a few times.
+    Each cloth vertex is first assigned to the corners of its nearest body face. Then, a few times, every body
+    vertex takes the nearest of its own cloth vertex and those of its neighbours.
     """
     cloth, here = components(position), components(body)
     is_neighbor = surface.face_incidence < surface.faces.size
@@ -175,7 +175,7 @@ def _descend(
     body: Float[Array, "surface_vertices 3"],
     garment: Garment,
 ) -> Int[Array, " surface_vertices"]:
-    """Return cloth vertices that are nearer still, edges of the cloth away: its mesh may be the finer one."""
+    """Walk along edges of the cloth to nearer vertices, since its mesh may be finer than that of the body."""
     cloth, here, nobody = components(position), components(body), position.shape[0]
     own = jnp.arange(nobody, dtype=jnp.int32)[:, None]
     neighbors = jnp.where(garment.neighbor_mask, garment.neighbors, own).T

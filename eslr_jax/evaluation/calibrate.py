@@ -52,8 +52,8 @@ def example_scene(garment: str, size: str, clip: str, num_frames: int = _FRAMES)
 def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:
     """Measure error and cost of methods, on states of the optimum's own rollouts.
 
-    The optimum of a frame is the least that any of them finds: a network may lead into a deeper minimum. All
-    are timed in turns, since a machine's speed changes within minutes.
+    The optimum of a frame is the lowest potential that any method finds, since a network may lead to a deeper
+    minimum. The methods are timed alternately, since a machine's speed changes within minutes.
 
     Args:
         names: Of networks; SOLVER is the solver alone.
@@ -78,14 +78,14 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
 
 
 def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
-    """Return what every method takes per frame without iterations, and what an iteration takes [ms].
+    """Return every method's fixed cost per frame, and the cost of an iteration [ms].
 
-    An iteration is the same behind every method, so all share one cost, and methods are compared within turns: a
-    machine that changes its speed during the measurement then favours none.
+    An iteration is the same for every method, so all share one cost. The fixed cost of a method is that of the
+    first one plus their difference, which is taken within turns: a machine that changes its speed during the
+    measurement then favours none.
 
     Args:
-        times: Milliseconds per frame, turn by turn, by method and number of iterations; the others' fixed parts
-            are that of the first, and what they take longer than it.
+        times: Milliseconds per frame, turn by turn, by method and number of iterations.
     """
     names = list(dict.fromkeys(name for name, _ in times))
     low, high = _TIMED_ITERATIONS

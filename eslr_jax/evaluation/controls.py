@@ -1,4 +1,4 @@
-"""Controls: the same network without something, which tells what that something does."""
+"""Controls: a network without one of its parts, which shows what that part contributes."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
-from eslr_jax.evaluation.metrics import measure_frames
+from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene.plan import prepare_scene, shared_surface
@@ -174,14 +174,21 @@ def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> 
 
 
 def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
-    """Return plain measures of a trajectory on a scene with a body."""
+    """Return plain measures of a trajectory.
+
+    Args:
+        trajectory: What is measured.
+        scene: Its scene.
+
+    Raises:
+        ConfigError: The scene has no body, against which penetration and coverage are measured.
+    """
+    if scene.body is None:
+        raise ConfigError("penetration and coverage are measured against a body; give a scene with one")
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
     terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}
-    depth = -np.asarray(measures.distances)[:, is_real]
-    if scene.body is None:
-        raise ValueError("penetration and friction are measured against a body; give a scene with one")
     body = np.asarray(scene.body.positions)
     jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
     return {
@@ -190,8 +197,7 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
         "num_frames": int(scene.num_frames),
         "terms": terms,
         "total": sum(terms.values()),
-        "stretch_p99": float(np.quantile(measures.max_stretch, 0.99)),
-        "penetration_p999_mm": float(max(np.quantile(depth, 0.999), 0.0) * 1e3),
+        **extremes(measures, is_real),
         "jitter_m_s3": float(np.median(np.linalg.norm(jerk, axis=-1))),
         "coverage": _coverage(positions[-1], body[-1]),
     }

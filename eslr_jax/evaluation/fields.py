@@ -30,7 +30,7 @@ from eslr_jax.types import (
     Scene,
 )
 
-# No file holds functions of one's own; what air and damping take away is of a frame, not of a shape.
+# No file stores a user's own energies; energy lost to air and damping belongs to a frame, not to a shape.
 _TERMS = tuple(term for term in PotentialTerms._fields if term not in ("air", "damping", "own"))
 FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
@@ -128,8 +128,8 @@ def energy_shares(
 ) -> Float[Array, " vertices"]:
     """Share one term of the potential out over the vertices [J]; the shares add up to it.
 
-    Every term is a sum over faces, hinges, vertices or pairs. It is linear in a factor on each of them, here the
-    mean of factors at its vertices: the gradient by these is what each vertex holds.
+    Every term is a sum over faces, hinges, vertices or pairs. Each summand is scaled by the mean of factors at
+    its vertices; the term is linear in these factors, and its gradient by them gives the share of each vertex.
 
     Args:
         term: Name of an entry of `PotentialTerms`.
@@ -173,10 +173,10 @@ def _weigh(rows: Any, factors: Float[Array, " vertices"]) -> Any:
 def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
     """Share the optimality gap out over the vertices [J]; the shares add up to it.
 
-    A vertex' share is the work that the forces left at it do on its straight way x* + s (x - x*) to the optimum,
-    the integral of grad P . (x - x*) over s. The difference of the energies that a vertex holds here and there
-    would add up as well, but the terms trade energy at first order of x - x* while the gap is of the second:
-    it would show the trade.
+    The share of a vertex is the work of the remaining force at it along its straight way x* + s (x - x*) to the
+    optimum, which is the integral of grad P . (x - x*) over s. The differences of `energy_shares` at x and x*
+    also add up to the gap. But they show the energy that the terms exchange, which is of first order in x - x*,
+    while the gap is of second order.
 
     Args:
         position: Any stepper's positions at t + 1 [m], shape [vertices, 3].

@@ -1,4 +1,4 @@
-"""Somebody else's trajectory, which tells positions alone: what our report and our gap need besides (host)."""
+"""Trajectories of other simulators, which have positions only: add what report and gap need (host)."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ def find_friction_loads(
 
 @jax.jit
 def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
-    """Return a trajectory with the energies and residuals of where it went; frame 0 has none.
+    """Return a trajectory with energies and residuals at its positions in our energy; frame 0 has none.
 
     Args:
-        trajectory: Of anybody; what it says of its energies is replaced.
+        trajectory: Of any simulator; its own energies and residuals are replaced.
         scene: Its scene.
     """
 

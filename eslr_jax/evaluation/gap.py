@@ -73,8 +73,8 @@ def past_states(
         positions: Vertex positions [m].
         velocities: Vertex velocities [m/s].
         scene: Its scene.
-        residuals: Force norm over weight at the end of every frame; where unknown, NaN or all of them None, a
-            frame counts as ended in its minimum.
+        residuals: Force norm over weight at the end of every frame. NaN, or None for all frames, stands for
+            unknown: such a frame counts as one that ended in its minimum.
     """
     first = scene.initial_state.past
     if first is None:
@@ -189,7 +189,7 @@ def stepped_potentials(
 
 
 def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> OptimalityGap:
-    """Return where frames of a trajectory begin, end, and could have ended; nothing else is solved.
+    """Return potentials of a trajectory's frames: guess, reached and optimum; nothing else is solved.
 
     The arguments are those of `measure_gap`.
     """
@@ -203,7 +203,7 @@ def map_frames(
     inputs: FrameInput,
     scene: Scene,
 ) -> Any:
-    """State the problem of every frame and return what `measure` makes of where the cloth went.
+    """Apply `measure` to the positions that the cloth reached in every frame, and to the frame's problem.
 
     Args:
         measure: From positions and their frame's problem to a value, or to several.

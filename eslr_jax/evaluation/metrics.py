@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
@@ -47,6 +48,23 @@ def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -
 
     body = None if scene.body is None else scene.body.positions[1:]
     return jax.lax.map(measure, (positions[:-1], positions[1:], body))
+
+
+def extremes(measures: FrameMeasures, is_real: np.ndarray) -> dict[str, float]:
+    """Return the largest stretch that 99 % of the frames stay below, and the penetration of a scene with a body.
+
+    Args:
+        measures: Of a trajectory.
+        is_real: Which vertices are no padding, shape [vertices].
+    """
+    depth = -np.asarray(measures.distances)[:, is_real]
+    stretch = float(np.quantile(measures.max_stretch, 0.99))
+    return {"stretch_p99": stretch, "penetration_p999_mm": penetration_p999_mm(depth)}
+
+
+def penetration_p999_mm(depth: np.ndarray) -> float:
+    """Return the depth in the body [mm] that 99.9 % of the depths [m] stay below; zero where all are outside."""
+    return float(max(np.quantile(depth, 0.999), 0.0) * 1e3)
 
 
 @jax.jit

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_frames
+from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_frames, penetration_p999_mm
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.crossing import find_crossings
 from eslr_jax.geometry.topology import vertex_normals
@@ -80,7 +80,7 @@ def trajectory_report(
         depth = -measures.distances[:, is_real]
         if poses is not None:
             depth = _measured_again(depth, positions[1:], poses)
-        report["penetration_p999_mm"] = float(max(np.quantile(depth, 0.999), 0.0) * 1e3)
+        report["penetration_p999_mm"] = penetration_p999_mm(depth)
         report["penetration_max_mm"] = float(max(depth.max(), 0.0) * 1e3)
         report["penetrating_share"] = float((depth > 0).mean())
         if depth.max() > 0:

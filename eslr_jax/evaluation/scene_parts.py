@@ -84,7 +84,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
 
 
 def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]:
-    """Return milliseconds of each part of one frame, on this device, measured in turns.
+    """Return milliseconds of each part of one frame on this device; the parts are timed alternately.
 
     Args:
         params: Weights of the network; None without one.
@@ -121,7 +121,7 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
 
 
 def take_turns(parts: dict[str, tuple[Callable, tuple]], turns: int = _TURNS) -> dict[str, float]:
-    """Return the median milliseconds of functions that are jitted and called in turns.
+    """Return the median milliseconds of functions, which are jitted and called alternately.
 
     Args:
         parts: Functions with their arguments.

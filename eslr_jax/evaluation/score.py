@@ -111,9 +111,9 @@ def _check(positions: np.ndarray, scene: Scene, every: int) -> None:
 def _count_intersections(
     positions: np.ndarray, scene: Scene, every: int, garments: dict[str, dict[str, Any]] | None
 ) -> dict[str, int | None]:
-    """Return the pairs of triangles that intersect in the last frame, and in the worst of every so many.
+    """Return the numbers of intersecting pairs of triangles in the last frame, and in the worst measured frame.
 
-    Every entry of `garments` gets the pairs of the last frame that the garment takes part in.
+    Every entry of `garments` gets the number of pairs in the last frame that involve this garment.
     """
     faces = np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
     body, body_faces = None, None

@@ -32,11 +32,10 @@ def wear_report(
 ) -> dict[str, Any]:
     """Measure how a garment sits on a moving body.
 
-    Skin is covered where a face of the cloth lies in front of it in the rest pose, at most 3 cm away. It shows
-    through where it is later in front of the nearest face. Faces at a hem don't count, since skin passes
-    under them, nor do faces turned away by more than 60 degrees, which are folds or cover another limb, nor
-    faces far from the skin in the rest pose.
-    Every tenth frame and the last are looked at.
+    Skin is covered if a face of the cloth lies at most 3 cm in front of it in the rest pose. Covered skin shows
+    through if it is later in front of the nearest face. Three kinds of faces don't count: faces at a hem, since
+    skin passes under them; faces that are turned away by more than 60 degrees, which are folds or cover another
+    limb; and faces that are far from the skin in the rest pose. Every tenth frame and the last one are measured.
 
     Args:
         positions: Simulated vertex positions [m], shape [frames, vertices, 3].
@@ -113,10 +112,11 @@ def _part(face: int, parts: Parts) -> str | None:
 def _sides(
     points: NDArray, outward: NDArray, positions: NDArray, faces: Int[np.ndarray, "faces 3"], hem: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return how far skin is in front of cloth [m], negative behind it, how far off it is [m], and the face.
+    """Return how far skin is in front of cloth [m], negative behind it, its distance [m], and the nearest face.
 
-    The first is measured along the normals of both, and the smaller one counts: skin beside a fold is far off
-    it, but not in front of it. It is zero where they disagree, at a hem, and where the two face different ways.
+    How far it is in front is measured along the normals of skin and cloth, and the smaller value counts: skin
+    beside a fold is distant, but not in front. The value is zero at a hem, where the two measures differ in sign,
+    and where skin and cloth face different ways.
     """
     nearest, _, offset, normals = nearest_places(points, positions, faces, vertex_normals(positions, faces))
     distance = np.linalg.norm(offset, axis=1)

@@ -18,6 +18,7 @@ from eslr_jax.fit.remesh import remesh
 from eslr_jax.fit.rest import lay_to_rest
 from eslr_jax.fit.transfer import carry_shape
 from eslr_jax.fit.waist import Waist, find_waist
+from eslr_jax.fit.wearer import wearer_entry
 from eslr_jax.geometry.repair import (
     Cleaned,
     consistent_orientation,
@@ -44,12 +45,13 @@ def fit_garment(
     Args:
         source: Garment of `read_garment_source`.
         body: The body in its rest pose.
-        options: What is given instead of recognised.
+        options: Settings that replace what is recognised from the mesh.
         made_for: The body that it was modelled on, if that is another one: it is put on that body first and
             carried from there; see `transfer_garment`.
 
     Returns:
-        The garment; `metadata["fit"]` reports what was recognised, done and doubted.
+        The garment; `metadata["fit"]` reports what was recognised, done and doubted, `metadata["body"]` tells
+        the body.
 
     Raises:
         MeshError: The mesh can't be repaired, does not fit the body, or can't be carried to it.
@@ -77,10 +79,11 @@ def fit_garment(
         clean.positions,
         clean.faces,
         postures,
-        units="m" if source.is_metric and options.units == "auto" else options.units,
-        up="y" if source.is_metric and options.up == "auto" else options.up,
+        units=options.units,
+        up=options.up,
         front=options.front,
         keep_place=options.keep_place,
+        is_metric=source.is_metric,
         name=name,
     )
     posture = postures[placement.posture]
@@ -133,6 +136,7 @@ def fit_garment(
         vertex_map=vertex_map,
         metadata={
             "name": name,
+            **wearer_entry(body),
             "fit": {
                 "placement": _describe(placement, posture),
                 "mesh": report,
@@ -170,7 +174,7 @@ def _pin(
     else:
         is_pinned, pinned_by = waist.is_held, waist.reason
     falls = (waist.is_held.any() or waist.is_falling) and not is_pinned.any()
-    remedy = "give --pin, such as --pin loop:top, or sew its parts with --components join"
+    remedy = "give eslr fit --pin, such as --pin loop:top, or --components join to sew its parts together"
     return is_pinned, pinned_by, [f"nothing holds the garment up: {waist.reason}; {remedy}"] if falls else []
 
 
@@ -179,8 +183,8 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
     clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
     if not face_areas(clean.positions, clean.faces).sum() > 0:
         raise MeshError(
-            "no face with an area is left after welding coincident vertices; check the mesh, or give a smaller "
-            "--weld"
+            "no face with an area is left after welding coincident vertices; check the mesh, or give eslr fit a "
+            "smaller --weld"
         )
     num_used = len(np.unique(faces))
     report = {

@@ -15,7 +15,7 @@ _JOIN_GAP = 0.01  # [m] across which parts are joined: a seam allowance
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """What is given instead of recognised.
+    """Settings of a fit, which replace what is recognised from the mesh.
 
     Attributes:
         units: Unit of the file, or metres per unit.

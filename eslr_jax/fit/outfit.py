@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import MeshError
+from eslr_jax.fit.wearer import common_wearer
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
@@ -51,10 +52,12 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         The outfit. `metadata["outfit"]` has the names and the numbers of vertices.
 
     Raises:
-        MeshError: Two garments have the same name, or vertices of one stay beneath another.
+        MeshError: Two garments have the same name or were fitted to different bodies, or vertices of one stay
+            beneath another.
     """
     if len(set(names)) < len(names):
         raise MeshError(f"an outfit of {', '.join(names)}: a garment can be worn once only")
+    wearer = common_wearer(garments, names)
     placed: list[np.ndarray] = []
     for number, garment in enumerate(garments):
         positions = garment.rest_positions
@@ -83,7 +86,11 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         corner_uvs=np.concatenate([g.corner_uvs for g in garments]) if has_uvs else None,  # type: ignore[misc]
         face_parts=face_parts,
         part_names=part_names,
-        metadata={"outfit": dict(zip(names, counts, strict=True)), "fabrics": _fabrics(garments, names)},
+        metadata={
+            "outfit": dict(zip(names, counts, strict=True)),
+            "fabrics": _fabrics(garments, names),
+            **wearer,
+        },
     )
 
 

@@ -88,6 +88,7 @@ def find_placement(
     up: Axis = "auto",
     front: Axis = "auto",
     keep_place: bool = False,
+    is_metric: bool = False,
     name: str = "garment",
 ) -> Placement:
     """Return the unit, axes, place and posture in which a garment fits the body best.
@@ -104,12 +105,17 @@ def find_placement(
         up: Axis of the file that points up.
         front: Axis of the file that the wearer faces.
         keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own.
+        is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
         name: Name of the garment in messages.
 
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where
             everything is given, nothing is refused.
     """
+    given = {"--units": units, "--up": up, "--front": front, "--keep-place": keep_place or "auto"}
+    missing = [option for option, value in given.items() if value == "auto"]
+    if is_metric:
+        units, up = "m" if units == "auto" else units, "y" if up == "auto" else up
     factors = _factors(positions, postures[0], units, name)
     orientations = [
         Placement(factor, rotation, np.zeros(3), 0, *axes, "floor", weight * (1.0 if is_usual else _TURNED))
@@ -125,10 +131,10 @@ def find_placement(
     is_given = keep_place and "auto" not in (units, up, front)
     near = np.abs(postures[best.posture].heights(best.apply(sample.points))) < _NEAR
     if near.mean() < _MIN_NEAR and not is_given:
-        options = {"--units": units, "--up": up, "--front": front, "--keep-place": keep_place or "auto"}
-        missing = [option for option, value in options.items() if value == "auto"]
+        prescribed = is_metric and not {"--units", "--up"}.isdisjoint(missing)
+        rule = " (its format prescribes metres and y up, unless --units and --up say otherwise)" * prescribed
         raise MeshError(
-            f"{name}: does not fit the body in any unit, axis or place that was tried; give "
+            f"{name}: does not fit the body in any unit, axis or place that was tried{rule}; give eslr fit "
             f"{' and '.join(missing)}, or model it on the body of eslr assets --export body.obj"
         )
     margin = np.inf if rival is None else rival.cost - best.cost
@@ -137,7 +143,7 @@ def find_placement(
     if confidence < DOUBTFUL and rival is not None:
         warnings.append(
             f"the place is doubtful (confidence {confidence:.0%}): {rival.describe()} fits almost as well; look "
-            "at the picture, and give --units, --up, --front or --keep-place"
+            "at the picture, and give eslr fit --units, --up, --front or --keep-place"
         )
     if near.mean() < _MIN_NEAR:
         warnings.append("the garment is not on the body, and stays there as asked; look at the picture")
@@ -188,7 +194,8 @@ def _choose(
 def _is_rival(best: Placement, other: Placement, sample: Sample) -> bool:
     """Tell whether another placement puts the garment elsewhere.
 
-    If the garment fits with its feet at the origin, that it fits also where it is moved to says nothing.
+    If the garment fits with the body's feet at the file's origin, a place found by moving it, with the same
+    unit and axes, is no rival.
     """
     key = (best.factor, best.up, best.front)
     if best.origin == "floor" and other.origin == "found" and key == (other.factor, other.up, other.front):
@@ -255,7 +262,7 @@ def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndar
 
 
 def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> list[str]:
-    """Warn if the garment fits clearly better, or only then at its origin, a few percent larger or smaller."""
+    """Warn if, a few percent larger or smaller, the garment fits clearly better, or fits without moving."""
     posture = postures[best.posture]
     here = fit_cost(best.apply(sample.points), posture)
     origins = [best.translation]
@@ -270,7 +277,7 @@ def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> 
             return [
                 f"the unit is doubtful: {best.factor:g} m per unit was taken, {scale * best.factor:.3g} fits "
                 f"{'without moving' if best.origin == 'found' else 'better'} "
-                f"({1.0 / (scale * best.factor):.3g} units in a metre); give --units"
+                f"({1.0 / (scale * best.factor):.3g} units in a metre); give eslr fit --units"
             ]
     return []
 
@@ -289,7 +296,7 @@ def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: st
     if not factors:
         raise MeshError(
             f"{name}: bounding-box diagonal {diagonal:.4g} is no garment's in {', '.join(_TRIED_UNITS)}; scale "
-            "it, or give the metres per unit"
+            "it, or give eslr fit --units with the metres per unit"
         )
     small = _SMALL_SHARE * float(np.ptp(body.positions[:, 1]))
     return {

@@ -54,6 +54,6 @@ def describe_cost(num_vertices: int) -> str | None:
         return None
     return (
         f"{num_vertices:,} vertices are many: fitting takes about {num_vertices * 3e-4:.0f} s, and every frame "
-        f"about {num_vertices / 1000:.0f} times as long as with 1,000; --edge-length 0.01 gives about 10,000 for "
-        "a shirt"
+        f"about {num_vertices / 1000:.0f} times as long as with 1,000; eslr fit --edge-length 0.01 gives "
+        "about 10,000 for a shirt"
     )

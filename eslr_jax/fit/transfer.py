@@ -1,4 +1,4 @@
-"""Carry a garment from the body that it was made for to another one, of any rig, shape and rest pose."""
+"""Transfer a garment from the body that it was made for to another body, of any rig, shape and rest pose."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from eslr_jax.fit.clearance import body_heights, push_out
 from eslr_jax.fit.options import Scale
 from eslr_jax.fit.postures import Posture, rest_posture, take_posture
 from eslr_jax.fit.rest import lay_to_rest
+from eslr_jax.fit.wearer import wearer_entry
 from eslr_jax.geometry.topology import unique_edges
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.skeleton import Skeleton
@@ -62,7 +63,7 @@ def transfer_garment(
 
     Returns:
         The garment in the target's rest pose, with skin weights of the target; `metadata["transfer"]` reports
-        what was done.
+        what was done, `metadata["body"]` tells the target.
 
     Raises:
         ConfigError: The garment has a sewn shape of its own: it was fitted, and may have another pose.
@@ -82,7 +83,7 @@ def transfer_garment(
         skin_weights=rested.skin_weights,
         skin_indices=rested.skin_indices,
         sewn_positions=carried.sewn,
-        metadata=garment.metadata | {"transfer": carried.report},
+        metadata=garment.metadata | wearer_entry(target) | {"transfer": carried.report},
     )
 
 
@@ -96,9 +97,9 @@ def carry_shape(
 ) -> Carried:
     """Carry a garment's shape from a posed body to another body in the same pose.
 
-    A spline through the joints and the crotch leads from one body to the other. Then the cloth moves along the
-    skin's normals until its distance from the skin is what it was, in proportion to the bodies; loose cloth
-    follows the cloth around it.
+    A spline through the joints and the crotch maps space from one body to the other. Then the cloth moves along
+    the skin's normals until its distance from the skin is the old one, scaled by the ratio of the bodies' sizes.
+    Loose cloth follows the cloth around it.
 
     Args:
         mesh: Garment vertices on the source [m], and triangles.

@@ -30,9 +30,9 @@ def find_crossings(
     """Return the pairs of faces that intersect, and how deep vertices are behind the layer that they passed.
 
     Two faces intersect where an edge of one pierces the other; faces that share a vertex touch and don't count.
-    The edges that pierce surround the cloth that is on the wrong side: without them it hangs on nothing. It is as
-    deep as it is far from all other cloth, so what lies on a third layer counts as less deep than it is. Where a
-    crossing begins at a crease, as at an armpit, nothing is cut off, and no depth is told.
+    The edges that pierce surround the cloth on the wrong side: without them it is a separate region. The depth of
+    its vertices is their distance from all other cloth, which is too small where a third layer lies nearby. An
+    intersection that begins at a crease, as at an armpit, separates no region, so no depth is known.
 
     Source: the regions of Baraff, Witkin and Kass 2003, doi 10.1145/1201775.882357, section 4.
 

@@ -145,7 +145,7 @@ def _padding_values(leaves: dict[str, np.ndarray], bucket: Bucket) -> dict[str, 
             "is_pinned": False,
         },
         "faces": {"faces": last, "rest_areas": 0, "inverse_rest_frames": np.eye(2)},
-        "hinges": {"hinges": last, "hinge_rest_areas": 0, "hinge_rest_angles": 0},
+        "hinges": {"hinges": last, "hinge_rest_areas": 0, "hinge_rest_lengths": 0},
         "edges": {"senders": last, "receivers": last, "edge_mask": False},
     }
 

@@ -1,11 +1,10 @@
 """Curvatures of a sheet's faces from the angles of its hinges, for bending in newton metres.
 
-A hinge's angle is shared out between its two faces: each turns by a part of it between its middle and the
-common edge. The turns at a face's three edges make up its curvature, sum of turn times edge length over area
-along the edges' normals (the element of Morley). How an angle is to be shared follows from the curvature
-around, which three angles of a face tell: a sheet bent to a cylinder, in whatever direction, then has the
-energy of a cylinder, on any mesh. At a free edge the turn is the one of least energy, which is the natural
-condition there.
+The angle of a hinge is divided between its two faces: each face turns by its share, from its middle to the common
+edge. The turns at the three edges of a face give its curvature, the sum of turn times edge length over area along
+the edges' normals (the element of Morley). The shares follow from the curvature around the hinge, which the three
+angles of a face determine. So a sheet bent to a cylinder has the energy of a cylinder, in any direction and on
+any mesh. The turn at a free edge is that of least energy, which is the natural boundary condition.
 
 Sources: Morley 1968, doi 10.1017/S0001925900004546 (the element); Grinspun et al. 2006,
 doi 10.1111/j.1467-8659.2006.00974.x (curvature of faces from the rotation of their edges).
@@ -161,8 +160,9 @@ def _shares(
 ) -> tuple[Int[np.ndarray, "faces 9"], Float[np.ndarray, "faces 3 9"]]:
     """Return the nine hinges around every face, -1 where there is none, and each edge's turn by their angles.
 
-    The first three are the face's own; a neighbour adds its other two. To first order the turns at a hinge go
-    with the heights of its faces. The rest follows from the curvature there, the mean of both faces by area.
+    The first three hinges are the face's own; each neighbour adds its other two. To first order, the turns at a
+    hinge are in proportion to the heights of its faces. The rest follows from the curvature at the hinge, the
+    mean of both faces weighted by area.
     """
     is_hinge = sides.hinge >= 0
     num_faces = len(areas)

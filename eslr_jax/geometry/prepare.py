@@ -86,7 +86,7 @@ def prepare_garment(
         inverse_rest_frames=topology.inverse_rest_frames(sewn, faces),
         hinges=hinges,
         hinge_rest_areas=areas[hinge_faces].sum(axis=1),
-        hinge_rest_angles=topology.hinge_angles(sewn, hinges),
+        hinge_rest_lengths=np.linalg.norm(sewn[hinges[:, 1]] - sewn[hinges[:, 0]], axis=1),
         vertex_areas=topology.vertex_areas(areas, faces, num_vertices),
         senders=senders,
         receivers=receivers,
@@ -130,12 +130,17 @@ def to_device(garment: Garment) -> Garment:
 
 
 def _check_rows(name: str, num_vertices: int, skin_weights: np.ndarray, skin_indices: np.ndarray) -> None:
-    """Raise on skin weights that do not fit the mesh, or whose rows can't be normalised."""
+    """Raise on skin weights that do not fit the mesh, name no joint, or whose rows can't be normalised."""
     fits = skin_weights.ndim == 2 and len(skin_weights) == num_vertices
     if not fits or skin_weights.shape != skin_indices.shape:
         raise MeshError(
             f"{name}: skin weights {skin_weights.shape} and indices {skin_indices.shape} do not fit "
             f"{num_vertices} vertices; give one row per vertex, or use transfer_skin_weights"
+        )
+    if (skin_indices < 0).any():
+        vertex = int(np.argmax((skin_indices < 0).any(axis=1)))
+        raise MeshError(
+            f"{name}: skin indices of vertex {vertex} are {skin_indices[vertex]}; joints are counted from 0"
         )
     sums = skin_weights.sum(axis=1)
     is_bad = ~(np.isfinite(sums) & (sums > 0)) | np.any(skin_weights < 0, axis=1)

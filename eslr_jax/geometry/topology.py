@@ -187,24 +187,6 @@ def inverse_rest_frames(
     return inverse
 
 
-def hinge_angles(
-    positions: Float[np.ndarray, "vertices 3"], hinges: Int[np.ndarray, "hinges 4"]
-) -> Float[np.ndarray, " hinges"]:
-    """Return the signed dihedral angle of every hinge [rad]; zero is flat, a convex ridge is positive.
-
-    theta = atan2(e . (n_a x n_b), n_a . n_b), e the unit edge i -> j, n_a and n_b the unit normals of the
-    left and right face.
-
-    Source: HOOD, `bending_energy.py`.
-    """
-    start, end, left, right = (positions[hinges[:, k]] for k in range(4))
-    edge = normalize(end - start)
-    normal_left = normalize(np.cross(end - start, left - start))
-    normal_right = normalize(np.cross(start - end, right - end))
-    sine = np.sum(edge * np.cross(normal_left, normal_right), axis=1)
-    return np.arctan2(sine, np.sum(normal_left * normal_right, axis=1))
-
-
 def vertex_components(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> tuple[int, np.ndarray]:
     """Return the number of connected components, and the component of every vertex, shape [vertices]."""
     starts, ends, _ = half_edges(faces)

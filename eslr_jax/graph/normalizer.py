@@ -87,9 +87,14 @@ def is_warming_up(statistics: Mapping[str, Normalizer]) -> Bool[Array, ""]:
 
 
 def standard_deviation(normalizer: Normalizer) -> Float[Array, " features"]:
-    """Return the population standard deviation, at least `MIN_DEVIATION`; one if no rows were seen."""
-    variance = normalizer.squared_deviations / jnp.maximum(normalizer.count, 1)
-    return jnp.where(normalizer.count > 0, jnp.maximum(jnp.sqrt(variance), MIN_DEVIATION), 1)
+    """Return the population standard deviation, at least `MIN_DEVIATION`; one for a feature that never changed.
+
+    A network that was trained with one timestep has seen a constant there. Divided by HOOD's floor, another
+    timestep would come out as a million deviations.
+    """
+    spread = normalizer.squared_deviations
+    deviation = jnp.sqrt(spread / jnp.maximum(normalizer.count, 1))
+    return jnp.where(spread > 0, jnp.maximum(deviation, MIN_DEVIATION), 1)
 
 
 def normalize(normalizer: Normalizer, rows: Float[Array, "rows features"]) -> Float[Array, "rows features"]:

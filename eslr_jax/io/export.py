@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
@@ -41,7 +42,8 @@ def export_trajectory(
         run: The trajectory, from `read_trajectory`.
         path: Path of the file; of a new folder for `obj` and `ply`, which are one file per frame.
         garment: The garment that was simulated. It tells the vertex order of the garment's own file, so that a
-            point cache lies on that file, and its texture coordinates.
+            point cache lies on that file, and its texture coordinates. A vertex that the fit dropped is laid on
+            the next one of the file, and a warning tells of it where a point cache shows it.
         format: Format of the file; by default what the suffix of `path` says.
         content: What to write; by default both meshes to glb and usd, and the garment to all others.
 
@@ -64,6 +66,8 @@ def export_trajectory(
     if not meshes:
         raise AssetError("this run has no body; export the garment")
     check_meshes(meshes, run.timestep)
+    if chosen in ("pc2", "mdd") and content == "garment" and garment is not None:
+        _warn_of_dropped(garment)
     if chosen in ("usd", "usda", "usdc"):
         if path.suffix.lower() != f".{chosen}":
             raise AssetError(f"{path}: USD goes by the name of its file; name it .{chosen}")
@@ -101,10 +105,13 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
         if not np.array_equal(garment.faces, faces):
             raise AssetError("the garment file is not the one of this run; simulate again")
         uvs, order = garment.corner_uvs, garment.vertex_map
-        if order is not None and len(order) and order.min() >= 0 and order.max() < len(places):
+        if order is not None and order.max(initial=-1) < len(places):
             first = first_rows(order, len(places))
             if (first[faces] >= 0).all():
-                places, faces = order, first[faces]
+                # Dropped vertices have no faces that are left: the next one will do, and the count is the file's.
+                kept = np.flatnonzero(order >= 0)
+                following = np.searchsorted(kept, np.arange(len(order)))
+                places, faces = order[kept[np.minimum(following, len(kept) - 1)]], first[faces]
     name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"
     cloth = AnimatedMesh(
         name, run.positions[:, places], faces, corner_uvs=uvs, velocities=run.velocities[:, places]
@@ -120,6 +127,17 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
         skin=run.body.skin,
     )
     return {"garment": cloth, "body": body}
+
+
+def _warn_of_dropped(garment: GarmentFile) -> None:
+    """Warn if a point cache has places for vertices that are not simulated."""
+    order = np.array([], int) if garment.vertex_map is None else garment.vertex_map
+    if (count := int(np.sum(order < 0))) > 0:
+        warnings.warn(
+            f"{count} of the {len(order)} vertices of the garment's file were dropped by the fit; the cache "
+            "keeps the order of the file, and lays each of them on the next vertex that was kept",
+            stacklevel=3,
+        )
 
 
 def _garments(cloth: AnimatedMesh, outfit: dict[str, int]) -> list[AnimatedMesh]:

@@ -33,6 +33,7 @@ STAGES = (
     ("coarse_edge0", "mesh_edge"),
 )
 NUM_COARSE = 3  # coarse levels
+_MIN_DEVIATION = 1e-8  # by which HOOD divides a feature that never changed
 _NORMALIZERS = {"garment": "node", "mesh": "mesh_edge", "world": "world_edge", "output": "output"}
 _CORE = "_learned_model."
 
@@ -152,10 +153,11 @@ def _normalizer(tensors: Tensors, name: str) -> Normalizer:
         for part in ("_acc_sum", "_acc_sum_squared")
     )
     mean = total / max(count, 1.0)
+    least = count * _MIN_DEVIATION**2
     return Normalizer(
         count=np.float32(count),  # type: ignore[arg-type]
         mean=mean.astype(np.float32),  # type: ignore[arg-type]
-        squared_deviations=np.maximum(squares - count * mean**2, 0.0).astype(np.float32),  # type: ignore[arg-type]
+        squared_deviations=np.maximum(squares - count * mean**2, least).astype(np.float32),  # type: ignore[arg-type]
         num_updates=np.int32(_tensor(tensors, f"{name}._num_accumulations")[0]),  # type: ignore[arg-type]
     )
 

@@ -20,6 +20,8 @@ from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.types import Body, BodyMotion, Scene
 
+_LABELS = ("garment", "motion", "motion_start_s")  # of the report, which the trajectory has as well
+
 
 @dataclasses.dataclass(frozen=True)
 class Run:
@@ -68,7 +70,7 @@ def write_run(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
         faces=np.asarray(scene.garment.faces),
-        metadata={name: report[name] for name in ("garment", "motion") if name in report},
+        metadata={name: report[name] for name in _LABELS if name in report},
         timestep=float(poses.timestep),
         body=_body_track(scene, rig, poses),
         friction_loads=np.asarray(track.friction_loads),
@@ -80,7 +82,7 @@ def write_run(
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
-    """Return what a report says of its scene, and `evaluation.run_scene` makes the scene of again."""
+    """Return the part of a report that describes its scene, from which `evaluation.run_scene` rebuilds it."""
     return {
         "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
         "integrator": "euler" if scene.initial_state.past is None else "bdf2",

@@ -23,7 +23,7 @@ _FIELDS = {
     "iterations": ("iu", "frames"),
 }
 _PAIRS = "pair_demand"
-_LAYOUT = _FIELDS | dict.fromkeys(_TERMS.values(), ("f", "frames")) | {_PAIRS: ("iu", "frames 2")}
+_LAYOUT = _FIELDS | dict.fromkeys(_TERMS.values(), ("f", "frames")) | {_PAIRS: ("iu", "frames")}
 _REMEDY = "start without --resume in another folder"
 
 

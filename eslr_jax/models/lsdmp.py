@@ -6,11 +6,11 @@ vertex i.
 
 The paper leaves open what follows; the choices are those of MeshGraphNet and HOOD. f_e, f_v and f'_v give
 increments, for edges and vertices alike. N(i) of eq. 3 includes the body point of i's world edge, and every
-smoothing adds e_ij again. One default differs from HOOD, which updates its body vertices: garment vertices
-near the same one hear of each other through it. Here every world edge has a body row of its own, which
-could only return a vertex's own message. So body rows keep their encoding, and a layer costs a quarter
-less. `ModelConfig.update_body` restores HOOD's way, with the same number of weights: both directions share
-f_e, garment and body share f_v and f'_v.
+smoothing adds e_ij again. One default differs from HOOD. HOOD updates its body vertices, and garment vertices
+near the same body vertex exchange messages through it. Here every world edge has a body row of its own, which
+could only return its garment vertex's own message. So body rows keep their encoding, and a layer costs a
+quarter less. `ModelConfig.update_body` restores HOOD's update, with the same number of weights: both directions
+share f_e, garment and body share f_v and f'_v.
 
 Source: paper, eqs. 1-4.
 """

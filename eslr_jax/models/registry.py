@@ -61,8 +61,9 @@ def _without_attention(config: ModelConfig) -> ModelConfig:
 SMOOTH = dataclasses.replace(
     _without_attention(SMALL), edge_latents=False, smoothing_steps=2, output="descent", refinement_steps=1
 )
-# The paper's network for 1k vertices, which are 21 hops across where its garments have some 60: layers are to
-# hops, and widths to layers, as there. One application a frame, HOOD's features, an acceleration.
+# The paper's network scaled to 1k vertices. Garments are 21 hops across at 1k, and some 60 in the paper. The
+# ratio of layers to hops, and that of width to layers, are the paper's. One application a frame, HOOD's
+# features, an acceleration.
 SHALLOW = dataclasses.replace(
     PAPER,
     message_passing_steps=5,

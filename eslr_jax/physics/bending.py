@@ -1,10 +1,10 @@
 """Bending: dihedral angles at interior edges.
 
-A material says how stiff it is in one of two ways. `bending_stiffness` k [J] is HOOD's number: every hinge
-has its own energy, and what a sheet feels depends on its mesh. Equilateral triangles have the flexural
-rigidity D = k / 4 [N m], and so has a grid bent across its rows; bent across its diagonals a grid has up to 3
-k / 4. As a cantilever a grid measures .82 of k / 4, and irregular triangles of 20 to 5 mm .88 to 1.09 of it.
-A `plate` has the rigidity that it says on any mesh, see `geometry.plate`.
+A material gives its bending in one of two ways. `bending_stiffness` k [J] is HOOD's: every hinge has an energy of
+its own, and the flexural rigidity D [N m] of a sheet depends on its mesh. D is k / 4 for equilateral triangles,
+and for a grid that is bent across its rows; for a grid that is bent across its diagonals it is up to 3 k / 4.
+Measured on a cantilever, D is .82 times k / 4 for a grid, and .88 to 1.09 times k / 4 for irregular triangles
+of 20 to 5 mm. A `plate` has the same, given flexural rigidity on any mesh, see `geometry.plate`.
 """
 
 from __future__ import annotations
@@ -103,7 +103,6 @@ def bending_energy(
     garment: Garment,
     material: Material,
     *,
-    use_rest_angles: bool = False,
     use_current_length: bool = False,
 ) -> Float[Array, ""]:
     """Return the bending energy [J] at positions [m], shape [vertices, 3]: of the plate, or of `hinge_energies`.
@@ -111,15 +110,11 @@ def bending_energy(
     With the current length it is HOOD's own energy, which knows no plate.
     """
     if material.plate is not None and not use_current_length:
-        angle, _ = dihedral_angles(position, garment)
-        return angle_energy(
-            angle - garment.hinge_rest_angles if use_rest_angles else angle, garment, material
-        )
+        return angle_energy(dihedral_angles(position, garment)[0], garment, material)
     energies = hinge_energies(
         _hinge_corners(position, garment),
         garment,
         material,
-        use_rest_angles=use_rest_angles,
         use_current_length=use_current_length,
     )
     return jnp.sum(energies)
@@ -130,28 +125,23 @@ def hinge_energies(
     garment: Garment,
     material: Material,
     *,
-    use_rest_angles: bool = False,
     use_current_length: bool = False,
 ) -> Float[Array, " hinges"]:
     """Return the bending energy of every hinge [J].
 
-    E_h = k_b l^2 / (4 (A_a + A_b)) (theta - theta_rest)^2 / 2.
+    E_h = k_b l^2 / (4 (A_a + A_b)) theta^2 / 2: fabric is flat at rest.
 
     Args:
         corners: Positions of the hinges' corners [m], of `gather_corners`.
-        garment: Hinges with the sum of their rest areas, and rest angles.
+        garment: Hinges with their rest lengths and the sum of their rest areas.
         material: Bending stiffness k_b [J].
-        use_rest_angles: Bend around the rest mesh's own angles; fabric is flat, so off by default.
         use_current_length: Take l from the corners, as HOOD does, instead of from the rest mesh.
 
     Source: HOOD (arXiv 2212.07242); Grinspun et al. 2003, doi 10.2312/SCA03/062-067.
     """
     angle, squared_length = _angles(corners)
-    if use_rest_angles:
-        angle = angle - garment.hinge_rest_angles
-    return (
-        hinge_stiffnesses(garment, material, squared_length if use_current_length else None) * angle * angle
-    )
+    stiffness = hinge_stiffnesses(garment, material, squared_length if use_current_length else None)
+    return stiffness * angle * angle
 
 
 def angle_energy(angle: Float[Array, " hinges"], garment: Garment, material: Material) -> Float[Array, ""]:
@@ -188,20 +178,14 @@ def hinge_stiffnesses(
     """Return the energy of every hinge [J] by its squared angle; zero where padded.
 
     Args:
-        garment: Hinges with the sum of their rest areas.
+        garment: Hinges with their rest lengths and the sum of their rest areas.
         material: Bending stiffness [J].
-        squared_length: Of the hinges' edges [m^2]; those of the rest mesh if None.
+        squared_length: Of the hinges' edges [m^2]; those at rest if None.
     """
     if squared_length is None:
-        squared_length = rest_squared_lengths(garment)
+        squared_length = jnp.square(garment.hinge_rest_lengths)
     areas = garment.hinge_rest_areas
     is_real = areas > 0
     scale = jnp.where(is_real, squared_length / (4.0 * jnp.where(is_real, areas, 1.0)), 0.0)
     (stiffness,) = in_memory(0.5 * material.bending_stiffness * scale)
     return stiffness
-
-
-def rest_squared_lengths(garment: Garment) -> Float[Array, " hinges"]:
-    """Return the squared rest length of every hinge's edge [m^2]."""
-    edge = garment.rest_positions[garment.hinges[:, 1]] - garment.rest_positions[garment.hinges[:, 0]]
-    return jnp.sum(edge * edge, axis=-1)

@@ -28,9 +28,9 @@ class InitialGuess(NamedTuple):
 def initial_guess(problem: FrameProblem) -> InitialGuess:
     """Return the lower of two guesses, with collapsed faces opened a little.
 
-    The inertial guess suits cloth that rests or hangs. The ballistic guess suits cloth that falls: there it is
-    the optimum, which L-BFGS misses by millimetres a second, since its first steps bend what only has to move.
-    The potential decides.
+    The inertial guess suits cloth that rests or hangs. The ballistic guess, free fall, suits cloth that falls,
+    and is its optimum. From the inertial guess L-BFGS misses this optimum by millimetres a second, since its
+    first steps bend cloth that only has to move. The guess with the lower potential is taken.
     """
     fall = problem.constants.gravity * jnp.square(problem.inertial_timestep)
     down = jnp.array([[0.0, 1.0, 0.0]], problem.position.dtype) * fall
@@ -52,8 +52,8 @@ def spread_collapsed(
 ) -> Float[Array, "vertices 3"]:
     """Return positions [m], shape [vertices, 3], with vertices of collapsed faces moved by a micrometre.
 
-    The angle at a hinge without area is zero by convention, and jumps as soon as it has any. From cloth pressed
-    flat onto a line every step is uphill, and a line search would stay there for ever.
+    The angle at a hinge without area is zero by convention, and jumps as soon as the hinge has an area. So every
+    step from cloth that is collapsed onto a line goes uphill, and a line search never leaves that state.
     """
     garment = problem.garment
     corners = position[garment.faces]

@@ -193,11 +193,10 @@ def _sparse_rows(values: np.ndarray, columns: np.ndarray, width: int) -> scipy.s
 
 def bending_stiffnesses(garment: Garment, material: Material) -> Float[np.ndarray, " hinges"]:
     """Return k_b l^2 / (4 (A_a + A_b)) per hinge with rest lengths [J]; zero where padded."""
-    rest = np.asarray(garment.rest_positions, np.float64)
-    edge = rest[garment.hinges[:, 1]] - rest[garment.hinges[:, 0]]
+    length = np.asarray(garment.hinge_rest_lengths, np.float64)
     areas = np.asarray(garment.hinge_rest_areas, np.float64)
     is_real = areas > 0
-    scale = np.where(is_real, np.sum(edge**2, axis=1) / (4.0 * np.where(is_real, areas, 1.0)), 0.0)
+    scale = np.where(is_real, length**2 / (4.0 * np.where(is_real, areas, 1.0)), 0.0)
     return np.asarray(material.bending_stiffness, np.float64) * scale
 
 
@@ -313,9 +312,9 @@ def pair_table(pairs: Pairs | None, num_corners: int) -> Int[np.ndarray, "pairs 
 def _turning_height(
     offset: np.ndarray, first: np.ndarray, second: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return heights along the normal across two edges [m], it, and what the edges' turning adds to the height.
+    """Return heights along the common normal of two edges [m], the normal, and derivatives by both edges.
 
-    That is by each of the edges: what of the offset lies within the plane of both.
+    The derivatives are those of the height through the normal; the offset is held constant.
     """
     normal = np.cross(first, second)
     size = np.linalg.norm(normal, axis=1)[:, None]

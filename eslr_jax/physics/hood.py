@@ -1,7 +1,7 @@
 """Energy set `hood`: HOOD's published losses with every quirk, so that its tables can be compared.
 
-What differs from set `consistent` is listed side by side in `physics.potential`. Three readings of the same
-six terms exist in HOOD's code, and differ in which frame of the body they look at:
+`physics.potential` lists the differences from set `consistent` side by side. HOOD's code has three variants of
+the same six terms, which use different frames of the body:
 
 | criterion    | collision: nearest centroid | collision: planes | friction: body motion | weight, eps |
 |--------------|-----------------------------|-------------------|-----------------------|-------------|
@@ -158,9 +158,9 @@ def hood_friction_energy(
 ) -> Float[Array, ""]:
     """Return mu g sum_v m_v s_v |Delta_T| [J] over the vertices near the body.
 
-    Delta is the cloth's motion minus that of the body face nearest to it at first. Delta_T is its part across
-    the mean of that face's normal and the one nearest at last (not normalised again), and
-    s = sqrt(|1 - cos^2(Delta_T, z)| + 1e-4).
+    Delta is the cloth's motion minus that of the body face that is nearest before the motion. Delta_T is Delta
+    without its part along the mean of two normals (not normalised again), that of this face and that of the face
+    that is nearest after the motion, and s = sqrt(|1 - cos^2(Delta_T, z)| + 1e-4).
 
     Args:
         position: Predicted vertices [m], shape [vertices, 3].

@@ -16,8 +16,8 @@ from eslr_jax.physics.preconditioner import Stiffness, stiffness_inverse
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
-# With 2, 98.8 % of 342 frames kept 1 % (experiments/speed.md); 2.5 takes 2 of 42 iterations more.
-_CAUTION = 2.5  # times the decrement is taken for the gap
+# With 2, 98.8 % of 342 frames kept 1 % (experiments/speed.md); 2.5 takes 43 instead of 40 iterations.
+_CAUTION = 2.5  # the gap's share of the gain is taken as sqrt(_CAUTION * d), see `Stop.tolerance`
 
 
 class Minimum(NamedTuple):
@@ -34,10 +34,10 @@ class Stop(NamedTuple):
     """When a minimisation ends."""
 
     iterations: int | Int[Array, ""]  # upper bound
-    # Share of what was gained since `reference`, below which the gap shall fall. Half the Newton decrement,
-    # g . H^-1 g / 2 with the recursion's own H^-1, leaves out soft directions, more of them near the minimum.
-    # Where it is a share d of the gain, the gap is a share of at most sqrt(2.5 d) in 99 % of the frames
-    # (`_CAUTION`; experiments/speed.md).
+    # Stop where the estimated gap is below this share of the gain, the fall of the energy from `reference`. Half
+    # the Newton decrement, g . H^-1 g / 2 with the recursion's own H^-1, misses soft directions, and more of them
+    # near the minimum. Where it is a share d of the gain, the gap is a share of at most sqrt(2.5 d) in 99 % of
+    # the frames (`_CAUTION`; experiments/speed.md).
     tolerance: Float[Array, ""] | float = 0.0
     reference: Float[Array, ""] | float = 0.0  # energy [J] from which the gain counts
 
@@ -102,8 +102,8 @@ def minimize(
 ) -> Minimum:
     """Minimise `function` from `start` by L-BFGS.
 
-    The loop's first pass goes to the start and counts as no iteration, so that the energy, most of a frame's
-    program, is compiled once.
+    The first pass of the loop evaluates the start, and does not count as an iteration. So the energy, which is
+    most of a frame's program, is compiled only once.
 
     Args:
         function: Differentiable energy [J] of positions [m], shape [vertices, 3].
@@ -142,8 +142,8 @@ def minimize(
         direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
         slope = product(direction, state.gradient)
         x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
-        # Where no step along the direction leads down, the history is dropped and tried without. A direction
-        # that rounding has turned uphill tells nothing of the gap.
+        # If no step along the direction lowers the energy, the next iteration goes without the history. The
+        # decrement of a direction that rounding has turned uphill tells nothing about the gap.
         kept = state._replace(is_kept=state.is_kept & is_lower)
         moved = _advance(kept, Point(x, value, gradient), inverse)
         return moved._replace(

@@ -165,8 +165,9 @@ def _excess(material: Material) -> Float[Array, ""]:
 def constants_for(material: Material) -> PhysicsConstants:
     """Return the physical constants of a scene of this fabric.
 
-    A sheet under tension presses on what it is bent over. How deep it sinks in is to depend on its strain alone:
-    contacts with a fabric beyond HOOD's ranges are stiffer by as much as the fabric is, by its stiffest face.
+    A sheet under tension presses on what it is bent over. The depth to which it sinks in shall depend on its
+    strain alone. So if the stiffest face of a fabric is stiffer than HOOD's ranges, contacts are stiffer by
+    that factor.
     """
     excess = _excess(material)
     usual = PhysicsConstants()

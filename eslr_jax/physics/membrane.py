@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import Vector3, dot3, gather_corners, in_memory, sub3
+from eslr_jax.numerics import Vector3, dot3, gather_corners, in_memory, safe_norm, safe_sqrt, sub3
 from eslr_jax.types import Garment, Material, Threads
 
 STIFFENING = 0.01  # strain beyond a thread's limit at which it is twice as stiff
@@ -123,5 +123,6 @@ def principal_stretches(
     first, second = deformation_gradient(corners, garment)
     c00, c11, c01 = dot3(first, first), dot3(second, second), dot3(first, second)
     mean = 0.5 * (c00 + c11)
-    radius = jnp.sqrt(jnp.maximum((0.5 * (c00 - c11)) ** 2 + c01 * c01, 0.0))
-    return jnp.sqrt(mean + radius), jnp.sqrt(jnp.maximum(mean - radius, 0.0))
+    # Equal stretches, as at rest, and a collapsed face are roots of zero, where a plain root has no slope.
+    radius = safe_norm(jnp.stack([0.5 * (c00 - c11), c01], axis=-1))
+    return safe_sqrt(mean + radius), safe_sqrt(mean - radius)

@@ -1,4 +1,4 @@
-"""The incremental potential: the sum of the energies whose minimum is one step of implicit Euler.
+"""The incremental potential: the sum of the energies whose minimum is one step of the integrator.
 
 This is energy set `consistent`, which simulates and trains. Set `hood` (`physics.hood`) reproduces HOOD's
 published losses for its tables. Side by side, from x_t to x_{t+1}:
@@ -158,7 +158,9 @@ def evaluate(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Poi
 
 
 def contact_load(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
-    """Return the normal force of the body on every vertex [N]; it loads the next frame's friction.
+    """Return the normal force of the nearest body point on every vertex [N]; it loads the next frame's friction.
+
+    The force of an opposing body part loads none: between two limbs the nearer one alone rubs.
 
     Args:
         position: Positions at t + 1 [m], shape [vertices, 3].

@@ -16,7 +16,7 @@ from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import repulsion_diagonal
 from eslr_jax.types import Garment, Material
 
-_TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/solver_convergence.py)
+_TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/tried.md)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms
 # Share of its stiffness at rest that a spring keeps where its edge has collapsed, to under a third of its length.
 # Without it, the energy of cloth that starts flat on a line rises by 0.5 % of its drop (hard case `bad_start`).
@@ -129,9 +129,9 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
 def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
 
-    A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal holds the
-    sum of a vertex's springs and no more: with a larger share long waves converge slowly (experiments/tried.md).
-    Networks take `stiffness`, which they were trained with.
+    A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal changes by
+    the sum of the changes of a vertex's springs, and no more: with a larger diagonal long waves converge slowly
+    (experiments/tried.md). Networks take `stiffness`, which they were trained with.
 
     Args:
         problem: The frame's problem.

@@ -1,8 +1,8 @@
 """Repulsion: a one-sided barrier between layers of cloth, or between cloth and tips of the body.
 
-It is cubic, and between layers linear once they have passed through each other. Two limbs that cross force the
-layers between them through each other, and nothing can keep these apart: a force that grows without bound tore
-the cloth, with 100,000 times its weight.
+It is cubic, but between layers linear once they have passed through each other. Two limbs that intersect force
+the layers between them through each other, and no force can keep these layers apart. A force without a bound
+grew to 100,000 times the weight of the cloth, and tore it.
 
 Layers are vertices over faces and edges over edges (`LayerPairs`). Tips are vertices of the body over faces of
 the cloth (`TipPairs`); they don't give way.
@@ -26,11 +26,11 @@ def pair_heights(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: Pairs,
 ) -> tuple[Float[Array, " pairs"], Vector3]:
-    """Return how high the first place of every pair is on the side it is kept on [m], and that direction.
+    """Return the height d of every pair's first place over its second one [m], and the direction of that height.
 
-    d = side (x_p + sum_k w_k x_k) . n, with a tip x_p and the face's unit normal n at `position`; of layers see
-    `layer_heights`. So the energy of d turns with the cloth. The forces between layers have no resultant and no
-    moment. Unused rows give zero.
+    For a tip x_p, d = side (x_p + sum_k w_k x_k) . n with the face's unit normal n at `position`; for layers see
+    `layer_heights`. An energy of d does not change when the cloth turns, so the forces between layers have no
+    resultant and no moment. Unused rows give zero.
     """
     x = components(position)
     if isinstance(pairs, LayerPairs):
@@ -106,10 +106,10 @@ def push_apart(
     pairs: Pairs,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
 ) -> Float[Array, "vertices 3"]:
-    """Move the sides of every overlapping pair apart, a few times: both by half, or the cloth by all of it.
+    """Move overlapping pairs apart, a few times: layers by half the overlap each, cloth off a tip by all of it.
 
-    Like pushing out of the body, it is a better start than the barrier's own slow first iterations. A vertex
-    of several pairs moves by the mean of what they ask for.
+    Like pushing cloth out of the body, this saves the slow first iterations that the barrier would take. A vertex
+    of several pairs moves by the mean of their moves.
     """
     num_vertices = position.shape[0]
     share = 0.5 if isinstance(pairs, LayerPairs) else 1.0

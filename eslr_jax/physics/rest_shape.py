@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import safe_norm, scatter_corners
-from eslr_jax.physics.bending import dihedral_angles
 from eslr_jax.types import Garment
 
 
@@ -26,6 +25,7 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
     areas = jnp.where(is_real, _areas(rest_positions, garment.faces), 0.0)
     left, right = garment.hinges[:, [0, 1, 2]], garment.hinges[:, [1, 0, 3]]
     hinge_areas = _areas(rest_positions, left) + _areas(rest_positions, right)
+    hinge_edges = rest_positions[garment.hinges[:, 1]] - rest_positions[garment.hinges[:, 0]]
     thirds = jnp.broadcast_to((areas / 3.0)[:, None], garment.faces.shape)
     return garment.replace(
         rest_positions=rest_positions,
@@ -34,7 +34,7 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
             is_real[:, None, None], _inverse_rest_frames(rest_positions, garment), garment.inverse_rest_frames
         ),
         hinge_rest_areas=jnp.where(garment.hinge_rest_areas > 0, hinge_areas, 0.0),
-        hinge_rest_angles=dihedral_angles(rest_positions, garment)[0],
+        hinge_rest_lengths=jnp.where(garment.hinge_rest_areas > 0, safe_norm(hinge_edges), 0.0),
         vertex_areas=scatter_corners(thirds, garment.face_incidence),
         is_recut=True,
     )

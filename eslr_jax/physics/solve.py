@@ -2,8 +2,8 @@
 
 The minimum x* of the potential P(x, theta) is a function of everything the problem holds. Differentiating
 grad P(x*, theta) = 0 gives dx*/dtheta = -H^-1 d(grad P)/dtheta with the Hessian H = d^2 P / dx^2. So a derivative
-costs one linear system, whatever the solver did on its way, and the starting point drops out. It is exact at the
-minimum; where the solver stops early it is off in the order of the gradient that was left.
+costs one linear solve, however many iterations the solver took, and does not depend on the starting point. It is
+exact at the minimum. If the solver stops early, its error is of the order of the remaining gradient.
 
 Source: Griewank and Walther 2008, Evaluating Derivatives, section 15 (implicit functions).
 """

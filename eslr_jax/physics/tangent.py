@@ -29,7 +29,7 @@ _LEFT, _RIGHT = 2, 3  # the corners of a hinge that no edge joins
 
 
 class Tangent(NamedTuple):
-    """The Hessian of a frame's potential; vertices that don't move stand for themselves."""
+    """The Hessian of a frame's potential; for vertices that don't move it is the identity."""
 
     columns: Int[Array, "slots vertices"]  # vertex of every block in a vertex's row; its own comes first
     blocks: Float[Array, "slots 3 3 vertices"]  # [N/m]; zero where a slot is not used

@@ -13,6 +13,7 @@ from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
+from eslr_jax.physics.materials import constants_for
 from eslr_jax.types import (
     Air,
     BodyMotion,
@@ -36,7 +37,7 @@ class ScenePlan:
     """What a scene models, with which constants, and how large its buffers are."""
 
     surface: BodySurface | None  # body faces that are searched for contacts; None: no body
-    constants: PhysicsConstants = PhysicsConstants()
+    constants: PhysicsConstants | None = None  # None: those for the fabric, see `constants_for`
     has_pins: bool = struct.field(pytree_node=False, default=True)
     starts_at_rest: bool = struct.field(
         pytree_node=False, default=False
@@ -44,6 +45,7 @@ class ScenePlan:
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)  # None: layers cross
     pieces: Int[Array, " vertices"] | None = None  # of self-contact between different pieces only
     has_skin: bool = struct.field(pytree_node=False, default=False)  # faces of the cloth keep off the skin
+    has_tips: bool = struct.field(pytree_node=False, default=False)  # the body has tips finer than the cloth
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
     ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
     air: Air | None = None
@@ -66,7 +68,8 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     skinned = skin_garment(garment, poses.joint_transforms)
     position, body = skinned[0], None
     if plan.surface is not None:
-        body = SceneBody(plan.surface, poses.positions[:, plan.surface.vertex_ids], has_skin=plan.has_skin)
+        track = poses.positions[:, plan.surface.vertex_ids]
+        body = SceneBody(plan.surface, track, has_skin=plan.has_skin, has_tips=plan.has_tips)
         position = clear_of_body(position, body.positions[0], plan.surface, garment)
         if plan.has_skin:
             position = lift_off_skin(position, body.positions[0], plan.surface, garment)
@@ -78,7 +81,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     return Scene(
         garment=garment,
         material=material,
-        constants=plan.constants,
+        constants=plan.constants or constants_for(material),
         initial_state=start_integrator(initial_state(position, velocity), plan.integrator),
         timestep=poses.timestep,
         body=body,

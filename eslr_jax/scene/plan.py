@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +15,26 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.body.timing import check_length
 from eslr_jax.contact.self_contact import SEARCH_RADIUS, starting_capacity
+from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.fit.postures import SHOULDERS
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
-from eslr_jax.physics.materials import COTTON, constants_for
+from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air, validate_damping, validate_substeps
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
 from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
-# [m] that cloth strays from where it is skinned to, besides how loose it hangs; farther body faces are left out.
+# [m] that cloth may be away from its skinned place, besides its distance from the body at rest. Body faces that
+# are farther away are left out.
 REACH = 0.08
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 _FAR_AT_REST = (
     2.0 * SEARCH_RADIUS
 )  # [m] between places of one piece that may come close; nearer ones bend towards
 _SAMPLED_FRAMES = 12  # frames in which reachable faces, and pieces that meet, are looked for
+Ground = Literal["auto", "on", "off"]
 _build = jax.jit(build_scene)
 _skin = jax.jit(skin_garment)
 
@@ -44,12 +47,13 @@ class SceneOptions:
     has_body: bool = True
     start_at_rest: bool = False  # zero initial velocity instead of the body's
     self_contact: bool | None = None  # keep layers of cloth apart; None: where two pieces can meet
-    has_folds: bool = False  # None decides about one piece as well: whether it can meet itself
+    has_folds: bool = False  # self_contact None: keep a one-piece garment off itself, if it can meet itself
     has_skin: bool = False  # keep the faces of the cloth off the skin, besides its vertices off the body
+    has_tips: bool = False  # the body has tips finer than the cloth, as a needle has: faces keep off them
     integrator: Integrator = "euler"
     substeps: int = 1  # in which a frame is simulated
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
-    ground: Literal["auto", "on", "off"] = "auto"
+    ground: Ground = "auto"
     air: Air | None = None  # drag and wind; None: a vacuum
     damping: float | None = None  # of the fabric [s], see `physics.damping`; None: none
     # Terms of one's own: functions of positions [m], shape [vertices, 3], and the frame's `FrameProblem` to an
@@ -76,16 +80,20 @@ def plan_scene(
     Args:
         garment: A prepared garment.
         poses: The body in motion.
-        constants: Physical constants; a fabric stiffer than HOOD's wants `constants_for` it.
+        constants: Physical constants; by default those for the fabric, see `physics.materials.constants_for`.
         options: What to leave out or add.
         surface: Body faces to search instead of those in reach, so that several scenes share one compiled
             rollout; see `shared_surface`.
 
     Raises:
         MotionError: The motion has fewer than two frames.
+        MeshError: The garment hangs on joints that the body does not have.
+        ConfigError: An option has a value that it can't have.
     """
     options = options or SceneOptions()
+    _check_choices(options)
     check_length(poses)
+    _check_joints(garment, poses)
     skinned, looseness = np.empty(0), np.empty(0)
     piece, has_layers = piece_of_vertices(garment), options.self_contact
     num_pieces = int(piece.max()) + 1
@@ -112,12 +120,13 @@ def plan_scene(
         has_ground = _could_fall(garment, poses, piece) or _reaches_ground(garment, skinned, poses, radii)
     return ScenePlan(
         surface=surface,
-        constants=constants or PhysicsConstants(),
+        constants=constants,
         has_pins=bool(np.any(garment.is_pinned)),
         starts_at_rest=options.start_at_rest,
         self_contact=starting_capacity(len(piece), num_pieces) if has_layers else None,
         pieces=jnp.asarray(piece) if has_layers and is_undecided and num_pieces > 1 else None,
         has_skin=options.has_skin,
+        has_tips=options.has_tips,
         integrator=options.integrator,
         substeps=validate_substeps(options.substeps),
         ground=ground_height(poses) if has_ground else None,
@@ -153,8 +162,9 @@ def prepare_scene(
 
     Raises:
         MotionError: The motion has fewer than two frames.
+        MeshError: The garment hangs on joints that the body does not have.
+        ConfigError: An option has a value that it can't have.
     """
-    constants = constants or constants_for(material)
     plan = plan_scene(garment, poses, constants=constants, options=options, surface=surface)
     on_shapes(_build.eval_shape(garment, poses, material, plan))
     return _build(garment, poses, material, plan)
@@ -170,8 +180,9 @@ def prepare_scenes(
 ) -> list[Scene]:
     """Return scenes that can be stacked: padded to one bucket, over one part of the body.
 
-    What one of them needs, all of them model: pins, self-contact, a ground, and the body faces near any garment
-    at rest, whatever the motion. Other motions of the same garments then run the same compiled rollout.
+    All scenes model what one of them needs: pins, self-contact and a ground. All search the body faces near any
+    of the garments at rest, whatever the motion. So other motions of the same garments run the same compiled
+    rollout.
 
     Args:
         garments: Unpadded garments of like sizes.
@@ -182,15 +193,15 @@ def prepare_scenes(
 
     Raises:
         MotionError: A motion has fewer than two frames.
+        MeshError: A garment hangs on joints that its body does not have.
+        ConfigError: An option has a value that it can't have.
     """
     options = options or SceneOptions()
     padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
     surface = shared_surface(padded, poses[0]) if options.has_body else None
     plans = [
-        plan_scene(
-            garment, motion, constants=constants or constants_for(fabric), options=options, surface=surface
-        )
-        for garment, motion, fabric in zip(padded, poses, materials, strict=True)
+        plan_scene(garment, motion, constants=constants, options=options, surface=surface)
+        for garment, motion in zip(padded, poses, strict=True)
     ]
     has_pins = any(plan.has_pins for plan in plans)
     if any(plan.ground is not None for plan in plans):
@@ -201,21 +212,39 @@ def prepare_scenes(
     capacities = [plan.self_contact for plan in plans if plan.self_contact is not None]
     layers = max(capacities, key=lambda capacity: capacity.pairs, default=None)
     plans = [plan.replace(has_pins=has_pins, self_contact=layers) for plan in plans]
-    if layers is not None and not has_one_piece:
-        plans = [
-            plan.replace(pieces=jnp.asarray(piece_of_vertices(garment)))
-            for garment, plan in zip(padded, plans, strict=True)
-        ]
+    has_pieces = layers is not None and not has_one_piece
+    plans = [
+        plan.replace(pieces=jnp.asarray(piece_of_vertices(garment)) if has_pieces else None)
+        for garment, plan in zip(padded, plans, strict=True)
+    ]
     return [
         _build(garment, motion, material, plan)
         for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
     ]
 
 
+def _check_choices(options: SceneOptions) -> None:
+    """Refuse words that are none of an option's."""
+    for name, accepted in (("integrator", get_args(Integrator)), ("ground", get_args(Ground))):
+        if getattr(options, name) not in accepted:
+            raise ConfigError(f"{name} is {getattr(options, name)!r}; give one of {', '.join(accepted)}")
+
+
 def first_frames(scene: Scene, num_frames: int) -> Scene:
     """Return the first frames of a scene, at most all of them."""
     num_frames = min(num_frames, scene.num_frames)
     return slice_tracks(scene, slice(num_frames)).replace(num_frames=num_frames)
+
+
+def _check_joints(garment: Garment, poses: BodyMotion) -> None:
+    """Raise where a garment hangs on joints that the body does not have, whose weights would be lost."""
+    last, num_joints = int(np.max(garment.skin_indices)), poses.joint_transforms.shape[1]
+    if last >= num_joints:
+        raise MeshError(
+            f"the garment was fitted to another body: it hangs on joint {last}, and this body has {num_joints} "
+            "joints, counted from 0; give the mesh that it was fitted from, or carry that mesh to this body with "
+            "eslr fit --made-for"
+        )
 
 
 def ground_height(poses: BodyMotion) -> Float[Array, ""]:

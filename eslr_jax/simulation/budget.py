@@ -1,4 +1,4 @@
-"""What a device can do in how much time: the choice of a simulator for a budget or for a tolerance (host)."""
+"""Choose a simulator for a budget or a tolerance, by measurements of the device (host)."""
 
 from __future__ import annotations
 
@@ -177,18 +177,18 @@ def _within_tolerance(methods: list[Method], tolerance: float) -> Choice:
 
 
 def keep_budget(choice: Choice, budget_ms: float) -> Callable[[int, float], int]:
-    """Return how a rollout keeps a budget on this machine, garment and hour, for `simulate`.
+    """Return a `pace` for `simulate` that adapts the iterations, so that frames keep a budget.
 
-    The calibration knows how the cost of a frame divides; what the last frames took says how much slower or
-    faster all of it is.
+    The calibration divides the cost of a frame into a fixed part and a part per iteration. The time of the last
+    frames gives the factor by which both are slower or faster now.
 
     Args:
         choice: Of `choose`, for the budget.
         budget_ms: Milliseconds per frame.
 
     Returns:
-        From the iterations of the last frames and the milliseconds that one of them took, the iterations of the
-        next; where the budget is too small for cloth, it is missed.
+        A function of the iterations of the last frames, and of the milliseconds that one of them took. It returns
+        the iterations of the next frames, but never too few for intact cloth: a smaller budget is missed.
     """
     least = min(choice.iterations, _FEWEST)
 

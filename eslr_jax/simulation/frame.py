@@ -52,7 +52,7 @@ def frame_inputs(scene: Scene) -> FrameInput:
 
 
 def part_of_frame(state: ClothState, frame: FrameInput, row: Int[Array, ""], parts: int) -> FrameInput:
-    """Return what the outside world does during one of the equal parts of a frame; it moves straight.
+    """Return the motion of body and pins during one of the equal parts of a frame, by straight lines.
 
     Args:
         state: Cloth at t: its pinned vertices are where the pins are.
@@ -73,7 +73,7 @@ def part_of_frame(state: ClothState, frame: FrameInput, row: Int[Array, ""], par
 
 
 def without_tracks(scene: Scene) -> Scene:
-    """Return what of a scene stays constant: scenes of any length then share a compiled program."""
+    """Return a scene without what moves, so that scenes of any length share a compiled program."""
     nothing = jax.tree.map(jnp.zeros_like, scene.initial_state)
     return slice_tracks(scene, slice(0)).replace(initial_state=nothing, num_frames=0)
 
@@ -164,7 +164,7 @@ def _body_contact(
         # Between two limbs nobody sees skin, and rows of both would pull the cloth to both sides.
         pinched = are_pinched(nearest, opposing)
         skin = skin.replace(is_near=skin.is_near & ~jnp.any(pinched[skin.corners], axis=1))
-    if body.is_sharp:
+    if body.has_tips:
         tips = find_tip_contacts(
             problem.position, problem.inertial_guess, *step, body.surface.patch_vertices, garment
         )
@@ -181,9 +181,9 @@ def _body_contact(
 def _layers(problem: FrameProblem, pairs: LayerPairs) -> SelfContact:
     """Return the contact of a frame between layers of the cloth.
 
-    A vertex on the wrong side of a face is asked back by one thickness a frame. Asked back at once, from
-    centimetres deep, it tore the cloth: pairs beside each other that ask for opposite sides pull with thousands
-    of weights.
+    A vertex on the wrong side of a face is pushed back by one contact thickness a frame. Pushed back within one
+    frame, from centimetres deep, it tore the cloth: neighbouring pairs with opposite sides pulled with thousands
+    of times the weight.
     """
     thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
     height, _ = pair_heights(problem.position, pairs)

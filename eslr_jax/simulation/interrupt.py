@@ -1,4 +1,4 @@
-"""Ctrl-C after what is in work, where it can be kept (host)."""
+"""Stop on Ctrl-C after the work in progress, so that its results are kept (host)."""
 
 from __future__ import annotations
 

@@ -155,7 +155,10 @@ def _step(
 
 
 def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
-    """Return the vertex that a ray points at: of those within a centimetre more than the nearest, the first.
+    """Return the vertex that a ray points at.
+
+    It is the first vertex along the ray, among those that are at most a centimetre farther from the ray than the
+    nearest one.
 
     Args:
         positions: Vertices [m].

@@ -110,8 +110,8 @@ def scan_frames(
         stepper: Of `make_stepper`.
         scene: Its constant parts.
         state: Where to begin.
-        inputs: The outside world, along a leading axis; without body and pins one frame of a falling cloth is
-            like the next, and `scene.num_frames - 1` are simulated.
+        inputs: Motion of body and pins, along a leading axis of frames. Without body and pins it is empty, and
+            `scene.num_frames - 1` frames are simulated.
 
     Returns:
         The last state, and what every frame left behind.
@@ -158,7 +158,7 @@ def step_frame(
     return end, FrameReport(
         terms=jax.tree.map(lambda values: values[-1], reports.terms),
         residual=residual,
-        iterations=jnp.sum(reports.iterations, dtype=jnp.int32),
+        iterations=jnp.max(reports.iterations),
         gap_bound=jnp.max(reports.gap_bound),
         pair_demand=None if demand is None else jnp.max(demand),
     )
@@ -174,6 +174,7 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         return jnp.concatenate([jnp.zeros_like(values[:1]), values])
 
     reports = jax.tree.map(after_nothing, frames.reports)
+    is_good = end.first_bad_frame < 0
     return Trajectory(
         positions=with_start(start.position, frames.positions),
         velocities=with_start(start.velocity, frames.velocities),
@@ -183,5 +184,5 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         iterations=reports.iterations,
         pair_demand=reports.pair_demand,
         status=end.status,
-        first_bad_frame=end.first_bad_frame,
+        first_bad_frame=jnp.where(is_good, -1, end.first_bad_frame - start.frame),
     )

@@ -1,4 +1,4 @@
-"""The host's door: check, simulate in chunks, enlarge buffers, raise."""
+"""Simulate from the host: check the scene, simulate in chunks, enlarge buffers, raise errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SIZES = 4
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
 Pace = Callable[[int, float], int]
-"""From the iterations per frame and the milliseconds that a frame took to the iterations of the next chunk."""
+"""Function of iterations per frame and milliseconds that a frame took; returns the next chunk's iterations."""
 
 
 class Timing(NamedTuple):
@@ -76,11 +76,12 @@ def simulate(
         CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
         CapacityError: A buffer was too small and can't be enlarged.
-        MotionError: The body is too fast to follow.
+        MotionError: The body is too fast to follow, or the scene has fewer than two frames.
     """
     config = config or SimConfig()
     check_network(params, config)
     check_scene(scene)
+    done = None if done is None else good_frames(done)
     larger: Scene | None = scene
     while larger is not None:
         scene = larger
@@ -139,7 +140,8 @@ def _in_chunks(
             iterations = loop.pace(iterations, took * 1e3 / chunk)
         count = min(chunk, total - first)
         done.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], frames))
-        is_bad = int(end.status) != Status.OK and int(end.first_bad_frame) <= total
+        bad = int(end.first_bad_frame) - int(scene.initial_state.frame)
+        is_bad = int(end.status) != Status.OK and bad <= total
         if count == chunk or is_bad:
             state = end
         loop.on_frames(first + count, total)
@@ -154,6 +156,8 @@ def _in_chunks(
 
 def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
     """Return a trajectory and the one that begins with its last frame as one."""
+    bad = after.first_bad_frame
+    after = after.replace(first_bad_frame=jnp.where(bad < 0, bad, bad + before.num_frames - 1))
     tail = _slice_frames(after, slice(1, None))
     return _map_frames(lambda first, second: jnp.concatenate([first, second]), tail, before)
 
@@ -184,7 +188,8 @@ def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothStat
         past = past_state(before, jnp.asarray(scene.timestep), np.asarray(trajectory.residuals)[frame])
     state = initial_state(jnp.asarray(position[frame]), jnp.asarray(velocity[frame]))
     load = jnp.asarray(np.asarray(trajectory.friction_loads)[frame])
-    return state.replace(friction_load=load, frame=jnp.int32(frame), past=past)
+    number = scene.initial_state.frame + jnp.int32(frame)
+    return state.replace(friction_load=load, frame=number, past=past)
 
 
 def _scan(
@@ -278,16 +283,19 @@ def last_frames(trajectory: Trajectory, scene: Scene, num_frames: int) -> tuple[
     bad = int(trajectory.first_bad_frame)
     kept = _slice_frames(trajectory, slice(first, None))
     kept = kept.replace(first_bad_frame=jnp.int32(bad - first if bad >= 0 else bad))
-    state = state_at(trajectory, scene, first).replace(frame=jnp.int32(0))
+    state = state_at(trajectory, scene, first)  # it knows its time, which gusts depend on
     return kept, slice_tracks(scene, slice(first, None)).replace(initial_state=state, num_frames=num_frames)
 
 
 def check_scene(scene: Scene) -> None:
-    """Check that the fabric, the constants and the timestep of a scene are physical.
+    """Check that a scene has frames to simulate, and that its fabric, constants and timestep are physical.
 
     Raises:
+        MotionError: There are fewer than two frames.
         ConfigError: Names the value and what is accepted.
     """
+    if scene.num_frames < 2:
+        raise MotionError(f"the scene has {scene.num_frames} frame; give two or more")
     validate_material(scene.material, scene.garment)
     validate_constants(scene.constants)
     validate_timestep(scene.timestep)

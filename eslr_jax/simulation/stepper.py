@@ -37,7 +37,7 @@ class FrameReport(NamedTuple):
 MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
 
 Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
-"""Advances the cloth by one frame; the one contract of the solver, of networks, and of both."""
+"""Advances the cloth by one frame; the common interface of the solver, of networks, and of both together."""
 
 
 def make_stepper(
@@ -70,8 +70,8 @@ def make_stepper(
         else:
             if config.model is not None and state.past is not None:
                 raise ConfigError(
-                    'a network steps by implicit Euler; choose integrator "euler", or iterations of the solver '
-                    "behind the network"
+                    'a network alone steps by implicit Euler; choose integrator "euler", or solver '
+                    "iterations after the network"
                 )
             point, _, status = _begin(params, problem, state, config)
             unknown = jnp.full_like(point.value, jnp.inf)
@@ -95,8 +95,8 @@ def find_start(
 ) -> tuple[Start, Int[Array, ""]]:
     """Return where the solver begins a frame, and status bits.
 
-    Without a network that is the solver's own guess. With one it is the prediction, or the point that the
-    prediction was refined from where that is lower.
+    Without a network this is the initial guess. With a network it is the prediction, or the lowest point from
+    which one of its refinement steps began, if that is lower.
 
     Args:
         params: Weights of the network; None without one.
@@ -171,8 +171,8 @@ def past_state(
 ) -> PastState:
     """Return what BDF2 remembers of the state before a frame, and whether it may be trusted.
 
-    A frame that ends far from its minimum leaves an error, which BDF2 would carry on and amplify: a garment of
-    which 20 iterations leave 40 weights flew apart. The next frame is then stepped by implicit Euler.
+    A frame that ends far from its minimum leaves an error, which BDF2 would carry on and amplify: a garment
+    with a residual of 40 weights after 20 iterations flew apart. So the next frame is stepped by implicit Euler.
 
     Args:
         before: Cloth at the beginning of the frame.

@@ -25,6 +25,8 @@ from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
+_SHARES = ("resets", "overflows")  # metrics that are zero or one in a step
+
 Progress = Callable[[int, int, dict[str, float]], None]
 
 
@@ -153,7 +155,7 @@ def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
         "steps": int(state.step),
         "garments": config.garments,
         "vertices": config.vertices,
-        "core_hours": core_seconds(out) / 3600,
+        "core_hours": core_seconds(out) / 3600 / config.seeds,  # seeds share the run
     }
     write_weights(path, jax.device_get(state.params), config.model, training)
     return path
@@ -206,12 +208,15 @@ def is_first_process() -> bool:
 
 
 def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, float]]:
-    """Return every seed's medians of a window: single resets have energies a hundred times the usual."""
+    """Return every seed's shares and medians of a window; a reset has energies a hundred times the usual."""
     fetched = jax.device_get(window)
-    medians = {
-        name: np.median([np.reshape(entry[name], seeds) for entry in fetched], axis=0) for name in fetched[0]
+    centers = {
+        name: (np.mean if name in _SHARES else np.median)(
+            [np.reshape(entry[name], seeds) for entry in fetched], axis=0
+        )
+        for name in fetched[0]
     }
-    return [{name: float(values[place]) for name, values in medians.items()} for place in range(seeds)]
+    return [{name: float(values[place]) for name, values in centers.items()} for place in range(seeds)]
 
 
 def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:

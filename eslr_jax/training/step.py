@@ -12,7 +12,7 @@ import numpy as np
 import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from eslr_jax.config import Criterion, TrainConfig
 from eslr_jax.contact.self_contact import default_capacity
@@ -231,11 +231,11 @@ def _sample_gradient(
     if params["statistics"]:
         statistics = _statistics(params, slot, problem, config)
     horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
-    slot = _advance(slot, problem, report, data, horizon)
+    slot, is_astray = _advance(slot, problem, report, data, horizon)
     metrics = {
         "loss": loss,
         "inertial_energy": report.inertial_energy,
-        "resets": slot.is_done.astype(jnp.float32),
+        "resets": is_astray.astype(jnp.float32),
         "overflows": (slot.state.status & Status.SELF_CONTACT_OVERFLOW > 0).astype(jnp.float32),
         **report.terms._asdict(),
     }
@@ -349,19 +349,27 @@ def curriculum(config: TrainConfig, step: Int[Array, ""] | int) -> Progress:
 
 def _advance(
     slot: Slot, problem: FrameProblem, report: LossReport, data: TrainingData, horizon: _Horizon
-) -> Slot:
-    """Move the trajectory on with the network's prediction; mark it done where it ends or has gone astray."""
+) -> tuple[Slot, Bool[Array, ""]]:
+    """Move the trajectory on with the network's prediction, and tell whether it has gone astray.
+
+    It is done then, and at its horizon.
+    """
     state = next_state(report.onward, problem, slot.state, jnp.int32(0))
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
     moved = jnp.max(jnp.abs(state.position - slot.state.position))
     is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
     age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
     is_done = is_astray | (age >= horizon.frames)
-    return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done)
+    return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done), is_astray
 
 
 def _statistics(params: Any, slot: Slot, problem: FrameProblem, config: TrainConfig) -> dict[str, Normalizer]:
-    """Return what the normalisers see in this frame (HOOD); accelerations are those of the skinned garment."""
+    """Return what the normalisers see in this frame (HOOD).
+
+    An acceleration is the way from the cloth's inertial guess to the skinned garment. Over HOOD's horizon of five
+    frames that is the skinned garment's own acceleration. In a long trajectory the distance by which cloth hangs
+    away from its skinned place dominates it.
+    """
     inputs = graph_inputs(problem, slot.state)
     graph = build_graph(problem.garment, problem.material, inputs, config.model)
     acceleration = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -36,7 +37,7 @@ from eslr_jax.simulation.live import (
     set_stage,
 )
 from eslr_jax.simulation.stepper import FrameReport
-from eslr_jax.types import Body, BodyMotion, ClothState
+from eslr_jax.types import Body, BodyMotion, ClothState, Material
 from eslr_jax.viewer.live_controls import (
     Choice,
     add_controls,
@@ -75,7 +76,7 @@ class Live:
     server: Any  # viser.ViserServer
     controls: dict[str, Any]
     body: str  # name or file
-    out: Path  # folder of recordings
+    out: Path  # folder of recordings, which have a numbered folder each
     cast: Cast | None = None
     wanted: tuple[Choice | None, float] = (None, 0.0)  # the last choice that was seen, and since when [s]
     refused: Choice | None = None  # what did not load
@@ -86,6 +87,7 @@ class Live:
     is_compiled: bool = False
     held: int | None = None  # vertex in the hand
     recorded: list[tuple[int, ClothState]] = dataclasses.field(default_factory=list)
+    setting: tuple[Material, tuple[float, float, float]] | None = None  # fabric, wind [m/s] of the recording
     asked: threading.Event = dataclasses.field(default_factory=threading.Event)  # for one step
 
     @property
@@ -99,7 +101,7 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
 
     Args:
         choice: What is on stage first.
-        out: Folder that recordings are written to.
+        out: Folder that recordings are written to, in the folders 1, 2, and so on.
         host: Address to listen on; only this machine by default.
         port: Port, or the next free one.
 
@@ -119,7 +121,7 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
     server.initial_camera.look_at = (0.0, 0.9, 0.0)
     server.initial_camera.fov = np.deg2rad(40.0)
     server.initial_camera.up = (0.0, 1.0, 0.0)
-    live = Live(server, controls, choice.body, Path(out))
+    live = Live(server, controls, choice.body, Path(out).expanduser())
     controls["playing"].on_update(lambda _: _show_single(live))
     controls["single"].on_click(lambda _: live.asked.set())
     controls["restart"].on_click(lambda _: _restart(live))
@@ -140,10 +142,11 @@ def run_live(
     until = until or threading.Event()
     due = time.perf_counter()
     while not until.is_set():
+        choice = read_choice(live.controls, live.body)
         try:
-            is_moved = one_frame(live)
+            is_moved = one_frame(live, choice)
         except EslrError as error:
-            live.refused = read_choice(live.controls, live.body)
+            live.refused = choice  # not what the controls say by now
             live.controls["status"].content = f"**{error}**"
             is_moved = False
         if is_moved:
@@ -155,22 +158,31 @@ def run_live(
         until.wait(max(due - now, 0.5 * _PAGE))
 
 
-def one_frame(live: Live) -> bool:
+def one_frame(live: Live, choice: Choice) -> bool:
     """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did.
+
+    Args:
+        live: Of `open_live`.
+        choice: What the controls put on stage.
 
     Raises:
         EslrError: What is chosen does not load, or the body is too fast.
     """
-    choice = read_choice(live.controls, live.body)
-    if _is_due(live, choice):
+    if choice != live.refused:
+        live.refused = None  # chosen once more, it is tried and told once more
+    is_due = _is_due(live, choice)
+    setting = fabric, wind = read_fabric(live.controls), read_wind(live.controls)
+    if live.recorded:
+        is_over = not live.controls["record"].value or len(live.recorded) >= MOST_RECORDED
+        # A run has one garment, body, motion, fabric and wind.
+        if is_over or is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting):
+            live.controls["record"].value = False
+            _save(live)
+    if is_due:
         _load(live, choice)
     cast = live.cast
     if cast is None or choice == live.refused:
         return False
-    is_full = len(live.recorded) >= MOST_RECORDED
-    if live.recorded and (is_full or not live.controls["record"].value):
-        live.controls["record"].value = False
-        _save(live, cast)
     if not (live.controls["playing"].value or live.asked.is_set()):
         return False
     live.asked.clear()
@@ -178,13 +190,12 @@ def one_frame(live: Live) -> bool:
         live.state, live.step = cast.stage.scene.initial_state, 0
     began = time.perf_counter()
     frames = _frames_of(live.step, cast)
-    fabric = read_fabric(live.controls)
     with (
         contextlib.nullcontext()
         if live.is_compiled
         else _busy(live, "compiling, which is kept for the next time")
     ):
-        stage = changed(cast.stage, fabric, read_wind(live.controls), _hand(live))
+        stage = changed(cast.stage, fabric, wind, _hand(live))
         tolerance = read_tolerance(live.controls)
         step = jax.block_until_ready(advance(stage, live.state, frames, live.iterations, tolerance))
     if live.state is None:  # restarted meanwhile
@@ -197,6 +208,7 @@ def one_frame(live: Live) -> bool:
     live.state, live.step = step.state, live.step + 1
     if live.controls["record"].value:
         live.recorded.append((frames[1], jax.tree.map(np.asarray, step.state)))
+        live.setting = setting
     _show(live, cast, frames[1])
     if live.is_compiled:
         live.times = [*live.times[-_SHOWN + 1 :], time.perf_counter() - began]
@@ -272,7 +284,7 @@ def _load(live: Live, choice: Choice) -> None:
     for _, mesh in drawn:
         mesh.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
     live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
-    live.recorded, live.is_compiled, live.refused = [], False, None
+    live.is_compiled, live.refused = False, None
     _restart(live)
 
 
@@ -373,14 +385,19 @@ def _hand(live: Live) -> Hand:
     return grasp(held, np.asarray(handle.position) + cast.spots[frame])
 
 
-def _save(live: Live, cast: Cast) -> None:
-    """Write what was recorded as a run, and hand its animation to whoever watches."""
+def _save(live: Live) -> None:
+    """Write what was recorded as a run in a folder of its own, and hand its animation to whoever watches."""
+    assert live.cast is not None
+    assert live.setting is not None
+    cast, (fabric, wind) = live.cast, live.setting
     frames = np.array([frame for frame, _ in live.recorded])
     states = [state for _, state in live.recorded]
     live.recorded = []
     if len(frames) < 2:
         return
-    live.controls["status"].content = f"writing {len(frames)} frames to {live.out}"
+    folders = (live.out / str(number) for number in itertools.count(1))
+    folder = next(folder for folder in folders if not folder.exists())
+    live.controls["status"].content = f"writing {len(frames)} frames to {folder}"
     poses = cast.poses.replace(
         positions=cast.poses.positions[frames], joint_transforms=cast.poses.joint_transforms[frames]
     )
@@ -390,19 +407,20 @@ def _save(live: Live, cast: Cast) -> None:
             for name in ("position", "velocity", "friction_load")
         )
     )
-    scene = cast.stage.scene.replace(material=read_fabric(live.controls))
+    scene = cast.stage.scene.replace(material=fabric)
     report = {
         "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,
         **scene_record(scene),
-        "wind_m_s": read_wind(live.controls),
+        "wind_m_s": wind,
     }
     try:
-        write_run(live.out, track, scene, (cast.rig, poses, cast.stored), report=report)
+        write_run(folder, track, scene, (cast.rig, poses, cast.stored), report=report)
     except EslrError as error:  # the cloth goes on
         for client in live.server.get_clients().values():
             client.add_notification("The recording was not written", str(error))
         return
-    data = (live.out / "animation.glb").read_bytes()
+    data = (folder / "animation.glb").read_bytes()
     for client in live.server.get_clients().values():
+        client.add_notification("Recorded", f"{len(frames)} frames are in {folder}")
         client.send_file_download("animation.glb", data, save_immediately=True)

@@ -3,8 +3,8 @@
     python experiments/benchmarks/frame_cost.py [--sizes 1k 4k 10k] [--out DIR] [--smoke]
     python experiments/benchmarks/frame_cost.py --sizes 50k 200k --no-self-contact  # joins the sizes in the file
 
-A T-shirt in the middle of a walk. Every part is called in turns with the others, and counts as a ratio to one
-iteration of the solver in the same turns: figures of a busy machine then compare with those of a quiet one.
+A T-shirt in the middle of a walk. The parts are timed alternately, and their least times are also given
+relative to one iteration of the solver, so that figures of a busy machine compare with those of an idle one.
 Writes frame_cost.json.
 """
 

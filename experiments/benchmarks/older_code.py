@@ -1,12 +1,13 @@
-"""Time to a share of the initial gap, by this code and by an older commit, in turns.
+"""Time to a share of the initial gap, by this code and by an older commit, timed alternately.
 
     python experiments/benchmarks/older_code.py                       # 1k, 4k, 10k: half an hour
     python experiments/benchmarks/older_code.py --commit HEAD --smoke --out DIR
 
 The older code is checked out into a temporary folder. Each code solves the frames of its own near-optimal
-rollouts of T-shirt, dress and trousers. As many iterations count as leave a given share of the initial gap in the
-median. What a frame and an iteration cost is timed on the T-shirt: one process of each code after the other, in
-turns. Contacts and fabrics changed too, so the two codes do not solve quite the same problem.
+rollouts of T-shirt, dress and trousers. The iterations that count are those after which the median gap is a
+given share of the initial gap. The cost of a frame and of an iteration is timed on the T-shirt, in processes of
+both codes that run alternately. Contacts and fabrics changed too, so the two codes do not solve quite the same
+problem.
 
 Writes older_code.json.
 """
@@ -23,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 
 ROOT = Path(__file__).parents[2]
@@ -30,6 +32,7 @@ RESULTS = ROOT / "experiments" / "results"
 COMMIT = "e6478a3"  # of 22 November, before contacts, preconditioner and iterations were made anew
 SHARES = (0.01, 0.001)  # of the initial gap
 TURNS = 3
+COUNTS = [5, 10, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64, 76, 90, 106]  # of iterations whose gap is measured
 
 # What both codes run. It uses only what has kept its name.
 GAPS = """
@@ -87,32 +90,50 @@ def iterations_to(share: float, counts: list[int], medians: list[float]) -> floa
     return float(np.interp(-np.log(share), -np.log(falling), counts))
 
 
-def compare(older: Path, size: str, garments: list[str], frames: int, turns: int) -> dict:
-    """Return iterations, costs and times of both codes at one size.
+def count_iterations(older: Path, size: str, garments: list[str], frames: int) -> dict[str, dict[str, float]]:
+    """Return the iterations that both codes need at one size, by share of the initial gap.
 
     Args:
         older: Root of the older checkout.
         size: Of the garments.
         garments: Names of bundled garments.
         frames: Of every rollout.
+    """
+    found = {}
+    for name, code in {"before": older, "now": ROOT}.items():
+        medians = run(GAPS, code, [size, frames, garments, COUNTS])
+        found[name] = {f"{share:.1%}": iterations_to(share, COUNTS, medians) for share in SHARES}
+    print(f"{size}: {json.dumps(found)}", flush=True)
+    return found
+
+
+def time_codes(
+    older: Path, size: str, needed: dict[str, dict[str, float]], frames: int, turns: int
+) -> dict[str, dict]:
+    """Return what a frame costs by both codes at one size, and the ratio now / before.
+
+    Args:
+        older: Root of the older checkout.
+        size: Of the garment.
+        needed: Of `count_iterations`.
+        frames: Of every rollout.
         turns: Processes of each code that are timed.
     """
-    counts = [5, 10, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64, 76, 90, 106]
-    codes = {"before": older, "now": ROOT}
-    medians = {name: run(GAPS, code, [size, frames, garments, counts]) for name, code in codes.items()}
-    print(f"{size}: gaps measured", flush=True)
-    costs: dict[str, list[list[float]]] = {name: [] for name in codes}
+    costs: dict[str, list[list[float]]] = {name: [] for name in needed}
     for _ in range(turns):
-        for name, code in codes.items():
+        for name, code in {"before": older, "now": ROOT}.items():
             costs[name].append(run(TIMES, code, [size, frames]))
     result: dict = {}
-    for name in codes:
+    for name, found in costs.items():
         # The least of all turns: what else runs on the machine only ever adds.
-        fixed, iteration = np.min(costs[name], axis=0)
-        needed = {f"{share:.1%}": iterations_to(share, counts, medians[name]) for share in SHARES}
-        times = {share: fixed + count * iteration for share, count in needed.items()}
-        result[name] = {"fixed_ms": fixed, "iteration_ms": iteration, "iterations": needed, "ms": times}
+        times = {
+            share: min(fixed + count * iteration for fixed, iteration in found)
+            for share, count in needed[name].items()
+        }
+        by_turn = [{"fixed_ms": fixed, "iteration_ms": iteration} for fixed, iteration in found]
+        result[name] = {"iterations": needed[name], "ms": times, "turns": by_turn}
     result["ratio"] = {share: ms / result["before"]["ms"][share] for share, ms in result["now"]["ms"].items()}
+    print(f"{size}: {json.dumps(result['ratio'])}", flush=True)
     return result
 
 
@@ -135,14 +156,14 @@ def main() -> None:
         older = Path(folder) / "older"
         subprocess.run([*git, "worktree", "add", "--quiet", "--detach", older, arguments.commit], check=True)
         try:
+            needed = {size: count_iterations(older, size, garments, frames) for size in sizes}
             result = {
                 "commit": arguments.commit,
-                "sizes": {size: compare(older, size, garments, frames, turns) for size in sizes},
+                "sizes": {size: time_codes(older, size, needed[size], frames, turns) for size in sizes},
+                "environment": environment(),
             }
         finally:
             subprocess.run([*git, "worktree", "remove", "--force", older], check=True)
-    for size, entry in result["sizes"].items():
-        print(size, json.dumps(entry["ratio"]))
     with atomic_write(arguments.out / "older_code.json") as temporary:
         temporary.write_text(json.dumps(result, indent=2) + "\n")
 

@@ -2,7 +2,7 @@
 
     python experiments/benchmarks/step_time.py --json out.json
 
-All builds of a comparison run in turns (A B A B ...) in one process and are compared as ratios of medians.
+All builds of a comparison run alternately (A B A B ...) in one process and are compared as ratios of medians.
 Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a process
 of its own on one core; without PyTorch it is left out. `floor_share` is the share of the exact forward pass that
 its matrix products would take at the rate of one large product, which is measured in the same turns.

@@ -3,7 +3,7 @@
     python experiments/benchmarks/train_throughput.py [--json] [--smoke]
 
 The whole step also poses the body, searches contacts, states the frame's problem, advances the trajectory and
-keeps the metrics. The bare step is given a problem of the same size. Both are called in turns.
+keeps the metrics. The bare step is given a problem of the same size. Both are timed alternately.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fifteen situations that break simulators, each with its measures and bars.
+"""Fifteen situations that break simulators, each with its measures and limits.
 
 Any simulator runs them, as a library from `experiments/`: `run_case(find_case("hang"), solver_simulator())`;
 or by the command `python experiments/hard_cases`, see `__main__.py`.

@@ -206,7 +206,7 @@ def make_scene(
     body_positions: Float[np.ndarray, "frames body_vertices 3"] | None = None,
     pin_targets: Float[np.ndarray, "frames vertices 3"] | None = None,
     self_contact: bool = False,
-    is_sharp: bool = False,
+    has_tips: bool = False,
 ) -> Scene:
     """Put cloth, body and pins together; the cloth starts at rest.
 
@@ -223,7 +223,7 @@ def make_scene(
         pin_targets: Positions of pinned vertices in every frame [m], shape [frames, vertices, 3], or in all,
             shape [1, vertices, 3]; by default they stay where they start.
         self_contact: Keep layers of cloth apart.
-        is_sharp: Whether the body has tips finer than the cloth's mesh.
+        has_tips: Whether the body has tips finer than the cloth's mesh.
     """
     position = jnp.asarray(start, jnp.float32)
     obstacle = pins = None
@@ -232,7 +232,7 @@ def make_scene(
         obstacle = SceneBody(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
-            is_sharp=is_sharp,
+            has_tips=has_tips,
         )
     if np.any(garment.is_pinned):
         targets = np.asarray(start)[None] if pin_targets is None else pin_targets

@@ -42,9 +42,9 @@ def _build_needle(options: Mapping[str, Any]) -> Scenes:
     edge = capsule(_TIP, 0.7, around=12, rings=60)
     bar = Capsule(np.array([-0.35, 0.0, 0.0]), np.array([0.35, 0.0, 0.0]), _TIP)
     return {
-        "needle": CaseScene(make_scene(garment, start, 46, body=mesh, is_sharp=True), lambda frame: (cone,)),
+        "needle": CaseScene(make_scene(garment, start, 46, body=mesh, has_tips=True), lambda frame: (cone,)),
         "thin edge": CaseScene(
-            make_scene(garment, start, 46, body=edge, is_sharp=True), lambda frame: (bar,)
+            make_scene(garment, start, 46, body=edge, has_tips=True), lambda frame: (bar,)
         ),
     }
 

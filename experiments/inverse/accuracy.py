@@ -1,11 +1,12 @@
-"""How far the gradient of a walking T-shirt is off, by what the solver and the linear system leave, and its cost.
+"""Error and cost of the gradient of a walking T-shirt, by the tolerances of the solver and the linear system.
 
     python experiments/inverse/accuracy.py [--smoke] [--out DIR]
 
 Two losses after five frames (the shirt's mean x, its stretch energy in all frames) by three parameters (stiffness
-of the fabric, density, a shift of the body), in float32 as a user has it. They are held against central
-differences in float64 with a solver that ends where float64 ends. A cost is the time of loss and gradient over
-that of the loss alone, for the frame after these five, in turns. Writes accuracy.json and accuracy.png.
+of the fabric, density, a shift of the body), in float32, the default. They are compared with central
+differences in float64, whose solver ends where float64 ends. The cost is the time of loss and gradient relative
+to that of the loss alone, for the frame after these five, timed alternately. Writes accuracy.json and
+accuracy.png.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Let out a T-shirt that is too tight, so that its stretch on the body stays under a bar.
+"""Let out a T-shirt that is too tight, so that its stretch on the body stays under a limit.
 
     python experiments/inverse/fit.py [--smoke] [--out DIR]
 
 The shirt is cut 3 cm narrower all around. Parameters say how far each band of it (four heights of the trunk, the
-sleeves) is let out along its normals. The loss is the stretch above the bar on the body, after a few long frames
-in which the cloth comes to rest, and a small price for letting out. Writes fit.json and fit.png.
+sleeves) is let out along its normals. The loss is the stretch on the body above the limit, after a few long
+frames in which the cloth comes to rest, and a small price for letting out. Writes fit.json and fit.png.
 """
 
 from __future__ import annotations

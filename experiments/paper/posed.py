@@ -6,8 +6,9 @@ They predict displacements of the rest mesh, which the skin weights then carry a
 
 - pbns: four layers of 32 and a basis of displacements, one pose at a time. Its own springs and hinges are
   replaced by our energies, without inertia and friction: the floor that static poses leave.
-- snug: four GRUs of 256 and a linear layer. Its energies are ours. Windows of three frames, hidden states that
-  begin at random, and inertia on the last frame alone follow GAPS, as SNUG's own training was not published.
+- snug: four GRUs of 256 and a linear layer. Its energies are ours, without friction. Windows of three frames,
+  hidden states that begin at random, and inertia on the last frame alone follow GAPS, as SNUG's own training was
+  not published.
 - snug-m: snug that also reads the fabric, which changes from window to window. It stands in for MSN (Liu et al.
   2023), of which neither code nor text was found.
 

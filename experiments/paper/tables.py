@@ -1,7 +1,7 @@
 """The paper's tables: every system beside its controls, the solver and the optimum.
 
     python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
-        [--models LABEL=NAME,NAME ...] [--train] [--controls] [--keep] [--clips NAME ...] [--frames 100] [--smoke]
+        [--models LABEL=NAME,NAME ...] [--train] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
 seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
@@ -92,7 +92,7 @@ def main() -> None:
     )
     parser.add_argument("--controls", action="store_true", help="rows for each network's controls")
     parser.add_argument(
-        "--keep", action="store_true", help="keep the rows that a table of the same setting has"
+        "--anew", action="store_true", help="measure rows again that the table has; others stay in any case"
     )
     parser.add_argument("--clips", nargs="+", help="only these")
     parser.add_argument("--garments", nargs="+", help="only these")
@@ -120,9 +120,11 @@ def main() -> None:
             file = chosen.out / f"{name}.json"
             found = json.loads(file.read_text()) if file.exists() else {}
             check_setting(found, setting, file)
-            known = found if chosen.keep else {}
             has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
-            for result in energy_table(with_changes(rows, name, has_controls), setting, known):
+            asked = with_changes(rows, name, has_controls)
+            parts = rows_of_setting(found, setting)
+            missing = asked if chosen.anew else {k: row for k, row in asked.items() if k not in parts["mean"]}
+            for result in energy_table(missing, setting, parts):
                 write(result, file)
 
 
@@ -185,26 +187,23 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     return changed
 
 
-def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Yield the table after every row: means over seeds, the seeds' own, and those of every garment.
 
     Args:
         rows: Names by label.
         setting: Garments and clips.
-        known: Result of before, whose rows are kept if it has the same setting.
+        parts: Rows that the table has, of `rows_of_setting`; new ones are added.
     """
     shared = json.loads(json.dumps(setting._asdict()))
-    parts = rows_of_setting(known, setting)
     references = find_references(setting)
     for label, names in rows.items():
-        if label in parts["mean"]:
-            continue
         seeds = [measure_system(name, setting, references) for name in names]
         means = {
             garment: {column: float(np.mean([seed[garment][column] for seed in seeds])) for column in row}
             for garment, row in seeds[0].items()
         }
-        parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **read_system(names[0]).cost}
+        parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **training_cost(names)}
         parts["garments"][label] = means
         if len(seeds) > 1:
             parts["seeds"][label] = {
@@ -215,6 +214,13 @@ def energy_table(rows: Rows, setting: Setting, known: dict[str, Any]) -> Iterato
             row = parts["mean"][with_control]
             row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
         yield {**shared, **parts}
+
+
+def training_cost(names: Sequence[str]) -> dict[str, float]:
+    """Return parameters of a row's network, and the core-hours of all its seeds where each is known."""
+    costs = [read_system(name).cost for name in names]
+    hours = {"core_hours": sum(cost["core_hours"] for cost in costs)} if "core_hours" in costs[0] else {}
+    return {**costs[0], **hours}
 
 
 def check_setting(found: dict[str, Any], setting: Setting, file: Path) -> None:

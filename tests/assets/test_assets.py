@@ -6,7 +6,15 @@ import json
 import numpy as np
 import pytest
 
-from eslr_jax.assets import asset_names, load_garment, load_model, load_motion, load_splits
+from eslr_jax.assets import (
+    asset_names,
+    load_body,
+    load_garment,
+    load_garment_file,
+    load_model,
+    load_motion,
+    load_splits,
+)
 from eslr_jax.assets.catalog import is_intact, list_assets
 from eslr_jax.body.motion import Motion, pose_body, shape_body, still_motion
 from eslr_jax.errors import AssetError, CheckpointError, MotionError
@@ -54,6 +62,14 @@ def test_a_network_takes_other_numbers_of_refinement_steps():
 def test_close_names_are_suggested():
     with pytest.raises(AssetError, match="did you mean cmu_016_32"):
         load_motion("cmu_016_3 2")
+
+
+def test_a_folder_with_an_asset_s_name_is_not_taken_for_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("tshirt", "anny", "cmu_016_32"):
+        (tmp_path / name).mkdir()
+    assert load_garment_file("tshirt").rest_positions.shape == (1000, 3)
+    assert load_body("anny").joint_names == load_motion("cmu_016_32").joint_names
 
 
 def test_missing_motion_file(tmp_path):

@@ -54,6 +54,13 @@ def test_changed_file_and_damaged_entry_are_made_again(empty_cache, tmp_path, bo
     np.testing.assert_allclose(moved.sewn_positions[:, 1] - again.sewn_positions[:, 1], 0.01, atol=1e-6)
 
 
+def test_an_entry_tells_the_joints_of_its_own_body(empty_cache, scan, body):
+    other = body.replace(joint_names=(*body.joint_names[:-1], "tail"))  # else the same
+    for rig in (body, other):
+        entry = load_garment_file(scan, body=rig).metadata["body"]
+        assert entry["joint_names"] == list(rig.joint_names)
+
+
 def test_unwritable_cache_costs_only_time(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from formats import write_bvh
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import Motion, pose_body, still_motion
@@ -42,6 +43,18 @@ def test_a_rest_pose_before_a_motion_is_skipped_and_named(walking, frames):
     np.testing.assert_array_equal(kept.positions, walking.positions)
     np.testing.assert_array_equal(kept.rotations, walking.rotations)
     assert "skipped its first " + ("frame," if frames == 1 else "3 frames,") in text
+
+
+def test_a_motion_knows_when_it_begins_in_its_file(walking, body, tmp_path):
+    whole = with_rest_pose_first(walking, 3, offset=(1.5, 0.0, 0.0))
+    write_bvh(tmp_path / "walk.bvh", whole)
+    with pytest.warns(UserWarning, match="skipped its first 3 frames"):
+        motion = load_motion(tmp_path / "walk.bvh", body=body)
+    assert motion.start == pytest.approx(3 / walking.fps)
+    later = cut_start(motion, 10 / motion.fps)
+    assert later.start == pytest.approx(13 / walking.fps)
+    assert loop_motion(later, 20.0).start == later.start
+    assert load_motion("cmu_016_32").start == 0.0
 
 
 def test_a_motion_without_a_rest_pose_is_kept(walking, body):

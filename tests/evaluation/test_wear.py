@@ -1,5 +1,7 @@
 """How a garment sits, and the words for it: a square of cloth over a ball."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -118,7 +120,7 @@ def test_a_start_with_cloth_deep_behind_cloth_is_told_with_its_place(dent, is_to
     assert (text is not None) == is_told
     if text is not None:
         assert " pairs of faces" in text
-        assert "frame 0 (0.00 s), part coat" in text or "part skirt" in text
+        assert re.search(r"frame 0 \(0\.00 s\), part (coat|skirt)", text)
     assert start_crossing(scene.replace(self_contact=None)) is None
 
 

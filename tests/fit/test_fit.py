@@ -64,10 +64,19 @@ def test_what_is_given_is_not_recognised(body, shirt):
     higher = shirt.rest_positions + np.array([0, 0.02, 0])
     kept = fit_garment(source(higher, shirt.faces), body, FitOptions(keep_place=True))
     np.testing.assert_allclose(kept.sewn_positions, higher, atol=1e-9)
-    with pytest.raises(MeshError, match="give --up and --front"):
+    with pytest.raises(MeshError, match="give eslr fit --up and --front"):
         fit_garment(source(higher + 3.0, shirt.faces), body, FitOptions(keep_place=True, units="m"))
     with pytest.raises(MeshError, match="same axis"):
         fit_garment(source(shirt.rest_positions, shirt.faces), body, FitOptions(up="z", front="-z"))
+
+
+def test_the_unit_of_a_format_is_named_and_the_given_one_wins(body, shirt):
+    written = source(100.0 * shirt.rest_positions, shirt.faces, is_metric=True)  # a GLB in centimetres
+    with pytest.raises(MeshError, match=r"prescribes metres and y up.*give eslr fit --units and --up and"):
+        fit_garment(written, body, FitOptions(arms="rest"))
+    fitted = fit_garment(written, body, FitOptions(arms="rest", units="cm", front="z"))
+    assert fitted.metadata["fit"]["placement"]["metres_per_unit"] == 0.01
+    np.testing.assert_allclose(fitted.sewn_positions, shirt.rest_positions, atol=1e-9)
 
 
 def test_options_come_from_the_command_line():

@@ -10,7 +10,7 @@ from outfits import OUTFITS, count_pairs, load
 from eslr_jax.assets import prepare_stored
 from eslr_jax.errors import MeshError
 from eslr_jax.evaluation.referee import intersecting_pairs
-from eslr_jax.fabric import garment_material
+from eslr_jax.fabric import garment_material, worn_fabrics
 from eslr_jax.fit.outfit import LAYER_GAP, combine_garments
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.materials import fabric_material
@@ -67,6 +67,20 @@ def test_parts_and_fabrics_are_named_after_their_garments():
     for part, fabric in enumerate(("cotton", "denim", "silk")):
         expected = fabric_material(fabric).lame_mu
         assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
+
+
+def test_a_fabric_of_one_garment_leaves_the_others_theirs():
+    inner, outer = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
+    inner = dataclasses.replace(inner, metadata={"fabrics": ["satin"]})
+    half = np.arange(len(outer.faces)) // (len(outer.faces) // 2)
+    outfit = combine_garments(
+        [inner, dataclasses.replace(outer, face_parts=half, part_names=("low", "high"))], ["skirt", "top"]
+    )
+    material = garment_material(("top:denim", "top/high:silk"), prepare_stored(outfit, cache=False), outfit)
+    for part, fabric in enumerate(("satin", "denim", "silk")):
+        expected = fabric_material(fabric).lame_mu
+        assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
+    assert worn_fabrics(("denim",), outfit) == ("denim",)
 
 
 def test_a_garment_is_worn_once():

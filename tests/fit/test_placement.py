@@ -64,7 +64,7 @@ def test_kept_place_is_obeyed_even_beside_the_body(postures, shape, raised, asid
 
 def test_refusal_names_only_the_options_that_are_missing(postures):
     positions, faces = skirt()
-    with pytest.raises(MeshError, match=r"give --units and --front, or model it on the body"):
+    with pytest.raises(MeshError, match=r"give eslr fit --units and --front, or model it on the body"):
         find_placement(positions + 9.0, faces, postures, keep_place=True, up="y")
 
 

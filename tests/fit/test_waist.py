@@ -79,7 +79,9 @@ def test_leg_warmers_fall_and_the_report_says_so(body):
     options = FitOptions(units="m", up="y", front="z", arms="rest")
     fitted = fit_garment(source(*joined(*legs)), body, options)
     assert not fitted.is_pinned.any()
-    assert any("nothing holds the garment up" in text for text in fitted.metadata["fit"]["warnings"])
+    texts = fitted.metadata["fit"]["warnings"]
+    (warning,) = (text for text in texts if "nothing holds the garment up" in text)
+    assert "give eslr fit --pin" in warning
 
 
 def test_pins_replace_the_waistband(body):
@@ -110,4 +112,6 @@ def test_pins_replace_the_waistband(body):
 
 def test_cost_is_told_for_large_meshes_only():
     assert describe_cost(10_000) is None
-    assert describe_cost(251_000).startswith("251,000 vertices are many: fitting takes about 75 s")
+    text = describe_cost(251_000)
+    assert text.startswith("251,000 vertices are many: fitting takes about 75 s")
+    assert "eslr fit --edge-length" in text

@@ -143,6 +143,7 @@ def test_own_bucket_changes_nothing(garment):
             "skin weights .5, 4. and indices .153, 4. do not fit 153 vertices",
         ),
         ({"skin_weights": np.zeros((153, 4))}, "skin weights of vertex 0"),
+        ({"skin_indices": np.full((153, 4), -1)}, "skin indices of vertex 0 .* joints are counted from 0"),
         ({"is_pinned": np.zeros(4, bool)}, "is_pinned has shape .4,. and dtype bool for 153 vertices"),
     ],
 )

@@ -67,20 +67,6 @@ def test_hinges_are_interior_edges_in_face_orientation(mesh):
         assert by_side[j, i][1] == right
 
 
-@pytest.mark.parametrize("angle", [-2.0, -0.3, 0.0, 0.5, 3.0])
-def test_hinge_angle_is_the_fold_and_positive_on_a_ridge(angle):
-    # left face on the side of +y, right face folded down by `angle` about the x axis: a ridge seen from +z
-    positions = np.array([[0, 0, 0], [1, 0, 0], [0.4, 1, 0], [0.6, -np.cos(angle), -np.sin(angle)]])
-    hinges, _ = topology.find_hinges(np.array([[0, 1, 2], [1, 0, 3]]))
-    np.testing.assert_allclose(topology.hinge_angles(positions, hinges), [angle], atol=1e-12)
-
-
-def test_closed_convex_mesh_has_positive_angles(builders):
-    positions, faces = builders.octahedron()
-    angles = topology.hinge_angles(positions, topology.find_hinges(faces)[0])
-    np.testing.assert_allclose(angles, np.arccos(1 / 3), atol=1e-12)  # pi minus the dihedral angle
-
-
 def test_inverse_rest_frames_invert_the_rest_edges(mesh):
     positions, faces = mesh
     inverse = topology.inverse_rest_frames(positions, faces)

@@ -1,5 +1,7 @@
 """The Blender add-on: its process with this Python alone, and all of it where BLENDER_PYTHON has `bpy`."""
 
+import importlib
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +9,7 @@ import time
 import tomllib
 import zipfile
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +75,39 @@ def test_a_python_without_the_simulator_is_told_in_one_line(tmp_path):
     bare.chmod(0o755)
     with pytest.raises(JobError, match="this Python has no eslr_jax"):
         run(Job(steps(tmp_path, python=str(bare)), tmp_path))
+
+
+class _Modifiers(list):
+    """A garment's modifiers, as far as `lay_cache` knows them."""
+
+    def get(self, name):
+        return next((modifier for modifier in self if modifier.name == name), None)
+
+    def new(self, name, kind):
+        self.append(SimpleNamespace(name=name, type=kind))
+        return self[-1]
+
+    def move(self, start, end):
+        self.insert(end, self.pop(start))
+
+
+@pytest.mark.parametrize(("first", "fps", "report"), [
+    (0, 24, {}), (1, 24, {"motion_start_s": 0.0}), (1, 24, {"motion_start_s": 1 / 24}),
+    (5, 60, {"motion_start_s": 0.5}),
+])  # fmt: skip
+def test_the_cache_begins_where_the_simulation_does(tmp_path, monkeypatch, first, fps, report):
+    """Blender shows sample `frame_scale * frame - frame_start` (`MOD_meshcache.cc`)."""
+    monkeypatch.setitem(sys.modules, "bpy", ModuleType("bpy"))  # what is tested needs none of it
+    monkeypatch.delitem(sys.modules, "exchange", raising=False)
+    exchange = importlib.import_module("exchange")
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    start = exchange.read_start(tmp_path / "report.json")
+    garment = SimpleNamespace(matrix_world=np.eye(4), modifiers=_Modifiers())
+    scene = SimpleNamespace(frame_start=first, render=SimpleNamespace(fps=fps, fps_base=1.0))
+    cache = exchange.lay_cache(garment, np.zeros((3, 4, 3)), tmp_path / "a.pc2", scene, start=start)
+    frame = first + fps * report.get("motion_start_s", 0.0)  # that the first sample belongs to
+    assert cache.frame_scale * frame - cache.frame_start == pytest.approx(0.0)
+    assert cache.frame_scale * (frame + fps) - cache.frame_start == pytest.approx(30.0)
 
 
 @pytest.mark.slow

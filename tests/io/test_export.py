@@ -13,6 +13,7 @@ import trimesh
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
+from eslr_jax.cli.runs import export
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile
@@ -164,6 +165,18 @@ def test_point_caches_hold_every_frame(tmp_path, run, garment):
     np.testing.assert_array_equal(
         np.frombuffer(raw, ">f4", offset=8 + 4 * FRAMES).reshape(expected.shape), expected
     )
+
+
+def test_point_caches_keep_the_order_of_a_file_with_dropped_vertices(tmp_path, run, garment):
+    order = garment.vertex_map
+    dropped = replace(garment, vertex_map=np.concatenate([[-1], order[:5], [-1, -1], order[5:], [-1]]))
+    with pytest.warns(UserWarning, match=f"4 of the {VERTICES + 5} vertices .* were dropped"):
+        export_trajectory(run, tmp_path / "run.pc2", garment=dropped)
+    raw = (tmp_path / "run.pc2").read_bytes()
+    points = np.frombuffer(raw, "<f4", offset=32).reshape(FRAMES, VERTICES + 5, 3)
+    is_kept = dropped.vertex_map >= 0
+    np.testing.assert_array_equal(points[:, is_kept], run.positions[:, garment.vertex_map])
+    np.testing.assert_array_equal(points[:, ~is_kept], points[:, [1, 8, 8, -2]])
 
 
 def test_npz_comes_back_as_a_mesh_sequence(tmp_path, run):
@@ -352,6 +365,17 @@ def test_point_caches_of_nothing_are_not_written(tmp_path, points):
     with pytest.raises(MeshError):
         write_mdd(tmp_path / "a.mdd", points, STEP)
     assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["garment.npz", "trajectory.npz", "report.json"])
+def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name):
+    write_trajectory(tmp_path / "trajectory.npz", run)
+    before = (tmp_path / "trajectory.npz").read_bytes()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(AssetError, match="a file of the run itself"):
+        export(tmp_path, Path(name), format_="npz", content="garment")
+    assert os.listdir(tmp_path) == ["trajectory.npz"]
+    assert (tmp_path / "trajectory.npz").read_bytes() == before
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ def float64_garment(garment: Garment) -> Garment:
         rest_areas=areas,
         inverse_rest_frames=topology.inverse_rest_frames(rest, faces),
         hinge_rest_areas=areas[hinge_faces].sum(axis=1),
-        hinge_rest_angles=topology.hinge_angles(rest, garment.hinges),
+        hinge_rest_lengths=np.linalg.norm(rest[garment.hinges[:, 1]] - rest[garment.hinges[:, 0]], axis=1),
         vertex_areas=topology.vertex_areas(areas, faces, len(rest)),
     )
 

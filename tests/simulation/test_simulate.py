@@ -1,6 +1,7 @@
 """The host's door: checks, chunks, pace, buffers, errors."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +67,73 @@ def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
     assert again.num_frames == joined.num_frames
     for ours, theirs in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def crossing_sheets(num_frames=3):
+    """Two squares a few millimetres apart: every vertex has pairs."""
+    lower, upper = square(), square()
+    from eslr_jax.geometry.prepare import prepare_garment
+
+    rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
+    faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])
+    ones = np.ones((128, 1))
+    garment = prepare_garment(
+        rest, faces, skin_weights=ones, skin_indices=0 * ones.astype(int), allow_components=True
+    )
+    scene = prepare_scene(
+        garment, drifting_ball(num_frames), options=SceneOptions(self_contact=True, start_at_rest=True)
+    )
+    close = rest.copy()
+    close[64:, 1] -= 0.016
+    return scene.replace(
+        initial_state=initial_state(jnp.asarray(close, jnp.float32), jnp.zeros((128, 3), jnp.float32))
+    )
+
+
+@functools.cache
+def simulated(kind):
+    """A simulation of fourteen frames, whose buffers need not grow any more."""
+    options = {
+        "euler": SceneOptions(),
+        "bdf2": SceneOptions(integrator="bdf2"),
+        "substeps": SceneOptions(substeps=2),
+        "substeps of bdf2": SceneOptions(integrator="bdf2", substeps=2),
+    }
+    if kind == "self-contact":
+        scene = crossing_sheets(14).replace(self_contact=PairCapacity(pairs=1000))
+    else:
+        scene = prepare_scene(square(), drifting_ball(14), options=options[kind])
+    return simulate(None, scene, config=SOLVER)
+
+
+@pytest.mark.parametrize("kind", ["euler", "bdf2", "substeps", "substeps of bdf2", "self-contact"])
+def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhere(kind):
+    whole, _, scene = simulated(kind)
+    for count in (6, 2):
+        first = good_frames(whole.replace(first_bad_frame=jnp.int32(count)))
+        assert first.num_frames == count
+        programs = _compile.cache_info().misses
+        joined = simulate(None, scene, config=SOLVER, done=first).trajectory
+        assert _compile.cache_info().misses == programs, "it is the same program"
+        for (path, ours), theirs in zip(
+            jax.tree_util.tree_leaves_with_path(joined), jax.tree.leaves(whole), strict=True
+        ):
+            np.testing.assert_array_equal(ours, theirs, err_msg=str(path))
+
+
+def test_an_unfinished_simulation_with_self_contact_is_read_as_it_was_written(tmp_path):
+    part = simulated("self-contact").trajectory
+    assert part.pair_demand.shape == (14,)
+    assert np.asarray(part.pair_demand)[1:].min() > 0
+    options = {"frames": 30, "garment": "two sheets", "wind": [0.0, 1.5, 0.0]}
+    write_unfinished(tmp_path, part, options)
+    kept, read = read_unfinished(tmp_path)
+    assert read == options
+    for (path, ours), theirs in zip(
+        jax.tree_util.tree_leaves_with_path(kept), jax.tree.leaves(part), strict=True
+    ):
+        assert ours.dtype == theirs.dtype, path
+        np.testing.assert_array_equal(ours, theirs, err_msg=str(path))
 
 
 @pytest.mark.slow
@@ -159,27 +227,6 @@ def test_unphysical_scenes_are_refused_by_name(scene, changes, message):
         simulate(None, scene.replace(**changes))
 
 
-def crossing_sheets():
-    """Two squares a few millimetres apart: every vertex has pairs."""
-    lower, upper = square(), square()
-    from eslr_jax.geometry.prepare import prepare_garment
-
-    rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
-    faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])
-    ones = np.ones((128, 1))
-    garment = prepare_garment(
-        rest, faces, skin_weights=ones, skin_indices=0 * ones.astype(int), allow_components=True
-    )
-    scene = prepare_scene(
-        garment, drifting_ball(3), options=SceneOptions(self_contact=True, start_at_rest=True)
-    )
-    close = rest.copy()
-    close[64:, 1] -= 0.016
-    return scene.replace(
-        initial_state=initial_state(jnp.asarray(close, jnp.float32), jnp.zeros((128, 3), jnp.float32))
-    )
-
-
 @pytest.mark.slow
 def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     scene = crossing_sheets()
@@ -224,6 +271,57 @@ def test_a_body_too_fast_to_follow_is_told(scene):
         simulate(None, fast, config=SOLVER)
 
 
+def test_a_body_that_jumps_away_from_the_cloth_is_not_too_fast_to_follow(scene):
+    body = scene.body
+    fallen = scene.replace(
+        body=body.replace(positions=body.positions.at[5:].add(jnp.array([0.0, -0.4, 0.0])))
+    )
+    trajectory = simulate(None, fallen, config=SOLVER).trajectory
+    assert (trajectory.num_frames, int(trajectory.first_bad_frame)) == (14, -1)
+
+
+def test_a_limb_that_jumps_into_its_sleeve_is_too_fast_to_follow(small_scene):
+    body = small_scene.body
+    for jump, is_followed in ((0.2, True), (0.4, False)):
+        jumped = body.replace(positions=body.positions.at[3:].add(jnp.array([jump, 0.0, 0.0])))
+        ended = simulate(None, small_scene.replace(body=jumped), config=SOLVER, raises=False).trajectory
+        assert (Status.BODY_TOO_FAST in Status(int(ended.status))) != is_followed
+    assert int(ended.first_bad_frame) == 3
+    with pytest.raises(MotionError, match="frame 3: the body moved farther in one frame than contacts can"):
+        raise_for_status(ended)
+
+
 def test_a_negative_number_of_iterations_is_refused():
     with pytest.raises(ValueError, match="iterations must not be negative"):
         dataclasses.replace(SOLVER, iterations=-1)
+
+
+def test_a_buffer_without_a_row_is_refused():
+    with pytest.raises(ConfigError, match="one row or more"):
+        PairCapacity(pairs=0)
+
+
+def test_a_scene_of_one_frame_is_refused(scene):
+    with pytest.raises(MotionError, match="1 frame"):
+        simulate(None, first_frames(scene, 1), config=SOLVER)
+
+
+def test_frames_after_a_bad_one_are_simulated_again(scene):
+    whole = simulate(None, scene, config=SOLVER).trajectory
+    bad = whole.replace(
+        positions=whole.positions.at[7:].set(jnp.nan),
+        status=jnp.int32(Status.NON_FINITE),
+        first_bad_frame=jnp.int32(7),
+    )
+    again = simulate(None, scene, config=SOLVER, done=bad).trajectory
+    np.testing.assert_array_equal(again.positions, whole.positions)
+    assert int(again.status) == Status.OK
+
+
+def test_the_first_bad_frame_is_a_row_of_the_trajectory(scene):
+    """A scene that begins later counts its frames from there: gusts depend on the time."""
+    nothing = jnp.full_like(scene.initial_state.velocity, jnp.nan)
+    late = scene.initial_state.replace(frame=jnp.int32(50), velocity=nothing)
+    ended = simulate(None, scene.replace(initial_state=late), config=SOLVER, raises=False).trajectory
+    assert int(ended.first_bad_frame) == 1
+    assert good_frames(ended).num_frames == 1

@@ -158,7 +158,10 @@ class ESLR_OT_simulate(bpy.types.Operator):
             if not is_done:
                 return None
             positions = exchange.read_motion(self._folder / "motion.npz", self._garment)
-            exchange.lay_cache(self._garment, positions, self._cache_path(settings), context.scene)
+            start = exchange.read_start(self._folder / "run" / "report.json")
+            exchange.lay_cache(
+                self._garment, positions, self._cache_path(settings), context.scene, start=start
+            )
         except (ExchangeError, JobError, OSError) as error:
             self._job.cancel()
             self._end(context)

@@ -133,8 +133,16 @@ def read_motion(path: Path, garment: bpy.types.Object) -> np.ndarray:
     return to_z_up(positions)
 
 
+def read_start(path: Path) -> float:
+    """Return at what time of the animation a simulation begins [s], which its `report.json` tells.
+
+    A pose from which the character jumps into the animation, such as a T-pose, is not simulated.
+    """
+    return float(json.loads(path.read_text()).get("motion_start_s", 0.0))  # missing in older versions
+
+
 def lay_cache(
-    garment: bpy.types.Object, positions: np.ndarray, path: Path, scene: bpy.types.Scene
+    garment: bpy.types.Object, positions: np.ndarray, path: Path, scene: bpy.types.Scene, *, start: float
 ) -> bpy.types.Modifier:
     """Let a garment follow positions by a point cache, which comes before its other modifiers.
 
@@ -142,9 +150,10 @@ def lay_cache(
 
     Args:
         garment: The garment.
-        positions: Vertices in world space [m], shape [frames, vertices, 3]; the first frame is the scene's.
+        positions: Vertices in world space [m], shape [frames, vertices, 3].
         path: The PC2 file to write.
         scene: Its first frame and its rate tell when.
+        start: Time from the scene's first frame to that of the positions [s].
     """
     back = np.linalg.inv(np.array(garment.matrix_world))
     local = (positions @ back[:3, :3].T + back[:3, 3]).astype("<f4")
@@ -162,6 +171,7 @@ def lay_cache(
     garment.modifiers.move(len(garment.modifiers) - 1, 0)
     cache.cache_format, cache.filepath = "PC2", str(path)
     cache.forward_axis, cache.up_axis = "POS_Y", "POS_Z"  # as they are
-    cache.frame_start = scene.frame_start
     cache.frame_scale = FPS * scene.render.fps_base / scene.render.fps  # samples per frame
+    # Blender takes it from the scaled frame, so it counts samples (`MOD_meshcache.cc`).
+    cache.frame_start = cache.frame_scale * scene.frame_start + FPS * start
     return cache

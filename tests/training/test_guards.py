@@ -1,0 +1,134 @@
+"""What training does where something goes wrong: updates skipped, trajectories started anew, runs ended."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cloth import make_garment, make_limb, make_sheet, swing_motion
+
+from eslr_jax.config import TrainConfig
+from eslr_jax.errors import CapacityError, NonFiniteError
+from eslr_jax.models.registry import init_model
+from eslr_jax.training.checkpoint import Checkpoints
+from eslr_jax.training.data import build_training_data
+from eslr_jax.training.loop import train
+from eslr_jax.training.pool import start_trajectory
+from eslr_jax.training.step import _advance, _Horizon, init_train_state, make_train_step, slot_problem
+
+
+@pytest.fixture(scope="module")
+def config(cheap_model):
+    return TrainConfig(
+        model=cheap_model, steps=6, warmup=1, slots_per_garment=1, log_every=2, horizon_growth=1
+    )
+
+
+def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_starts_anew(
+    config, small_data
+):
+    step = make_train_step(config, 0)
+
+    def take_step(state):
+        state, metrics = step(
+            jax.tree.map(jnp.array, state), small_data
+        )  # a copy: the step donates its state
+        return jax.device_get(state), jax.device_get(metrics)
+
+    first, metrics = take_step(init_train_state(config, (small_data,)))
+    assert (first.skipped, metrics["resets"]) == (0, 0.0)
+    assert first.pools[0].is_done[0], "it has reached its horizon of one frame"
+    state, metrics = take_step(first)
+    assert (metrics["resets"], state.pools[0].age[0], state.pools[0].is_done[0]) == (0.0, 1, False)
+
+    cloth = state.pools[0].state
+    place = cloth.position.copy()
+    place[0, 7] = np.nan
+    pool = state.pools[0].replace(state=cloth.replace(position=place))
+    bad, metrics = take_step(state.replace(pools=(pool,)))
+    assert not np.isfinite(metrics["loss"])
+    assert (bad.skipped, bad.step) == (1, 3)
+    jax.tree.map(np.testing.assert_array_equal, bad.params, state.params)
+    jax.tree.map(np.testing.assert_array_equal, bad.optimizer, state.optimizer)
+    assert metrics["resets"] == 1.0
+    assert bad.pools[0].is_done[0]
+
+    after, metrics = take_step(bad)
+    assert np.isfinite(metrics["loss"])
+    assert (after.skipped, after.pools[0].age[0], metrics["resets"]) == (1, 1, 0.0)
+    assert np.isfinite(after.pools[0].state.position).all()
+    moved = jax.tree.map(lambda new, old: np.any(new != old), after.params["params"], bad.params["params"])
+    assert np.mean(jax.tree.leaves(moved)) > 0.8
+
+
+def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
+    config, cheap_model, small_data, tmp_path
+):
+    bad = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), init_model(cheap_model)["params"])
+    patient = dataclasses.replace(config, max_skipped=3)
+    with pytest.raises(NonFiniteError, match=r"^4 updates were not finite by step 4; .* checkpoint is 0, "):
+        train(patient, tmp_path, datasets=(small_data,), initial_params={"params": bad})
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [2, 4], "three updates may be skipped"
+    assert Checkpoints(tmp_path).latest() == 0
+    assert not (tmp_path / "model.npz").exists()
+    empty = init_train_state(patient, (small_data,)).pools
+    with np.load(tmp_path / "offending_state.npz") as arrays:
+        leaves = [arrays[str(place)] for place in range(len(arrays.files))]
+    (pool,) = jax.tree.unflatten(jax.tree.structure(empty), leaves)
+    assert pool.state.position.shape == empty[0].state.position.shape
+    assert pool.age[0] > 0, "of the last step, not of the first"
+
+
+@pytest.mark.parametrize("wrong", ["nothing", "horizon", "stretch", "displacement", "not a number"])
+def test_a_trajectory_is_astray_where_it_stretches_or_jumps_too_far_and_done_at_its_horizon_too(
+    advance, wrong
+):
+    slot, at = advance
+    place = np.asarray(slot.state.position)
+    middle = place.mean(axis=0)
+    onward = {
+        "stretch": middle + 2.6 * (place - middle),  # moves no vertex by 0.3 m
+        "displacement": place + np.float32([0.0, 0.31, 0.0]),
+        "not a number": np.where(np.arange(len(place))[:, None] == 7, np.float32(np.nan), place),
+    }.get(wrong, place)
+    moved, is_astray = at(onward, 1 if wrong == "horizon" else 2)
+    assert bool(is_astray) == (wrong not in ("nothing", "horizon"))
+    assert bool(moved.is_done) == (wrong != "nothing")
+    assert (int(moved.age), int(moved.before)) == (1, int(slot.frame))
+    np.testing.assert_array_equal(moved.state.position, onward)
+
+
+@pytest.fixture(scope="module")
+def advance(config, small_data):
+    """A trajectory at its start, and a function that moves it to where the network would take it."""
+    index = jnp.int32(0)
+    slot = jax.jit(lambda key: start_trajectory(key, small_data, index, config))(jax.random.key(0))
+    problem = jax.jit(lambda slot: slot_problem(slot, small_data, index, config))(slot)
+
+    @jax.jit
+    def at(onward, frames):
+        horizon = _Horizon(frames, config.reset_stretch, config.reset_displacement)
+        return _advance(slot, problem, SimpleNamespace(onward=onward), small_data, horizon)
+
+    return slot, lambda onward, frames: at(jnp.asarray(onward, jnp.float32), jnp.int32(frames))
+
+
+def test_a_run_whose_cloth_needs_more_self_contact_than_fits_ends_with_a_remedy(config, tmp_path):
+    """Six small sheets two millimetres apart: every vertex has more pairs than rows."""
+    sheet, faces = make_sheet(4, 4, 0.015, jitter=0)
+    sheet += np.array([0.0, 0.16, 0.0]) - sheet.mean(axis=0)
+    pile = np.concatenate([np.add(sheet, [0.0, 0.002 * layer, 0.0]) for layer in range(6)])
+    body = make_limb()
+    garment = make_garment(pile, np.concatenate([faces + len(sheet) * layer for layer in range(6)]))
+    data = build_training_data([garment], body, [swing_motion(body, 4)])
+    layered = dataclasses.replace(config, self_contact=True)
+    with pytest.raises(
+        CapacityError, match=r"than its buffers have by step 2; train with self_contact = fal"
+    ):
+        train(layered, tmp_path, datasets=(data,))
+    (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(line)["overflows"] == 1.0
