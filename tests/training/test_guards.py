@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,10 @@ from eslr_jax.models.registry import init_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train
+from eslr_jax.training.loss import LossReport
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import _advance, _Horizon, init_train_state, make_train_step, slot_problem
+from eslr_jax.types import PotentialTerms
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,8 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_
     step = make_train_step(config, 0)
 
     def take_step(state):
-        state, metrics = step(
-            jax.tree.map(jnp.array, state), small_data
-        )  # a copy: the step donates its state
+        copied = jax.tree.map(jnp.array, state)  # a step donates its state
+        state, metrics = step(copied, small_data)
         return jax.device_get(state), jax.device_get(metrics)
 
     first, metrics = take_step(init_train_state(config, (small_data,)))
@@ -80,7 +80,7 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
         leaves = [arrays[str(place)] for place in range(len(arrays.files))]
     (pool,) = jax.tree.unflatten(jax.tree.structure(empty), leaves)
     assert pool.state.position.shape == empty[0].state.position.shape
-    assert pool.age[0] > 0, "of the last step, not of the first"
+    assert pool.age[0] > 0, "what the network did, not where the run began"
 
 
 @pytest.mark.parametrize("wrong", ["nothing", "horizon", "stretch", "displacement", "not a number"])
@@ -92,7 +92,7 @@ def test_a_trajectory_is_astray_where_it_stretches_or_jumps_too_far_and_done_at_
     middle = place.mean(axis=0)
     onward = {
         "stretch": middle + 2.6 * (place - middle),  # moves no vertex by 0.3 m
-        "displacement": place + np.float32([0.0, 0.31, 0.0]),
+        "displacement": place + np.array([0.0, 0.31, 0.0], np.float32),
         "not a number": np.where(np.arange(len(place))[:, None] == 7, np.float32(np.nan), place),
     }.get(wrong, place)
     moved, is_astray = at(onward, 1 if wrong == "horizon" else 2)
@@ -108,11 +108,12 @@ def advance(config, small_data):
     index = jnp.int32(0)
     slot = jax.jit(lambda key: start_trajectory(key, small_data, index, config))(jax.random.key(0))
     problem = jax.jit(lambda slot: slot_problem(slot, small_data, index, config))(slot)
+    terms = PotentialTerms(*jnp.zeros(len(PotentialTerms._fields)))
 
     @jax.jit
     def at(onward, frames):
         horizon = _Horizon(frames, config.reset_stretch, config.reset_displacement)
-        return _advance(slot, problem, SimpleNamespace(onward=onward), small_data, horizon)
+        return _advance(slot, problem, LossReport(onward, terms, jnp.float32(0.0)), small_data, horizon)
 
     return slot, lambda onward, frames: at(jnp.asarray(onward, jnp.float32), jnp.int32(frames))
 
