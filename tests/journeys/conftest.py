@@ -48,8 +48,9 @@ def fit_report(eslr):
 def worn(eslr):
     """A function that simulates a garment file and returns the report and the trajectory's arrays."""
 
-    def run(path, out, *options, frames=20):
-        words = ("--simulator", "physics", "--iterations", 20, "--frames", frames, "--no-pictures", "--json")
+    def run(path, out, *options, frames=20, iterations=20):
+        words = ("--simulator", "physics", "--iterations", iterations, "--frames", frames)
+        words += ("--no-pictures", "--json")
         result = eslr("simulate", "--garment", path, *words, *options, "--out", out)
         assert result.returncode == 0, result.stderr
         with np.load(out / "trajectory.npz") as arrays:

@@ -46,7 +46,7 @@ def motions(tmp_path_factory, body):
         (tube_dress, "hood.pkl", 1.45, 1.0),
         # Fingers, which are no obstacles, are 12 mm in the cloth, and the report has 26 mm beside an elbow.
         (poncho, "cmu_01_01.bvh", 1.9, 33.0),
-        (cape, "amass.npz", 2.2, 1.4),
+        (cape, "amass.npz", 1.7, 1.0),
     ],
 )
 def test_a_foreign_garment_is_worn_on_a_foreign_motion(
@@ -54,7 +54,9 @@ def test_a_foreign_garment_is_worn_on_a_foreign_motion(
 ):
     path = write_obj(tmp_path / "garment.obj", shape())
     loop = ("--loop", 40) if motion.startswith("makehuman") else ()  # it has 17 frames
-    report, run = worn(path, tmp_path / "run", "--motion", motions / motion, *loop, frames=40)
+    # The cape, which starts on the shoulders, has not settled by frame 0 with twenty: it sinks by 0.2 m then.
+    words = ("--motion", motions / motion, *loop)
+    report, run = worn(path, tmp_path / "run", *words, frames=40, iterations=100 if shape is cape else 20)
     cloth, wearer = run["positions"], run["body_positions"]
     above = cloth[..., 1].mean(axis=1) - wearer[..., 1].mean(axis=1)
     assert abs(above[-1] - above[0]) < 0.1, "it falls off"
