@@ -121,6 +121,9 @@ class Material:
     threads: Threads | None = None  # stretch and shear, in the place of the Lame parameters
 
 
+MIN_DEVIATION = 1e-8  # floor of a feature's standard deviation (HOOD)
+
+
 @struct.dataclass
 class Normalizer:
     """Mean and spread of a set of features over every row seen so far; see `graph.normalizer`."""

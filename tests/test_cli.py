@@ -11,9 +11,11 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from formats import write_bvh
 from garment_files import scanned_tshirt
 
-from eslr_jax.assets import load_garment_file
+from eslr_jax.assets import load_body, load_garment_file, load_motion
+from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.io.garment import read_garment_npz
@@ -280,33 +282,12 @@ def test_no_iterations_are_those_of_a_network_alone():
         assert (method.simulator, method.config.iterations) == expected
 
 
-BVH_OF_BONES = """HIERARCHY
-ROOT Bone.000
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  JOINT Bone.001
-  {
-    OFFSET 0 1 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 0 1 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333
-0 0 0 0 0 0 0 0 0
-0 0 0 0 0 0 0 0 0
-"""
-
-
 def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, capsys):
     from eslr_jax.cli.bodies import joints
 
-    (tmp_path / "a.bvh").write_text(BVH_OF_BONES)
+    walk = skeleton_motion(load_motion("cmu_016_32"), load_body())
+    bones = [f"Bone.{number:03}" for number in range(len(walk.skeleton.joint_names))]
+    write_bvh(tmp_path / "a.bvh", walk, names=bones)
     joints(str(tmp_path / "a.bvh"), out=tmp_path / "map.json")
     values = json.loads((tmp_path / "map.json").read_text())
     assert values["LeftArm"] == ""

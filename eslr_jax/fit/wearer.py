@@ -41,7 +41,7 @@ def check_wearer(garment: GarmentFile, body: Body, name: str) -> None:
         strangers = [joint for joint in (*names, *own) if (joint in names) != (joint in own)]
         which = ", ".join(strangers[:3]) or "in another order"
         raise MeshError(f"{name} was fitted to another body, with other joints ({which}); {_REMEDY}")
-    away = np.linalg.norm(joints - np.asarray(body.joint_rest_positions), axis=1)
+    away = _distances(joints, np.asarray(body.joint_rest_positions))
     if away.max(initial=0.0) > _SAME_JOINT:
         joint = int(away.argmax())
         raise MeshError(
@@ -62,12 +62,16 @@ def common_wearer(garments: Sequence[GarmentFile], names: Sequence[str]) -> dict
         for garment, name in zip(garments, names, strict=True)
         if "body" in garment.metadata
     ]
-    for name, joints, _ in known[1:]:
-        first, others, _ = known[0]
-        is_same = joints[0] == others[0] and np.allclose(joints[1], others[1], rtol=0.0, atol=_SAME_JOINT)
-        if not is_same:
+    for name, (own, places), _ in known[1:]:
+        first, (theirs, others), _ = known[0]
+        if own != theirs or _distances(places, others).max(initial=0.0) > _SAME_JOINT:
             raise MeshError(f"{name} was fitted to another body than {first}; fit both to the same one")
     return {"body": known[0][2]} if known else {}
+
+
+def _distances(joints: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return how far the same joints of two bodies are apart at rest [m], shape [joints]."""
+    return np.linalg.norm(joints - others, axis=1)
 
 
 def _joints(garment: GarmentFile, name: str) -> tuple[list[str], np.ndarray]:

@@ -14,9 +14,8 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from eslr_jax.types import Normalizer
+from eslr_jax.types import MIN_DEVIATION, Normalizer
 
-MIN_DEVIATION = 1e-8  # floor of the standard deviation (HOOD)
 WARMUP_UPDATES = 100  # graphs seen before weights are trained (HOOD)
 MAX_UPDATES = 1_000_000  # graphs after which statistics freeze (HOOD)
 

@@ -20,7 +20,7 @@ import numpy as np
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import CheckpointError
 from eslr_jax.io.torch_archive import read_torch
-from eslr_jax.types import Normalizer
+from eslr_jax.types import MIN_DEVIATION, Normalizer
 
 Tensors = Mapping[str, np.ndarray]
 
@@ -33,7 +33,6 @@ STAGES = (
     ("coarse_edge0", "mesh_edge"),
 )
 NUM_COARSE = 3  # coarse levels
-_MIN_DEVIATION = 1e-8  # by which HOOD divides a feature that never changed
 _NORMALIZERS = {"garment": "node", "mesh": "mesh_edge", "world": "world_edge", "output": "output"}
 _CORE = "_learned_model."
 
@@ -153,7 +152,7 @@ def _normalizer(tensors: Tensors, name: str) -> Normalizer:
         for part in ("_acc_sum", "_acc_sum_squared")
     )
     mean = total / max(count, 1.0)
-    least = count * _MIN_DEVIATION**2
+    least = count * MIN_DEVIATION**2  # HOOD divides a feature that never changed by its floor
     return Normalizer(
         count=np.float32(count),  # type: ignore[arg-type]
         mean=mean.astype(np.float32),  # type: ignore[arg-type]

@@ -124,8 +124,9 @@ def main() -> None:
             asked = with_changes(rows, name, has_controls)
             parts = rows_of_setting(found, setting)
             missing = asked if chosen.anew else {k: row for k, row in asked.items() if k not in parts["mean"]}
-            for result in energy_table(missing, setting, parts):
-                write(result, file)
+            if missing:  # else the near-optimal rollouts would be made for nothing
+                for result in energy_table(missing, setting, parts):
+                    write(result, file)
 
 
 def plan_trainings(rows: Rows, out: Path) -> tuple[Rows, list[Training]]:
