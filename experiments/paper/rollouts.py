@@ -42,6 +42,7 @@ EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which 
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
 _GAP_FRAMES = 10  # of every rollout, from whose states the gap is measured
+_GAPS = ("gap_mj", "gap_share", "own_gap_mj", "own_gap_share")
 
 
 def arguments(description: str | None) -> argparse.ArgumentParser:
@@ -179,7 +180,8 @@ def measure_system(
 ) -> dict[str, dict[str, float]]:
     """Return the measures of a system on every garment, and on "all" of them.
 
-    Energies and distances are means over frames, clips and garments; gaps are medians over frames.
+    Energies and distances are means over frames, clips and garments; gaps are medians over frames: from the
+    states of the near-optimal rollout ("gap"), and from those of the system's own ("own_gap").
     """
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
@@ -190,15 +192,19 @@ def measure_system(
         row = measure(trajectory, scene, worn.root_height())
         row["distance_mm"] = distance_mm(trajectory, reference, scene)
         left = stepped_potentials(params, reference, scene, system.config, every) - gap.optimum
+        own = trajectory_gap(trajectory, scene, every=every)
+        own_left = own.reached - own.optimum
         measured.setdefault(garment, []).append(row)
-        gaps.setdefault(garment, []).append(np.stack([left * 1e3, left / gap.initial_gap]))
+        gaps.setdefault(garment, []).append(
+            np.stack([left * 1e3, left / gap.initial_gap, own_left * 1e3, own_left / own.initial_gap])
+        )
     measured["all"] = list(itertools.chain.from_iterable(measured.values()))
     gaps["all"] = list(itertools.chain.from_iterable(gaps.values()))
     rows = {}
     for garment, found in measured.items():
-        energy, share = np.median(np.concatenate(gaps[garment], axis=1), axis=1)
+        medians = np.median(np.concatenate(gaps[garment], axis=1), axis=1)
         means = {column: float(np.mean([row[column] for row in found])) for column in found[0]}
-        rows[garment] = {**means, "gap_mj": float(energy), "gap_share": float(share)}
+        rows[garment] = {**means, **dict(zip(_GAPS, medians.tolist(), strict=True))}
     print(name, {column: round(value, 4) for column, value in rows["all"].items()}, flush=True)
     return rows
 

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.body.motion import pose_body
+from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import (
     CONTACT_RADIUS,
     are_pinched,
@@ -11,7 +14,10 @@ from eslr_jax.contact.nearest import (
     find_contacts,
     nearest_point,
 )
+from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
 
 find = jax.jit(find_contacts)
 
@@ -91,3 +97,27 @@ def test_beyond_the_boundary_of_a_part_nothing_is_touched(sphere):
     contacts = find(query, vertices, vertices, surface)
     np.testing.assert_array_equal(contacts.is_near, [False, True])
     assert contacts.distances[0] > 0
+
+
+@pytest.mark.slow  # a rollout of a garment of 4k vertices on each test clip
+@pytest.mark.parametrize("clip", load_splits()["motions"]["test"])
+def test_contacts_of_cloth_are_the_true_nearest_points_of_the_whole_body(clip):
+    poses = pose_body(load_body(), load_motion(clip), num_frames=41)
+    scene = prepare_scene(load_garment("tshirt", vertices="4k"), poses)
+    positions = rollout_scene(None, scene, SimConfig(iterations=20)).positions
+    assert scene.body is not None
+    surface, blocks, rows = scene.body.surface, scene.garment.vertex_blocks, np.arange(0, 4000, 4)
+    search = jax.jit(nearest_point)
+    obstacle = np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
+    errors = []
+    for frame in range(0, 41, 10):
+        found = search(positions[frame], scene.body.positions[frame], surface, blocks)
+        query, body = np.asarray(positions[frame])[rows], np.asarray(poses.positions[frame])
+        face, weights = closest_points(query, body, obstacle)
+        exact = np.linalg.norm(np.einsum("vc,vcx->vx", weights, body[obstacle[face]]) - query, axis=1)
+        is_near = exact < CONTACT_RADIUS
+        errors.append((np.sqrt(found.squared_distance)[rows] - exact)[is_near])
+    error = np.concatenate(errors)
+    print(f"{clip}: {len(error)} vertices, {np.mean(error > 1e-4):.3%} off by 0.1 mm, worst {error.max():.6f} m")
+    assert error.min() > -1e-5
+    assert np.mean(error > 1e-3) <= 1e-3
