@@ -9,9 +9,9 @@ Mixamo character, here it is every third clip of DeepMimic, a backflip, a roll a
 model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
-bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the gap,
-from the optimum's states and from its own, and the energies of free rollouts; a second row says it of the same
-network untrained.
+bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the
+gap, from the optimum's states and from its own, and the energies of free rollouts; a second row says it of the
+same network untrained.
 --controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
 
 --train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the

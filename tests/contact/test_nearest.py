@@ -118,6 +118,8 @@ def test_contacts_of_cloth_are_the_true_nearest_points_of_the_whole_body(clip):
         is_near = exact < CONTACT_RADIUS
         errors.append((np.sqrt(found.squared_distance)[rows] - exact)[is_near])
     error = np.concatenate(errors)
-    print(f"{clip}: {len(error)} vertices, {np.mean(error > 1e-4):.3%} off by 0.1 mm, worst {error.max():.6f} m")
+    print(
+        f"{clip}: {len(error)} vertices, {np.mean(error > 1e-4):.3%} off by 0.1 mm, worst {error.max():.6f} m"
+    )
     assert error.min() > -1e-5
     assert np.mean(error > 1e-3) <= 1e-3
