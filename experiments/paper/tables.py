@@ -119,11 +119,9 @@ def main() -> None:
             if chosen.smoke:
                 setting = setting._replace(garments=setting.garments[:1])
             file = chosen.out / f"{name}.json"
-            found = json.loads(file.read_text()) if file.exists() else {}
-            check_setting(found, setting, file)
+            parts = rows_of_setting(file, setting)
             has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
             asked = with_changes(rows, name, has_controls)
-            parts = rows_of_setting(found, setting)
             missing = asked if chosen.anew else {k: row for k, row in asked.items() if k not in parts["mean"]}
             if missing:  # else the near-optimal rollouts would be made for nothing
                 for result in energy_table(missing, setting, parts):
@@ -225,34 +223,24 @@ def training_cost(names: Sequence[str]) -> dict[str, float]:
     return {**costs[0], **hours}
 
 
-def check_setting(found: dict[str, Any], setting: Setting, file: Path) -> None:
-    """Refuse to write over a table of other garments, clips, frames or vertices.
+def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
+    """Return the parts of a table that was written before, row by row; empty ones where there is none.
 
     Raises:
-        SystemExit: Says which, and what to give.
+        SystemExit: It is of other garments, clips, frames or vertices and may not be written over. Says which
+            differ, and what to give.
     """
-    garments = found.get("garments", [])
-    rows = garments.values() if isinstance(garments, dict) else [garments] if garments else []
+    found = json.loads(file.read_text()) if file.exists() else {}
+    parts = {name: found.get(name, {}) for name in ("mean", "seeds", "garments")}
     asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
     differs = [name for name, value in asked.items() if found.get(name, value) != value]
-    differs += ["garments"] if any(set(row) != set(setting.garments) for row in rows) else []
+    if any(set(row) != set(setting.garments) for row in parts["garments"].values()):
+        differs.append("garments")
     if differs:
         raise SystemExit(
             f"{file} is of other {', '.join(differs)}; give another --out, or move the file away"
         )
-
-
-def rows_of_setting(known: dict[str, Any], setting: Setting) -> dict[str, dict[str, Any]]:
-    """Return the parts of a table that was written before, row by row; empty ones if its setting was another."""
-    parts = {name: dict(known.get(name, {})) for name in ("mean", "seeds", "garments")}
-    is_alike = [known.get(name) for name in ("clips", "frames", "vertices")] == [
-        list(setting.clips),
-        setting.frames,
-        setting.vertices,
-    ]
-    if is_alike and all(set(row) == set(setting.garments) for row in parts["garments"].values()):
-        return parts
-    return {name: {} for name in parts}
+    return parts
 
 
 def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:

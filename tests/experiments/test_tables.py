@@ -1,11 +1,10 @@
 """Tables of the paper that grow row by row."""
 
 import json
-from pathlib import Path
 
 import pytest
 from paper.rollouts import Setting, read_system
-from paper.tables import DEEP, check_setting, plan_trainings, rows_of_setting
+from paper.tables import DEEP, plan_trainings, rows_of_setting
 
 from eslr_jax.assets.catalog import asset_names
 from eslr_jax.training.recipe import load_recipe
@@ -20,30 +19,33 @@ TABLE = {
 }
 
 
-def test_rows_of_the_same_setting_are_kept():
-    kept = rows_of_setting(json.loads(json.dumps(TABLE)), SETTING)
-    assert kept == {name: TABLE[name] for name in ("mean", "seeds", "garments")}
+@pytest.fixture
+def file(tmp_path):
+    """Return the file of a table."""
+    file = tmp_path / "table.json"
+    file.write_text(json.dumps(TABLE))
+    return file
 
 
-def test_rows_of_another_setting_are_dropped():
-    for other in (
-        SETTING._replace(garments=("tshirt",)),
-        SETTING._replace(clips=("cmu_016_29",)),
-        SETTING._replace(frames=50),
-    ):
-        assert not any(rows_of_setting(json.loads(json.dumps(TABLE)), other).values())
+def test_rows_of_the_same_setting_are_kept(file):
+    assert rows_of_setting(file, SETTING) == {name: TABLE[name] for name in ("mean", "seeds", "garments")}
 
 
-def test_a_table_of_another_setting_is_not_written_over():
-    check_setting({}, SETTING, Path("table.json"))
-    check_setting(json.loads(json.dumps(TABLE)), SETTING, Path("table.json"))
-    for other, name in (
+def test_without_a_table_there_are_no_rows(tmp_path):
+    assert rows_of_setting(tmp_path / "table.json", SETTING) == {"mean": {}, "seeds": {}, "garments": {}}
+
+
+@pytest.mark.parametrize(
+    ("other", "name"),
+    [
         (SETTING._replace(garments=("tshirt",)), "garments"),
         (SETTING._replace(clips=("cmu_016_29",)), "clips"),
         (SETTING._replace(frames=50), "frames"),
-    ):
-        with pytest.raises(SystemExit, match=f"other {name}; give another --out"):
-            check_setting(json.loads(json.dumps(TABLE)), other, Path("table.json"))
+    ],
+)
+def test_a_table_of_another_setting_is_not_written_over(file, other, name):
+    with pytest.raises(SystemExit, match=f"other {name}; give another --out"):
+        rows_of_setting(file, other)
 
 
 def test_controls_of_weights_show_no_training_cost():
