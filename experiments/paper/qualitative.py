@@ -27,7 +27,7 @@ from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
-ABLATION = ("mgn-small-6k", "gsa-small-6k", "lsdmp-small-6k", "eslr-small-6k")
+ABLATION = ("mgn-5-correction", "gsa-5-correction", "lsdmp-5-correction", "eslr-5-correction")
 MODELS = (*ABLATION, "eslr-small", "smooth-small+20", OPTIMUM)
 _SIZE = (240, 340)  # of a picture, width and height [pixels]
 _CAMERA = 25.0  # [degrees] from the front towards the side
