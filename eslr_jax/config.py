@@ -98,6 +98,10 @@ class ModelConfig:
             )
         if self.hierarchical and not (self.update_body and self.edge_latents):
             raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
+        if self.update_body and not self.edge_latents:
+            raise ValueError(
+                "update_body = true needs edge_latents = true: without messages no body row is read"
+            )
         features = "hood" if self.output == "acceleration" else "gradient"  # without a guess, or of one
         if self.features != features:
             raise ValueError(f'output = "{self.output}" needs features = "{features}"')
@@ -213,6 +217,12 @@ class TrainConfig:
             raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
         if self.criterion != "postcvpr" and self.energy_set != "hood":
             raise ValueError(f'criterion = "{self.criterion}" needs energy_set = "hood"')
+        if self.self_contact and self.energy_set == "hood":
+            raise ValueError('self_contact = true needs energy_set = "consistent": HOOD has no energy for it')
+        if self.refinement_weights != "equal" and self.iterations:
+            raise ValueError(f'refinement_weights = "{self.refinement_weights}" needs iterations = 0')
+        if self.refinement_weights == "contraction" and self.model.refinement_steps == 1:
+            raise ValueError('refinement_weights = "contraction" needs a model with refinement_steps > 1')
         for name in ("noise", "girth", "shape_range"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")

@@ -41,6 +41,10 @@ def test_nested_unknown_key_names_its_table():
         ({"features": "magic"}, "not one of"),
         ({"refinement_steps": 3}, "refinement_steps > 1 needs"),
         ({"output_scale": -1.0}, "must be positive"),
+        (
+            {"update_body": True, "edge_latents": False, "features": "gradient", "output": "correction"},
+            "update_body = true needs edge_latents = true",
+        ),
     ],
 )
 def test_impossible_values_name_the_field(values, message):
@@ -68,6 +72,8 @@ def test_recipe_takes_a_model_by_name(tmp_path):
     config = load_recipe(path, {"model.refinement_steps": 2})
     assert (config.steps, config.model.refinement_steps, config.model.latent_size) == (10, 2, 32)
     assert from_dict(TrainConfig, json.loads(json.dumps(to_dict(config)))) == config
+    path.write_text("steps = 10\n")
+    assert load_recipe(path, {"model.base": "eslr-small", "model.refinement_steps": 2}) == config
 
 
 @pytest.mark.parametrize(
@@ -80,6 +86,9 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('model = "eslr-small"\nhorizon = 0', "horizon must be at least 1"),
         ('[model]\nbase = "mgn-5"\noutput = "correction"', 'needs features = "gradient"'),
         ('[model]\nbase = "mgn-5"\nfeatures = "gradient"', 'needs features = "hood"'),
+        ('model = "mgn-5"\nenergy_set = "hood"\nself_contact = true', 'needs energy_set = "consistent"'),
+        ('model = "smooth-small"\niterations = 9\nrefinement_weights = "last"', "needs iterations = 0"),
+        ('model = "mgn-5"\nrefinement_weights = "contraction"', "refinement_steps > 1"),
     ],
 )
 def test_broken_recipes_are_refused(tmp_path, text, message):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ class Checkpoints:
     """The checkpoints of one output folder."""
 
     def __init__(self, folder: Path):
-        """Open the folder; it is created on the first save."""
+        """Open the folder, and create it."""
         options = ocp.CheckpointManagerOptions(
             max_to_keep=_KEPT, create=True, enable_async_checkpointing=True
         )
@@ -36,8 +38,12 @@ class Checkpoints:
         """Start writing a checkpoint; the state may be donated as soon as this returns.
 
         Source: orbax copies to the host before it returns, and renames the folder when it is whole.
+
+        Raises:
+            CheckpointError: This checkpoint, or the one before it, could not be written.
         """
-        self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
+        with _explained():
+            self._manager.save(int(state.step), args=ocp.args.StandardSave(_plain(state)))
 
     def wait(self) -> None:
         """Wait for what is being written, and raise its error.
@@ -45,17 +51,8 @@ class Checkpoints:
         Raises:
             CheckpointError: The checkpoint could not be written, as on a full disk.
         """
-        try:
+        with _explained():
             self._manager.wait_until_finished()
-        except (OSError, ValueError) as error:
-            text = one_line(error)
-            raise CheckpointError(
-                f"a checkpoint could not be written: {text}; free some space and resume"
-            ) from error
-
-    def latest(self) -> int | None:
-        """Return the step of the newest whole checkpoint."""
-        return self._manager.latest_step()
 
     def restore(self, example: TrainState) -> TrainState:
         """Return the newest checkpoint that can be read, and drop damaged ones that are newer.
@@ -94,6 +91,17 @@ class Checkpoints:
         """Finish writing and release the folder."""
         self.wait()
         self._manager.close()
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    """Raise a CheckpointError, with a remedy, where writing fails."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise CheckpointError(
+            f"a checkpoint could not be written: {one_line(error)}; free some space and resume"
+        ) from error
 
 
 def _plain(state: TrainState) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     """Load the garments at one resolution and the clips of a training run.
 
     Raises:
-        ConfigError: The split is unknown or empty, or no clip has two frames.
+        ConfigError: The split is unknown or empty.
         AssetError: A garment does not exist.
     """
     options = config.model.garment_options
@@ -135,7 +135,8 @@ def build_training_data(
         has_shapes: Trajectories draw the coefficients of the body's shape.
 
     Raises:
-        ConfigError: The garments are not near the body, or the body has no shapes and they are asked for.
+        ConfigError: The garments are not near the body, no clip has two frames, or the body has no shapes and
+            they are asked for.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *garments)
     surface = shared_surface(garments, body)
@@ -143,6 +144,8 @@ def build_training_data(
         raise ConfigError("none of the garments is near the body; train on garments that are worn")
     surface_rest = jnp.asarray(body.rest_positions[surface.vertex_ids])
     rotations, translations, frames_left = _join_clips(motions)
+    if not np.any(frames_left):
+        raise ConfigError("no clip has two frames; train on clips in which something moves")
     shapes = None
     if has_shapes:
         if not body.shape_directions.shape[-1]:

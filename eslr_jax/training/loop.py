@@ -72,8 +72,8 @@ def train(
     folders = [ensure_output_dir(folder) for folder in seed_folders(config, out)]
     if resume:
         state = checkpoints.restore(state)
-        for folder in folders:
-            _forget_after(folder / "metrics.jsonl", int(state.step))
+    for folder in folders:
+        _forget_after(folder / "metrics.jsonl", int(state.step))
     if is_first_process():
         write_run_config(out, config)
     if not resume:
@@ -111,7 +111,7 @@ def train(
                     log.write(json.dumps(record) + "\n")
                     log.flush()
                 on_progress(done, config.steps, records[0])
-                _check_skipped(state, config, checkpoints, out)
+                _check_skipped(state, config, checkpoints, folders)
                 if overflowed:
                     raise CapacityError(
                         f"self-contact needed more room than its buffers have by step {done}; train with "
@@ -124,9 +124,8 @@ def train(
                     checkpoints.save(state)
                 break
     checkpoints.close()
-    if int(state.step) >= config.steps and is_first_process():
-        for place, (one, folder) in enumerate(zip(seed_configs(config), folders, strict=True)):
-            export(take_seed(state, place) if config.seeds > 1 else state, one, folder)
+    if int(state.step) >= config.steps:
+        export(state, config, [folder / "model.npz" for folder in folders])
     return state
 
 
@@ -148,17 +147,19 @@ def _is_stopping(stop: Interruption, done: int) -> bool:
     return stop.is_wanted
 
 
-def export(state: TrainState, config: TrainConfig, out: Path) -> Path:
-    """Write the network of a run as npz and JSON, and return the npz file."""
-    path = out / "model.npz"
-    training = {
-        "steps": int(state.step),
-        "garments": config.garments,
-        "vertices": config.vertices,
-        "core_hours": core_seconds(out) / 3600 / config.seeds,  # seeds share the run
-    }
-    write_weights(path, jax.device_get(state.params), config.model, training)
-    return path
+def export(state: TrainState, config: TrainConfig, paths: list[Path]) -> None:
+    """Write the networks of a run, one a seed, as npz and JSON."""
+    if not is_first_process():
+        return
+    for place, path in enumerate(paths):
+        own = take_seed(state, place) if config.seeds > 1 else state
+        training = {
+            "steps": int(own.step),
+            "garments": config.garments,
+            "vertices": config.vertices,
+            "core_hours": core_seconds(path.parent) / 3600 / config.seeds,  # seeds share the run
+        }
+        write_weights(path, jax.device_get(own.params), config.model, training)
 
 
 def core_seconds(out: Path) -> float:
@@ -193,7 +194,7 @@ def _metrics_file(folder: Path) -> Path:
 
 
 def _forget_after(metrics: Path, step: int) -> None:
-    """Drop the records of steps that a killed run did after its last checkpoint: they come again."""
+    """Drop the records of steps that come again, as of a killed run after its last checkpoint."""
     if not is_first_process() or not metrics.exists():
         return
     lines = metrics.read_text().splitlines()
@@ -219,17 +220,20 @@ def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, flo
     return [{name: float(values[place]) for name, values in centers.items()} for place in range(seeds)]
 
 
-def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:
-    """Stop a run that produces nothing but NaN."""
+def _check_skipped(
+    state: TrainState, config: TrainConfig, checkpoints: Checkpoints, folders: list[Path]
+) -> None:
+    """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied."""
     skipped = int(np.max(state.skipped))
-    if skipped > config.max_skipped:
-        checkpoints.wait()
-        last = checkpoints.latest()
-        np.savez(
-            out / "offending_state.npz",
-            **{str(i): leaf for i, leaf in enumerate(jax.tree.leaves(jax.device_get(state.pools)))},
-        )
-        raise NonFiniteError(
-            f"{skipped} updates were not finite by step {int(state.step)}; the last good checkpoint "
-            f"is {last}, the offending trajectories are in {out / 'offending_state.npz'}; lower the learning rate"
-        )
+    if skipped <= config.max_skipped:
+        return
+    checkpoints.wait()
+    weights = [folder / "last_finite.npz" for folder in folders]
+    export(state, config, weights)
+    trajectories = folders[0] / "offending_state.npz"
+    leaves = jax.tree.leaves(jax.device_get(state.pools))
+    np.savez(trajectories, **{str(number): leaf for number, leaf in enumerate(leaves)})
+    raise NonFiniteError(
+        f"{skipped} updates were not finite by step {int(state.step)}; their trajectories are in {trajectories}. "
+        f"Begin another run with a lower learning_rate; --start-from {weights[0]} keeps what was learned"
+    )

@@ -119,6 +119,6 @@ def _mean_contraction(energies: Float[Array, " energies"]) -> Float[Array, ""]:
     """
     fixed = jax.lax.stop_gradient(energies)
     gap = fixed[:-1] - fixed[-1]
-    floor = _MIN_GAP * jnp.maximum(gap[0], 0.0)
-    reference = jnp.where(floor > 0, jnp.maximum(gap, floor), 1.0)
+    # By size, as a prediction may be worse than the guess.
+    reference = jnp.maximum(jnp.abs(gap), jnp.maximum(_MIN_GAP * jnp.abs(gap[0]), _MIN_INITIAL_GAP))
     return jnp.mean((energies[1:] - fixed[-1]) / reference)

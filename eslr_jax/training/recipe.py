@@ -30,10 +30,12 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
         if "base" in values:
             raise ConfigError(f"{base} has a base of its own; give {path} the values of both")
     overrides = dict(overrides or {})
-    model = overrides.pop("model", values.get("model"))
-    values["model"] = {"base": model} if isinstance(model, str) else model
+    if "model" in overrides:
+        values["model"] = overrides.pop("model")
+    if isinstance(values.get("model"), str):
+        values["model"] = {"base": values["model"]}
     apply_overrides(values, overrides)
-    model = values["model"]
+    model = values.get("model")
     if isinstance(model, dict) and "base" in model:
         base = model.pop("base")
         if base not in MODELS:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
+from eslr_jax.assets.load import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, NonFiniteError
 from eslr_jax.models.registry import init_model
@@ -69,13 +70,16 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
 ):
     bad = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), init_model(cheap_model)["params"])
     patient = dataclasses.replace(config, max_skipped=3)
-    with pytest.raises(NonFiniteError, match=r"^4 updates were not finite by step 4; .* checkpoint is 0, "):
+    with pytest.raises(NonFiniteError, match=r"^4 updates were not finite by step 4; .* --start-from "):
         train(patient, tmp_path, datasets=(small_data,), initial_params={"params": bad})
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [2, 4], "three updates may be skipped"
-    assert Checkpoints(tmp_path).latest() == 0
     assert not (tmp_path / "model.npz").exists()
-    empty = init_train_state(patient, (small_data,)).pools
+    start = init_train_state(patient, (small_data,))
+    assert Checkpoints(tmp_path).restore(start).step == 0
+    kept, _ = load_model(str(tmp_path / "last_finite.npz"))
+    jax.tree.map(np.testing.assert_array_equal, kept["params"], bad)
+    empty = start.pools
     with np.load(tmp_path / "offending_state.npz") as arrays:
         leaves = [arrays[str(place)] for place in range(len(arrays.files))]
     (pool,) = jax.tree.unflatten(jax.tree.structure(empty), leaves)

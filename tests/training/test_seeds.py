@@ -9,8 +9,9 @@ import signal
 
 import jax
 import numpy as np
+import pytest
 
-from eslr_jax.assets.load import load_model
+from eslr_jax.assets.load import load_model, model_record
 from eslr_jax.config import TrainConfig
 from eslr_jax.training.loop import train
 from eslr_jax.training.seeds import make_seeds_step, stack_seeds, take_seed
@@ -57,6 +58,8 @@ def test_a_run_of_two_seeds_goes_on_and_exports_both(small_data, cheap_model, tm
         records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         assert [record["step"] for record in records] == [1, 2, 3, 4, 5]
         params, _ = load_model(str(folder / "model.npz"))
+        hours = records[-1]["core_seconds"] / 3600
+        assert model_record(str(folder / "model.npz"))["core_hours"] == pytest.approx(hours / 2)
         for exported, trained in zip(
             jax.tree.leaves(params), jax.tree.leaves(take_seed(state, place).params), strict=True
         ):

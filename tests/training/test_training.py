@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
 from eslr_jax.assets import load_model, split_clips
@@ -29,7 +30,7 @@ from eslr_jax.simulation.network import refine
 from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
 from eslr_jax.training.data import build_training_data, load_training_data
 from eslr_jax.training.loop import train
-from eslr_jax.training.loss import physics_loss
+from eslr_jax.training.loss import _mean_contraction, physics_loss
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import curriculum, init_train_state, make_schedule, make_train_step, slot_problem
@@ -124,10 +125,22 @@ def test_resuming_nothing_is_refused(config, tmp_path):
 
 def test_half_written_checkpoint_is_not_taken(finished):
     """A folder that orbax has not renamed yet is no checkpoint."""
-    _, folder = finished
-    latest = Checkpoints(folder).latest()
-    (folder / "checkpoints" / f"{latest + 1}.orbax-checkpoint-tmp-1").mkdir()
-    assert Checkpoints(folder).latest() == latest
+    state, folder = finished
+    (folder / "checkpoints" / f"{int(state.step) + 1}.orbax-checkpoint-tmp-1").mkdir()
+    assert Checkpoints(folder).restore(state).step == state.step
+
+
+def test_a_checkpoint_that_cannot_be_written_says_what_to_do(finished, tmp_path, monkeypatch):
+    """orbax raises the error of the checkpoint before when the next one is saved."""
+    state, _ = finished
+    checkpoints = Checkpoints(tmp_path)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ocp.CheckpointManager, "save", full)
+    with pytest.raises(CheckpointError, match="No space left on device; free some space and resume"):
+        checkpoints.save(state)
 
 
 @pytest.mark.slow
@@ -159,9 +172,13 @@ def test_a_finished_run_is_extended_but_not_cut(finished, config, small_data, tm
 
 def test_a_folder_without_a_checkpoint_starts_anew(config, small_data, tmp_path):
     write_run_config(tmp_path, config)
+    (tmp_path / "metrics.jsonl").write_text('{"step": 2, "core_seconds": 1e6}\n')  # of a run that was deleted
     with pytest.raises(CheckpointError, match="no checkpoint to resume from; start without --resume"):
         train(config, tmp_path, datasets=(small_data,), resume=True)
     assert int(train(config, tmp_path, datasets=(small_data,)).step) == config.steps
+    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records] == [2, 4, 6]
+    assert records[-1]["core_seconds"] < 1e6
 
 
 def test_unknown_split_lists_what_exists():
@@ -307,6 +324,14 @@ def test_a_run_on_shapes_keeps_them_while_a_trajectory_lives(config, shaped_data
     assert np.isfinite(np.array(state.pools[0].state.position)).all()
 
 
+def test_clips_of_one_frame_are_refused(small_garment):
+    from cloth import make_limb, swing_motion
+
+    body = make_limb()
+    with pytest.raises(ConfigError, match="no clip has two frames"):
+        build_training_data([small_garment], body, [swing_motion(body, 1)])
+
+
 def test_a_body_without_shapes_refuses_them(small_garment):
     from cloth import make_limb, swing_motion
 
@@ -371,6 +396,19 @@ def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small
     assert gaps[0] > 0
     expected = np.mean((energies[1:] - energies[-1]) / np.maximum(gaps, 0.01 * gaps[0]))
     np.testing.assert_allclose(loss, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("energies", "weights"),
+    [
+        ([2.0, 1.0, 0.0], [0.25, 0.5]),
+        ([2.0, 3.0, 4.0], [0.25, 0.5]),  # worse than the guess
+        ([2e-9, 1e-9, 0.0], [5e6, 5e6]),  # at rest: rounding weighs no more than 1e-7 J do
+    ],
+)
+def test_contraction_weighs_frames_alike_whatever_they_do(energies, weights):
+    slope = jax.grad(_mean_contraction)(jnp.array(energies, jnp.float32))
+    np.testing.assert_allclose(slope[1:], weights, rtol=1e-5)
 
 
 @pytest.mark.slow
