@@ -59,7 +59,7 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
         num_frames: Length of the rollouts.
         counts: Numbers of iterations.
     """
-    scene = example_scene(garment, size, CLIP, num_frames)
+    scene = example_scene(garment, size, CLIP, num_frames, models=(name,))
     reports = []
     params, config = simulator_of(name)
     for count in counts:
@@ -162,8 +162,9 @@ def main() -> None:
         result |= {name: older[name] for name in ("peers", "sizes")}
     arguments.out.mkdir(parents=True, exist_ok=True)
     for size in arguments.sizes:
-        scenes = [example_scene(garment, size, CLIP, frames) for garment in garments]
-        methods = measure_methods((SOLVER, *arguments.models), scenes)
+        names = (SOLVER, *arguments.models)
+        scenes = [example_scene(garment, size, CLIP, frames, models=names) for garment in garments]
+        methods = measure_methods(names, scenes)
         print(f"{size}: methods measured", flush=True)
         measured = {method.name: points(method) for method in methods}
         about = environment()
@@ -172,7 +173,7 @@ def main() -> None:
 
             settings = peers.SMOKE_SETTINGS if arguments.smoke else peers.SETTINGS
             of_peers = peers.peer_points(scenes, settings)
-            result["peers"] = list(of_peers)
+            result["peers"] = list(dict.fromkeys([*result["peers"], *of_peers]))
             measured |= of_peers
             about["versions"] |= peers.peer_versions()
             print(f"{size}: peers measured", flush=True)

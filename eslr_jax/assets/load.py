@@ -349,6 +349,8 @@ def load_motion(
     """
     text = str(name)
     if text in PROCEDURAL:
+        if joint_map:
+            raise MotionError(f"{text} is computed from the body's own joints; leave out the map of joints")
         return make_procedural(text, load_body() if body is None else body)
     file, _, clip = text.partition("#")
     if _is_archived(text):

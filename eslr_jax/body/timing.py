@@ -163,11 +163,17 @@ def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) 
     check_length(poses)
     if num_frames < 0:
         raise MotionError(f"can't settle for {num_frames} frames; give 0 or more")
-    num_moving, limbs = num_frames - _HELD, None
-    if num_moving >= _FEWEST_MOVING and body is not None and body.parents.count(-1) == 1:
-        limbs = _limbs_from_rest(body, np.asarray(poses.joint_transforms[0], np.float64), num_moving)
+    limbs = None
+    if body is not None and begins_at_rest(num_frames, body):
+        pose = np.asarray(poses.joint_transforms[0], np.float64)
+        limbs = _limbs_from_rest(body, pose, num_frames - _HELD)
     positions, transforms = _glide((poses.positions, poses.joint_transforms), limbs, num_frames)
     return poses.replace(positions=positions, joint_transforms=transforms)
+
+
+def begins_at_rest(num_frames: int, body: Body | None) -> bool:
+    """Return whether `with_settling` has so many frames begin in the rest pose: its arguments."""
+    return body is not None and body.parents.count(-1) == 1 and num_frames - _HELD >= _FEWEST_MOVING
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:

@@ -13,7 +13,9 @@ from rich.table import Table
 
 from eslr_jax.cli.actor import FPS
 from eslr_jax.cli.console import app, use_compile_cache, waiting
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, ConfigError
+
+ARCHITECTURE = "eslr-15"  # the paper's
 
 
 @app.command
@@ -120,7 +122,7 @@ def _list_fabrics(as_json: bool) -> None:
 
 @app.command
 def info(
-    model: str = "eslr-15",
+    model: str = ARCHITECTURE,
     scene: str | None = None,
     motion: str = "cmu_016_32",
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
@@ -140,6 +142,10 @@ def info(
         json_: Print as JSON.
     """
     if scene is not None:
+        if model != ARCHITECTURE:
+            raise ConfigError(
+                "--model shows an architecture, --scene a scene with the default network: give one"
+            )
         _show_scene(scene, motion, vertices, simulator, self_contact, json_)
         return
     from eslr_jax.assets import asset_names, load_model

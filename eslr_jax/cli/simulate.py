@@ -186,7 +186,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
 
     from eslr_jax.assets import load_garment_file, prepare_stored
     from eslr_jax.body.motion import first_poses
-    from eslr_jax.body.timing import SETTLE_FRAMES, check_speed, with_settling
+    from eslr_jax.body.timing import SETTLE_FRAMES, begins_at_rest, check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
     from eslr_jax.evaluation.report import start_crossing
     from eslr_jax.evaluation.words import describe_start
@@ -251,7 +251,8 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
     if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
-    _say_if_any(describe_start(start_crossing(scene, parts=(stored.face_parts, stored.part_names))))
+    crossing = start_crossing(scene, parts=(stored.face_parts, stored.part_names))
+    _say_if_any(describe_start(crossing, is_put_on=begins_at_rest(settle, rig)))
     for name, worn in zip(names, garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))

@@ -72,6 +72,8 @@ def train(
     from eslr_jax.training.recipe import load_recipe
     from eslr_jax.training.seeds import seed_folders
 
+    if coordinator is None and (num_processes is not None or process_id is not None):
+        raise ConfigError("--num-processes and --process-id need --coordinator, which joins the processes")
     if resume:
         changes = dict(parse_override(text) for text in set_)
         if config is not None or changes.keys() - {"steps"} or start_from is not None:

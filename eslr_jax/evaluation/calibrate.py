@@ -11,7 +11,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
 from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
+from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.gap import GapOptions, OptimalityGap, measure_gap
 from eslr_jax.evaluation.scene_parts import Name, time_in_turns
 from eslr_jax.scene.plan import first_frames, prepare_scene
@@ -38,15 +38,20 @@ def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) ->
     """
     methods: list[Method] = []
     for size in sizes:
-        scenes = [example_scene(name, size, _CLIP) for name in _GARMENTS]
+        scenes = [example_scene(name, size, _CLIP, models=models) for name in _GARMENTS]
         methods += measure_methods((SOLVER, *models), scenes)
     return Calibration(device_name(), tuple(methods))
 
 
-def example_scene(garment: str, size: str, clip: str, num_frames: int = _FRAMES) -> Scene:
-    """Prepare a bundled garment on a bundled clip."""
+def example_scene(
+    garment: str, size: str, clip: str, num_frames: int = _FRAMES, *, models: tuple[str, ...] = ()
+) -> Scene:
+    """Prepare a bundled garment on a bundled clip, with the coarse edges that any of some networks reads."""
     poses = pose_body(load_body(), load_motion(clip), num_frames=num_frames)
-    return prepare_scene(load_garment(garment, vertices=size), poses)  # type: ignore[arg-type]
+    architectures = [simulator_of(name)[1].model for name in models]
+    has_coarse_edges = any(isinstance(model, ModelConfig) and model.hierarchical for model in architectures)
+    cloth = load_garment(garment, vertices=size, has_coarse_edges=has_coarse_edges)  # type: ignore[arg-type]
+    return prepare_scene(cloth, poses)
 
 
 def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from eslr_jax.config import ModelConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import init_model
 from eslr_jax.types import Garment
 
 Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
+EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 
 
 def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
@@ -22,7 +24,12 @@ def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
             "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
         params: Weights of the trained network.
         config: Architecture.
+
+    Raises:
+        ConfigError: The network has no such part.
     """
+    if control in EMBEDDING_CONTROLS and not config.attention_blocks:
+        raise ConfigError(f"control {control} takes geodesic coordinates away, which only attention reads")
     if control == "untrained":
         return {**params, "params": init_model(config)["params"]}
     if control == "no_decoder":

@@ -86,7 +86,7 @@ def evaluate(
     config = SimConfig(model=model, iterations=iterations)
     body = load_body()
     scenes, forced, policy = [], [], []
-    drifts: dict[str, float] = {}
+    drifts: dict[str, float | None] = {}
     total = len(garments) * len(clips)
     cloths = _load_alike(garments, options.vertices, model)
     if options.control is not None:
@@ -112,12 +112,12 @@ def evaluate(
         resting = prepare_scene(cloth, pose_body(body, still, arm_abduction=0.0), surface=surface)
         drifts[garment] = _drift(params, resting, config)
     return {
-        "split": options.split,
+        "split": None if options.clips else options.split,
         "vertices": options.vertices,
         "garments": list(garments),
         "clips": list(clips),
         **({**_summarize(forced), "on_policy": _summarize(policy)} if forced else {}),
-        "rollout": _pool_rollouts(scenes) | {"drift_mm_s": max(drifts.values()), "drift_mm_s_of": drifts},
+        "rollout": _pool_rollouts(scenes) | _pool_drifts(drifts),
         "scenes": scenes,
     }
 
@@ -203,9 +203,14 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _drift(params: Any, scene: Scene, config: SimConfig) -> float:
-    """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s]."""
+def _drift(params: Any, scene: Scene, config: SimConfig) -> float | None:
+    """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s].
+
+    None where the rollout went wrong: it stands still from there on.
+    """
     trajectory = _roll(params, scene, config)
+    if Status(int(trajectory.status)) != Status.OK:
+        return None
     areas = np.asarray(scene.garment.vertex_areas)
     centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
     frames = round(1.0 / float(scene.timestep))
@@ -217,6 +222,13 @@ def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float
     """Return the share of the reachable body vertices that lie within `reach` [m] of the cloth."""
     distance, _ = cKDTree(cloth).query(body, distance_upper_bound=reach)
     return float(np.isfinite(distance).mean())
+
+
+def _pool_drifts(drifts: dict[str, float | None]) -> dict[str, Any]:
+    """Return the largest drift, and that of every garment [mm/s]; None stands for a rollout that went wrong."""
+    known = [drift for drift in drifts.values() if drift is not None]
+    largest = max(known) if len(known) == len(drifts) else None
+    return {"drift_mm_s": largest, "drift_mm_s_of": drifts}
 
 
 def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:

@@ -89,20 +89,22 @@ def _describe_layers(report: dict[str, Any], words: Words) -> None:
         words.good.append("no cloth passes through cloth")
 
 
-def describe_start(crossing: dict[str, Any] | None) -> str | None:
+def describe_start(crossing: dict[str, Any] | None, *, is_put_on: bool) -> str | None:
     """Return a warning where cloth begins deeper behind cloth than self-contact pulls it back; else None.
 
     Args:
         crossing: Of `report.start_crossing`.
+        is_put_on: The garment begins on the body's rest pose, whatever the motion is.
     """
     if crossing is None or crossing["depth_mm"] <= _UNTANGLED_MM:
         return None
     x, y, z = crossing["position_m"]
-    place = f"at {x:.2f} {y:.2f} {z:.2f} m, {_where(crossing['place'])}"
+    place = _where(crossing["place"], "on the rest pose" if is_put_on else None)
+    other = "begin with another frame (--start), lift the arms (--arm-abduction), or "
     return (
-        f"cloth begins {crossing['depth_mm']:.0f} mm behind cloth that it passes through, {place}, with "
-        f"{crossing['crossing_pairs']} pairs of faces. What is deeper than {_UNTANGLED_MM:.0f} mm may stay. "
-        "Begin with another frame (--start), lift the arms (--arm-abduction), or mend the garment there"
+        f"cloth begins {crossing['depth_mm']:.0f} mm behind cloth that it passes through, at {x:.2f} {y:.2f} "
+        f"{z:.2f} m, {place}, with {crossing['crossing_pairs']} pairs of faces. What is deeper than "
+        f"{_UNTANGLED_MM:.0f} mm may stay: {'' if is_put_on else other}mend the garment there"
     )
 
 
@@ -122,9 +124,9 @@ def _describe_place(report: dict[str, Any], words: Words) -> None:
         words.good.append("the garment stays where it was put on")
 
 
-def _where(place: dict[str, Any]) -> str:
-    """Return a place as text."""
-    text = f"frame {place['frame']} ({place['time_s']:.2f} s)"
+def _where(place: dict[str, Any], moment: str | None = None) -> str:
+    """Return a place as text; `moment` stands for its frame."""
+    text = moment or f"frame {place['frame']} ({place['time_s']:.2f} s)"
     if place.get("part"):
         text += f", part {place['part']}"
     for key, word in (("vertex", "vertex"), ("body_vertex", "body vertex")):

@@ -100,8 +100,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100, help="of every rollout")
     chosen = parser.parse_args()
     if chosen.smoke:
-        chosen.models = chosen.models or (DEEP[-1], f"optimum={OPTIMUM}")
-        chosen.clips, chosen.frames, chosen.garments = ["cmu_016_32"], 5, ["tshirt"]
+        chosen.models, chosen.frames = chosen.models or (DEEP[-1], f"optimum={OPTIMUM}"), 5
     rows = {
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
@@ -112,12 +111,17 @@ def main() -> None:
             run_training(training, ("steps=2",) if chosen.smoke else ())
     for name in chosen.tables:
         if name == "model_cost":
-            result = cost_table(rows, chosen.vertices, chosen.smoke)
-            write(result, chosen.out / f"{name}_{chosen.vertices}.json")
+            file = chosen.out / f"{name}_{chosen.vertices}.json"
+            names = (*rows, *full_size(chosen.vertices, chosen.smoke))
+            check_costs(file, names)
+            write(cost_table(rows, chosen.vertices, chosen.smoke), file)
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
+            if not (setting.garments and setting.clips):
+                print(f"{name}: left out, as none of its garments or none of its clips is asked for")
+                continue
             if chosen.smoke:
-                setting = setting._replace(garments=setting.garments[:1])
+                setting = setting._replace(garments=setting.garments[:1], clips=setting.clips[-1:])
             file = chosen.out / f"{name}.json"
             parts = rows_of_setting(file, setting)
             has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
@@ -156,6 +160,8 @@ def run_training(training: Training, changes: tuple[str, ...]) -> None:
         train(training.folder, resume=True)
     else:
         train(training.folder, training.recipe, (*training.changes(), *changes))
+    if not (training.folder / "model.npz").exists():
+        raise SystemExit("the training was stopped; run the same command to go on")
 
 
 def table_setting(
@@ -163,14 +169,18 @@ def table_setting(
 ) -> Setting:
     """Return the garments and clips of a table; those that are given are taken where they belong to it."""
     splits = load_splits()
+    kinds = splits["garments"]
     if table == "new_motion":
-        own_clips, own_garments = splits["motions"]["unseen_motion"][::3], ("tshirt", "dress")
+        all_clips, all_garments = splits["motions"]["unseen_motion"], [*kinds["train"], *kinds["unseen"]]
+        own_clips, own_garments = all_clips[::3], ["tshirt", "dress"]
         frames = min(frames, _NEW_MOTION_FRAMES)
     else:
-        kind = "unseen" if table == "unseen_garments" else "train"
-        own_clips, own_garments = splits["motions"]["test"][:_CLIPS], splits["garments"][kind]
-    worn = tuple(name for name in garments or () if table == "new_motion" or name in own_garments)
-    return Setting(worn or tuple(own_garments), tuple(clips or own_clips), frames, vertices)
+        all_clips = splits["motions"]["test"]
+        all_garments = own_garments = kinds["unseen" if table == "unseen_garments" else "train"]
+        own_clips = all_clips[:_CLIPS]
+    worn = own_garments if garments is None else [name for name in garments if name in all_garments]
+    played = own_clips if clips is None else [name for name in clips if name in all_clips]
+    return Setting(tuple(worn), tuple(played), frames, vertices)
 
 
 def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
@@ -243,6 +253,24 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
     return parts
 
 
+def full_size(vertices: str, is_smoke: bool) -> tuple[str, ...]:
+    """Return the architectures without weights whose cost is measured too."""
+    if is_smoke:
+        return FULL_SIZE[-1:]
+    return FULL_SIZE if vertices != "1k" else ()
+
+
+def check_costs(file: Path, names: Sequence[str]) -> None:
+    """Refuse to write over a table with rows that would be lost: times compare only within a run.
+
+    Raises:
+        SystemExit: Names them.
+    """
+    found = json.loads(file.read_text())["mean"] if file.exists() else {}
+    if lost := [name for name in found if name not in names]:
+        raise SystemExit(f"{file} has rows for {', '.join(lost)}; measure them too, or give another --out")
+
+
 def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     """Return what systems and the full-size networks cost: a frame of the T-shirt, contact search included.
 
@@ -250,8 +278,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     """
     read = {label: read_system(name) for label, (name, *_) in rows.items()}
     systems = {label: system for label, system in read.items() if system.weights_on is None}
-    full_size = FULL_SIZE if vertices != "1k" else ()
-    for name in FULL_SIZE[-1:] if is_smoke else full_size:
+    for name in full_size(vertices, is_smoke):
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
         systems[name] = System(

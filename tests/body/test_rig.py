@@ -160,3 +160,8 @@ def test_a_rig_without_the_joints_is_refused(body):
     strange = body.replace(joint_names=tuple(f"bone{k}" for k in range(len(body.joint_names))))
     with pytest.raises(MotionError, match="lacks"):
         make_procedural("swing", strange)
+
+
+def test_a_computed_motion_takes_no_map_of_joints(body):
+    with pytest.raises(MotionError, match="leave out the map of joints"):
+        load_motion("turn", body=body, joint_map={"Hips": "hip"})

@@ -5,7 +5,7 @@ import pytest
 
 from eslr_jax.cli.budget import parse_budget, parse_request, parse_share
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation.calibrate import fit_costs
+from eslr_jax.evaluation.calibrate import example_scene, fit_costs
 from eslr_jax.simulation.budget import (
     SOLVER,
     Calibration,
@@ -141,3 +141,11 @@ def test_nothing_asked_for_is_a_tolerance():
     assert parse_request(None, "2%", is_chosen=True) == (None, 0.02)
     assert parse_request("20ms", None, is_chosen=True) == (20.0, None)
     assert parse_request(None, None, is_chosen=False) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("models", "has_coarse_edges"), [((SOLVER, "mgn-5-correction"), False), (("hood-5-correction",), True)]
+)
+def test_scenes_have_the_coarse_edges_that_their_networks_read(models, has_coarse_edges):
+    scene = example_scene("tshirt", "1k", "cmu_016_32", 2, models=models)
+    assert (scene.garment.coarse is not None) == has_coarse_edges

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
+from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import stepped_potentials, trajectory_gap
 from eslr_jax.models.registry import MODELS, init_model
@@ -69,6 +70,11 @@ def test_without_a_decoder_the_guess_is_left(moves):
 def test_untrained_weights_and_other_embeddings_predict_otherwise(moves):
     for control in ("untrained", "no_embedding", "random_embedding"):
         assert not np.array_equal(moves[control], moves[None]), control
+
+
+def test_a_network_without_attention_has_no_coordinates_to_lose():
+    with pytest.raises(ConfigError, match="only attention reads"):
+        control_params("no_embedding", {}, ModelConfig(attention_blocks=0))
 
 
 def test_random_coordinates_keep_their_spread(scene):

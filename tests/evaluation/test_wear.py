@@ -116,11 +116,16 @@ def test_a_start_with_cloth_deep_behind_cloth_is_told_with_its_place(dent, is_to
     start, faces = np.concatenate([flat, upper]), np.concatenate([faces, faces + len(flat)])
     scene = make_scene(make_cloth((start, faces), {}, allow_components=True), start, 2, self_contact=True)
     parts = (np.repeat([0, 1], len(faces) // 2), ("skirt", "coat"))
-    text = describe_start(start_crossing(scene, parts=parts))
+    text = describe_start(start_crossing(scene, parts=parts), is_put_on=False)
     assert (text is not None) == is_told
     if text is not None:
         assert " pairs of faces" in text
         assert re.search(r"frame 0 \(0\.00 s\), part (coat|skirt)", text)
+        assert "--start" in text
+        put_on = describe_start(start_crossing(scene, parts=parts), is_put_on=True)
+        assert put_on
+        assert re.search(r"on the rest pose, part (coat|skirt)", put_on)
+        assert "--start" not in put_on, "which does not change the rest pose"
     assert start_crossing(scene.replace(self_contact=None)) is None
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from paper.rollouts import Setting, read_system
-from paper.tables import DEEP, plan_trainings, rows_of_setting
+from paper.tables import DEEP, check_costs, plan_trainings, rows_of_setting, table_setting
 
 from eslr_jax.assets.catalog import asset_names
 from eslr_jax.training.recipe import load_recipe
@@ -46,6 +46,25 @@ def test_without_a_table_there_are_no_rows(tmp_path):
 def test_a_table_of_another_setting_is_not_written_over(file, other, name):
     with pytest.raises(SystemExit, match=f"other {name}; give another --out"):
         rows_of_setting(file, other)
+
+
+def test_what_is_asked_for_is_taken_where_it_belongs_to_the_table():
+    default = table_setting("native_garments", None, None, 100, "1k")
+    assert (len(default.garments), len(default.clips)) == (6, 3)
+    chosen = table_setting("native_garments", ["cmu_056_01", "deepmimic_walk"], ["pants", "scraf"], 100, "1k")
+    assert (chosen.garments, chosen.clips) == (("pants",), ("cmu_056_01",))
+    assert table_setting("unseen_garments", None, ["pants"], 100, "1k").garments == ()
+    moved = table_setting("new_motion", ["cmu_056_01", "deepmimic_walk"], ["pants"], 100, "1k")
+    assert (moved.garments, moved.clips, moved.frames) == (("pants",), ("deepmimic_walk",), 60)
+
+
+def test_costs_of_other_rows_are_not_lost(tmp_path):
+    file = tmp_path / "model_cost_1k.json"
+    check_costs(file, ("mgn-5",))
+    file.write_text(json.dumps({"mean": {"mgn-5": ROW, "eslr-5": ROW}}))
+    check_costs(file, ("mgn-5", "eslr-5", "hood"))
+    with pytest.raises(SystemExit, match="has rows for eslr-5; measure them too, or give another --out"):
+        check_costs(file, ("mgn-5",))
 
 
 def test_controls_of_weights_show_no_training_cost():

@@ -207,7 +207,7 @@ OPTIONS = {
     "minus one iteration": (("--iterations", "-1"), "iterations"),
     "a missing model": (("--model", "missing.npz"), "missing.npz"),
     "an unknown model": (("--model", "eslr-huge"), "eslr-huge"),
-    "a finer mesh of a file": (("--garment", "tank", "--vertices", "1k", "--fabric", "front:denim"), "front"),
+    "a fabric for a part that the garment lacks": (("--garment", "tank", "--fabric", "front:denim"), "front"),
 }  # fmt: skip
 OTHERS = {
     "render of nothing": (("render", "missing", "--out", "a.png"), "missing"),
@@ -244,6 +244,14 @@ OTHERS = {
         "tshrit",
     ),
     "info of an unknown network": (("info", "--model", "eslr-huge"), "eslr-huge"),
+    "info of a network and a scene": (("info", "--scene", "tshirt", "--model", "eslr-small"), "--model"),
+    "processes that nothing joins": (
+        ("train", "--config", "good.toml", "--num-processes", "2", "--process-id", "1", "--out", "t"),
+        "--coordinator",
+    ),
+    "coordinates taken from a network without attention": (
+        ("evaluate", "--model", "mgn-5-correction", "--control", "no_embedding"), "attention",
+    ),
     "info of a missing scene": (("info", "--scene", "missing.obj"), "missing.obj"),
     "a body exported to stl": (("assets", "--export", "body.stl"), "obj"),
     "joints of nothing": (("joints", "--motion", "missing.bvh"), "missing.bvh"),
