@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -164,7 +165,14 @@ def make_motion(
     Raises:
         MotionError: No joint is known to both, or the source does not stand at rest.
     """
-    if up == "z" or (up == "auto" and _stands_along_z(source)):
+    is_judged = up == "auto" and _stands_along_z(source.skeleton, source.positions)
+    if is_judged and not _stands_along_z(source.skeleton, source.skeleton.rest_positions[None]):
+        warnings.warn(
+            f"{source.name}: taken as Z up, as the figure is longest along z, though not at rest; if it crawls "
+            "or lies, say that Y is up (--motion-up y)",
+            stacklevel=2,
+        )
+    if up == "z" or is_judged:
         source = turn_motion(source, _Y_UP)
     target = body_skeleton(body)
     mapping = complete_map(target, source.skeleton, joint_map)
@@ -243,9 +251,9 @@ def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:
     )
 
 
-def _stands_along_z(motion: SkeletonMotion) -> bool:
-    """Tell whether the head is mostly above the feet along z rather than y."""
-    parts = find_parts(motion.skeleton)
+def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
+    """Tell whether the head is mostly above the feet along z rather than y; positions: [frames, joints, 3]."""
+    parts = find_parts(skeleton)
     upper = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
     lower = [
         parts[side, chain][0]
@@ -255,7 +263,7 @@ def _stands_along_z(motion: SkeletonMotion) -> bool:
     ]
     if upper is None or not lower:
         return False
-    rise = (motion.positions[:, upper] - motion.positions[:, lower].mean(axis=1)).mean(axis=0)
+    rise = (positions[:, upper] - positions[:, lower].mean(axis=1)).mean(axis=0)
     return bool(rise[2] > abs(rise[1]))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -93,6 +94,7 @@ def fit_garment(
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
     if options.edge_length is not None:
+        _check_pins(source, options)
         sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
         vertex_map, face_source = np.arange(len(sewn)), face_source[nearest]
     validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
@@ -148,6 +150,26 @@ def fit_garment(
             },
         },
     )
+
+
+def _check_pins(source: GarmentSource, options: FitOptions) -> None:
+    """Warn of pins by vertices of the file, which remeshing replaces.
+
+    Raises:
+        ConfigError: They are asked for by number.
+    """
+    counted = [text for text in options.pin if text.startswith("vertices:")]
+    if counted:
+        raise ConfigError(
+            f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
+            "a region or a loop"
+        )
+    if not options.pin and source.is_pinned is not None and source.is_pinned.any():
+        warnings.warn(
+            f"{source.name}: the pins of the file are lost with edge_length, which replaces its vertices; name a "
+            "part, a region or a loop",
+            stacklevel=3,
+        )
 
 
 def _pin(

@@ -24,6 +24,7 @@ _LAYOUT = {
     "obstacle_faces": ("biu", "faces"),
 }
 _REMEDY = "give a body npz as documented"
+_ROUNDED = 1e-3  # by which the sum of a vertex' skin weights may differ from one and is left alone
 _UPRIGHT = 0.7  # least height over the longest side of a standing body; a T-pose is as wide as it is high
 
 
@@ -37,7 +38,7 @@ def read_body(path: str | Path) -> Body:
         The body, float32.
 
     Raises:
-        AssetError: The file is missing or damaged, lacks an array, or its Y is not up.
+        AssetError: The file is missing or damaged, lacks an array, a vertex follows no joint, or Y is not up.
     """
     arrays = read_arrays(path, content="body")
     what = f"body file {path}"
@@ -48,6 +49,11 @@ def read_body(path: str | Path) -> Body:
     for key, (kinds, *_) in _LAYOUT.items():
         if not len(arrays[key]) or (kinds == "f" and not np.isfinite(arrays[key]).all()):
             raise AssetError(f"{what}: {key} is empty or not finite; {_REMEDY}")
+    weights = arrays["skin_weights"]
+    if (weights < 0).any() or not weights.any(axis=1).all():
+        raise AssetError(f"{what}: a vertex has a negative skin weight, or none; {_REMEDY}")
+    total = weights.sum(axis=1, keepdims=True)
+    arrays["skin_weights"] = weights / np.where(np.abs(total - 1) > _ROUNDED, total, 1.0)
     sides = np.ptp(arrays["rest_positions"], axis=0)
     if sides[1] < _UPRIGHT * sides.max():
         raise AssetError(

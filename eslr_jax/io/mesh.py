@@ -166,13 +166,17 @@ def _check_ply_header(path: Path) -> None:
 
 
 def _read_stl(path: Path) -> MeshFile:
-    """Read an STL file and share its vertices."""
+    """Read an STL file, all solids as one mesh, and share its vertices."""
     with path.open("rb") as stream:
         content = load_stl(stream)
-    content = next(iter(content.get("geometry", {}).values()), content)  # text files nest their solids
-    positions = np.asarray(content["vertices"]).reshape(-1, 3)
+    solids = list(content.get("geometry", {}).values()) or [content]  # text files nest several
+    corners = [
+        np.asarray(solid["vertices"]).reshape(-1, 3)[np.asarray(solid["faces"], np.int64).reshape(-1, 3)]
+        for solid in solids
+    ]
+    positions = np.concatenate(corners).reshape(-1, 3)
     kept, place = shared_vertices(positions)
-    return MeshFile(positions[kept], place[np.asarray(content["faces"], np.int64).reshape(-1, 3)])
+    return MeshFile(positions[kept], place.reshape(-1, 3))
 
 
 def _read_glb(path: Path) -> MeshFile:

@@ -1,6 +1,8 @@
 """Joints by any name, and motions carried from rig to rig."""
 
+import dataclasses
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -165,3 +167,17 @@ def test_a_rig_without_the_joints_is_refused(body):
 def test_a_computed_motion_takes_no_map_of_joints(body):
     with pytest.raises(MotionError, match="leave out the map of joints"):
         load_motion("turn", body=body, joint_map={"Hips": "hip"})
+
+
+def test_a_figure_that_lies_in_its_motion_alone_is_told_to_be_taken_as_z_up(body):
+    source = skeleton_motion(load_motion("cmu_016_32"), body)
+    lie = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    crawling = dataclasses.replace(
+        source, rotations=lie @ source.rotations, positions=source.positions @ lie.T
+    )
+    with pytest.warns(UserWarning, match="taken as Z up.* --motion-up y"):
+        make_motion(crawling, body, up="auto")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_motion(crawling, body, up="y")
+        make_motion(source, body, up="auto")

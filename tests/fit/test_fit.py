@@ -284,3 +284,13 @@ def test_remeshing_gives_the_wanted_edges_and_keeps_hems(body, shirt, edge_lengt
     assert len(loops) == len(before)
     low = min(fitted.sewn_positions[loop, 1].mean() for loop in loops)
     assert low == pytest.approx(min(shirt.rest_positions[loop, 1].mean() for loop in before), abs=2e-3)
+
+
+def test_pins_that_remeshing_replaces_are_refused_or_told(body, shirt):
+    pytest.importorskip("pyacvd")
+    shirt_source = source(shirt.rest_positions, shirt.faces)
+    with pytest.raises(ConfigError, match="counts vertices of the file, which edge_length replaces"):
+        fit_garment(shirt_source, body, FitOptions(edge_length=0.03, pin=("vertices:0,5",)))
+    held = dataclasses.replace(shirt_source, is_pinned=np.arange(len(shirt.rest_positions)) < 5)
+    with pytest.warns(UserWarning, match="the pins of the file are lost"):
+        fit_garment(held, body, FitOptions(edge_length=0.03))

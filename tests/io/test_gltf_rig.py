@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from eslr_jax.assets import load_body, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.body.rig import make_body, make_motion
-from eslr_jax.io.gltf_document import sample_keys
+from eslr_jax.io.gltf_document import GltfDocument, sample_keys
 from eslr_jax.io.gltf_rig import gltf_clip_names, read_gltf_body, read_gltf_motion
 from eslr_jax.io.skeleton import Skeleton, chain_positions
 
@@ -117,6 +117,24 @@ def test_the_simple_skin_of_the_gltf_samples():
     angles = Rotation.from_matrix(motion.rotations[:, 1]).as_rotvec()[:, 2]
     assert np.degrees(angles.max()) == pytest.approx(90.0, abs=1e-3)
     np.testing.assert_allclose(motion.positions[:, 0], np.tile([0, 1, 0], (12, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "fps", "count"),
+    [
+        ([np.arange(10) / 24], 24.0, 10),
+        ([np.arange(10) / 24, np.array([0.0, 3.0, 9.0]) / 24], 24.0, 10),  # a track without what is redundant
+        ([np.array([0.0, 0.5, 1.0, 1.1, 1.2, 2.3])], 30.0, 70),  # by hand
+        ([np.array([0.0, 0.5, 0.51, 2.0])], 100.0, 201),
+        ([np.array([0.0, 0.5, 0.501, 2.0])], 120.0, 241),
+        ([np.array([1.0])], 30.0, 1),
+    ],
+)
+def test_animations_are_sampled_by_their_keys(keys, fps, count):
+    times, rate = GltfDocument(FIXTURES / "simple_skin.gltf").sample_times(keys)
+    assert (rate, len(times)) == (pytest.approx(fps), count)
+    assert times[0] == keys[0][0]
+    assert times[-1] > keys[0][-1] - 1 / rate
 
 
 def test_key_frames_between_keys():

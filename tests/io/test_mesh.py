@@ -41,6 +41,18 @@ def test_stl_corners_are_shared(tmp_path, kind):
     np.testing.assert_allclose(positions[faces], POSITIONS[FACES], atol=1e-7)
 
 
+def test_all_solids_of_a_text_stl_are_read(tmp_path):
+    apart = trimesh.Trimesh(POSITIONS + np.array([0.0, 5.0, 0.0]), FACES, process=False).export(
+        file_type="stl_ascii"
+    )
+    path = tmp_path / "scarf.stl"
+    path.write_text(_export("stl_ascii").decode() + "\n" + apart)
+    positions, faces = read_mesh(path)
+    assert len(positions) == 2 * len(POSITIONS)
+    both = np.concatenate([POSITIONS[FACES], POSITIONS[FACES] + np.array([0.0, 5.0, 0.0])])
+    np.testing.assert_allclose(positions[faces], both, atol=1e-6)
+
+
 @pytest.mark.parametrize("key", ["rest_positions", "positions", "vertices"])
 def test_npz_keys(tmp_path, key):
     np.savez(tmp_path / "scarf.npz", **{key: POSITIONS.astype(np.float32), "faces": FACES})

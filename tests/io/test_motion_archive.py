@@ -35,6 +35,7 @@ BROKEN_BODIES = {
         {"rest_positions": np.linspace(0, 1, 12272)[:, None] * [0.5, 0.3, 1.8]},
         "turn it so that Y is up",
     ),
+    "a vertex without a joint": ({"skin_weights": np.zeros((12272, 7))}, "skin weight"),
     "faces of floats": ({"faces": np.zeros((24540, 3))}, "faces"),
 }
 
@@ -68,3 +69,10 @@ def test_broken_bodies_are_named_in_one_line(tmp_path, bundled, kind):
     changes, word = BROKEN_BODIES[kind]
     write_arrays(tmp_path / "body.npz", whole(bundled, changes))
     refuses(read_body, tmp_path / "body.npz", word)
+
+
+def test_skin_weights_of_a_body_sum_to_one(tmp_path, bundled):
+    write_arrays(tmp_path / "body.npz", {**bundled, "skin_weights": 0.97 * bundled["skin_weights"]})
+    np.testing.assert_allclose(
+        read_body(tmp_path / "body.npz").skin_weights, bundled["skin_weights"], atol=1e-6
+    )
