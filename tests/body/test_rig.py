@@ -175,7 +175,7 @@ def test_a_figure_that_lies_in_its_motion_alone_is_told_to_be_taken_as_z_up(body
     crawling = dataclasses.replace(
         source, rotations=lie @ source.rotations, positions=source.positions @ lie.T
     )
-    with pytest.warns(UserWarning, match="taken as Z up.* --motion-up y"):
+    with pytest.warns(UserWarning, match="taken as Z up.*--motion-up y"):
         make_motion(crawling, body, up="auto")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
