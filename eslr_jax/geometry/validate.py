@@ -19,6 +19,7 @@ from eslr_jax.geometry.topology import (
     vertex_components,
 )
 
+_FLAT = 1e-6  # of the cube around a body: less volume than that is rounding
 MIN_DIAGONAL = 0.05  # [m] of the bounding box; smaller is no garment
 MAX_DIAGONAL = 5.0  # [m]
 DUPLICATE_TOLERANCE = 1e-7  # of the bounding box's diagonal
@@ -260,7 +261,19 @@ def validate_body(
             f"{_ids(np.array([starts[edge], ends[edge]]))} of face {edge // 3}: the body is not closed; fill its "
             "holes, or mark the faces around them as no obstacles"
         )
-    if np.sum(np.linalg.det(positions[faces] - positions.mean(axis=0))) < 0:
+    check_outward(positions, faces, name=name)
+
+
+def check_outward(
+    positions: Float[np.ndarray, "body_vertices 3"], faces: Int[np.ndarray, "body_faces 3"], *, name: str
+) -> None:
+    """Check that the faces of a body, which may have holes, point outside.
+
+    Raises:
+        MeshError: They enclose a negative volume.
+    """
+    volume = np.sum(np.linalg.det(positions[faces] - positions.mean(axis=0))) / 6
+    if volume < -_FLAT * np.ptp(positions, axis=0).max() ** 3:
         raise MeshError(f"{name}: its faces point inside; flip the normals")
 
 

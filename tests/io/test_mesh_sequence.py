@@ -23,6 +23,7 @@ from eslr_jax.io.mesh_sequence import (
 from eslr_jax.io.skin import Skin
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
+CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))  # it stands
 FACES = np.asarray(CAPSULE.faces)
 TURNS = Rotation.from_euler("y", [[0], [20], [40], [60]], degrees=True)
 MOVING = np.stack([turn.apply(CAPSULE.vertices) for turn in TURNS])
@@ -245,3 +246,11 @@ def test_another_order_or_another_mesh_is_refused():
         )
     with pytest.raises(MeshError, match=f"has 10 vertices, the garment {len(CAPSULE.vertices)}"):
         in_vertex_order(MeshSequence("mine", MOVING[:, :10], FACES[:1] % 10, 30.0), garment_of())
+
+
+def test_a_moving_mesh_that_lies_or_is_inside_out_is_told():
+    with pytest.raises(MeshError, match="body: its faces point inside; flip the normals"):
+        pose_sequence(MeshSequence("body", MOVING, FACES[:, ::-1], 30.0))
+    lying = MOVING @ Rotation.from_euler("x", 90, degrees=True).as_matrix().T
+    with pytest.warns(UserWarning, match="if it stands, turn it so that Y is up"):
+        pose_sequence(MeshSequence("body", lying, FACES, 30.0))
