@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="a small model, one turn")
     arguments = parser.parse_args()
     changes = (
-        {"model": "mgn-small", "model.refinement_steps": 1, "garments": ["tshirt"]} if arguments.smoke else {}
+        {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]} if arguments.smoke else {}
     )
     config = load_recipe(RECIPE, {"split": "validation", **changes})
     data = load_training_data(config, config.vertices[0])
