@@ -17,6 +17,7 @@ from eslr_jax.errors import MotionError
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import unique_edges
 from eslr_jax.geometry.validate import check_outward
+from eslr_jax.io.body import UPRIGHT
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.skeleton import nearest_rotations
 from eslr_jax.types import Body, BodyMotion
@@ -24,7 +25,6 @@ from eslr_jax.types import Body, BodyMotion
 NUM_PATCHES = 48  # pieces that move almost rigidly; about two a limb segment
 _BLEND_STEPS = 12  # Laplacian smoothings of the patches' weights
 _INFLUENCES = 4
-_UPRIGHT = 0.7  # least height of a standing body over its longest side
 
 
 def pose_sequence(
@@ -52,7 +52,7 @@ def pose_sequence(
     rest, positions = scaled[0], _resample(scaled, sequence.fps, fps)
     check_outward(rest, faces, name=sequence.name)
     sides = np.ptp(rest, axis=0)
-    if sides[2] == sides.max() and sides[1] < _UPRIGHT * sides[2]:
+    if sides[2] == sides.max() and sides[1] < UPRIGHT * sides[2]:
         warnings.warn(
             f"{sequence.name} is {sides[1]:.3g} m high and {sides[2]:.3g} m long along z: if it stands, turn it "
             "so that Y is up",

@@ -171,9 +171,9 @@ def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) 
     return poses.replace(positions=positions, joint_transforms=transforms)
 
 
-def begins_at_rest(num_frames: int, body: Body | None) -> bool:
+def begins_at_rest(num_frames: int, body: Body) -> bool:
     """Return whether `with_settling` has so many frames begin in the rest pose: its arguments."""
-    return body is not None and body.parents.count(-1) == 1 and num_frames - _HELD >= _FEWEST_MOVING
+    return body.parents.count(-1) == 1 and num_frames - _HELD >= _FEWEST_MOVING
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:

@@ -15,7 +15,7 @@ from eslr_jax.cli.actor import FPS
 from eslr_jax.cli.console import app, use_compile_cache, waiting
 from eslr_jax.errors import AssetError, ConfigError
 
-ARCHITECTURE = "eslr-15"  # the paper's
+_ARCHITECTURE = "eslr-15"  # the paper's
 
 
 @app.command
@@ -122,7 +122,7 @@ def _list_fabrics(as_json: bool) -> None:
 
 @app.command
 def info(
-    model: str = ARCHITECTURE,
+    model: str = _ARCHITECTURE,
     scene: str | None = None,
     motion: str = "cmu_016_32",
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
@@ -142,7 +142,7 @@ def info(
         json_: Print as JSON.
     """
     if scene is not None:
-        if model != ARCHITECTURE:
+        if model != _ARCHITECTURE:
             raise ConfigError(
                 "--model shows an architecture, --scene a scene with the default network: give one"
             )

@@ -25,7 +25,7 @@ _LAYOUT = {
 }
 _REMEDY = "give a body npz as documented"
 _ROUNDED = 1e-3  # by which the sum of a vertex' skin weights may differ from one and is left alone
-_UPRIGHT = 0.7  # least height over the longest side of a standing body; a T-pose is as wide as it is high
+UPRIGHT = 0.7  # least height over the longest side of a standing body; a T-pose is as wide as it is high
 
 
 def read_body(path: str | Path) -> Body:
@@ -55,7 +55,7 @@ def read_body(path: str | Path) -> Body:
     total = weights.sum(axis=1, keepdims=True)
     arrays["skin_weights"] = weights / np.where(np.abs(total - 1) > _ROUNDED, total, 1.0)
     sides = np.ptp(arrays["rest_positions"], axis=0)
-    if sides[1] < _UPRIGHT * sides.max():
+    if sides[1] < UPRIGHT * sides.max():
         raise AssetError(
             f"{what} is {sides[1]:.3g} m high and {sides.max():.3g} m long; turn it so that Y is up"
         )

@@ -111,7 +111,7 @@ def train(
                     log.write(json.dumps(record) + "\n")
                     log.flush()
                 on_progress(done, config.steps, records[0])
-                _check_skipped(state, config, checkpoints, folders)
+                _check_skipped(state, config, checkpoints, out)
                 if overflowed:
                     raise CapacityError(
                         f"self-contact needed more room than its buffers have by step {done}; train with "
@@ -220,17 +220,15 @@ def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, flo
     return [{name: float(values[place]) for name, values in centers.items()} for place in range(seeds)]
 
 
-def _check_skipped(
-    state: TrainState, config: TrainConfig, checkpoints: Checkpoints, folders: list[Path]
-) -> None:
+def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:
     """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied."""
     skipped = int(np.max(state.skipped))
     if skipped <= config.max_skipped:
         return
     checkpoints.wait()
-    weights = [folder / "last_finite.npz" for folder in folders]
+    weights = [folder / "last_finite.npz" for folder in seed_folders(config, out)]
     export(state, config, weights)
-    trajectories = folders[0] / "offending_state.npz"
+    trajectories = out / "offending_state.npz"  # of all seeds
     leaves = jax.tree.leaves(jax.device_get(state.pools))
     np.savez(trajectories, **{str(number): leaf for number, leaf in enumerate(leaves)})
     raise NonFiniteError(

@@ -21,7 +21,7 @@ from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
 from eslr_jax.assets.load import model_record
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
-from eslr_jax.evaluation.controls import Control, control_garment, control_params
+from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
 from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
@@ -37,7 +37,7 @@ from eslr_jax.types import Scene, Trajectory
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
 OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
 CONTROLS: tuple[Control, ...] = get_args(Control)
-CONTROLS_OF_WEIGHTS = CONTROLS[:2]  # the others are of the geodesic embedding
+CONTROLS_OF_WEIGHTS = tuple(name for name in CONTROLS if name not in EMBEDDING_CONTROLS)
 EMBEDDINGS = ("raw", "landmarks")  # modes beside the canonical one, with which networks were trained
 TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
