@@ -24,7 +24,12 @@ import numpy as np
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.load import START_MODEL
-from eslr_jax.evaluation.calibrate import example_scene, measure_methods, simulator_of
+from eslr_jax.evaluation.calibrate import (
+    example_scene,
+    measure_methods,
+    read_coarse_edges,
+    simulator_of,
+)
 from eslr_jax.evaluation.report import environment, trajectory_report
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.simulation.budget import SOLVER, Method, device_name, interpolate_gap
@@ -59,7 +64,8 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
         num_frames: Length of the rollouts.
         counts: Numbers of iterations.
     """
-    scene = example_scene(garment, size, CLIP, num_frames, models=(name,))
+    reads_edges = read_coarse_edges((name,))
+    scene = example_scene(garment, size, CLIP, num_frames, has_coarse_edges=reads_edges)
     reports = []
     params, config = simulator_of(name)
     for count in counts:
@@ -161,9 +167,12 @@ def main() -> None:
         older = json.loads(path.read_text())
         result |= {name: older[name] for name in ("peers", "sizes")}
     arguments.out.mkdir(parents=True, exist_ok=True)
+    names = (SOLVER, *arguments.models)
+    reads_edges = read_coarse_edges(names)
     for size in arguments.sizes:
-        names = (SOLVER, *arguments.models)
-        scenes = [example_scene(garment, size, CLIP, frames, models=names) for garment in garments]
+        scenes = [
+            example_scene(garment, size, CLIP, frames, has_coarse_edges=reads_edges) for garment in garments
+        ]
         methods = measure_methods(names, scenes)
         print(f"{size}: methods measured", flush=True)
         measured = {method.name: points(method) for method in methods}

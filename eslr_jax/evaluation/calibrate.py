@@ -37,21 +37,26 @@ def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) ->
         sizes: Resolutions of the garments.
     """
     methods: list[Method] = []
+    has_coarse_edges = read_coarse_edges(models)
     for size in sizes:
-        scenes = [example_scene(name, size, _CLIP, models=models) for name in _GARMENTS]
+        scenes = [example_scene(name, size, _CLIP, has_coarse_edges=has_coarse_edges) for name in _GARMENTS]
         methods += measure_methods((SOLVER, *models), scenes)
     return Calibration(device_name(), tuple(methods))
 
 
 def example_scene(
-    garment: str, size: str, clip: str, num_frames: int = _FRAMES, *, models: tuple[str, ...] = ()
+    garment: str, size: str, clip: str, num_frames: int = _FRAMES, *, has_coarse_edges: bool = False
 ) -> Scene:
-    """Prepare a bundled garment on a bundled clip, with the coarse edges that any of some networks reads."""
+    """Prepare a bundled garment on a bundled clip, with the coarse edges that a hierarchical network reads."""
     poses = pose_body(load_body(), load_motion(clip), num_frames=num_frames)
-    architectures = [simulator_of(name)[1].model for name in models]
-    has_coarse_edges = any(isinstance(model, ModelConfig) and model.hierarchical for model in architectures)
     cloth = load_garment(garment, vertices=size, has_coarse_edges=has_coarse_edges)  # type: ignore[arg-type]
     return prepare_scene(cloth, poses)
+
+
+def read_coarse_edges(names: tuple[str, ...]) -> bool:
+    """Return whether any of some methods reads coarse edges; the argument is that of `measure_methods`."""
+    architectures = [simulator_of(name)[1].model for name in names]
+    return any(isinstance(model, ModelConfig) and model.hierarchical for model in architectures)
 
 
 def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:

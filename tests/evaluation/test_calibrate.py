@@ -5,7 +5,7 @@ import pytest
 
 from eslr_jax.cli.budget import parse_budget, parse_request, parse_share
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation.calibrate import example_scene, fit_costs
+from eslr_jax.evaluation.calibrate import example_scene, fit_costs, read_coarse_edges
 from eslr_jax.simulation.budget import (
     SOLVER,
     Calibration,
@@ -147,5 +147,5 @@ def test_nothing_asked_for_is_a_tolerance():
     ("models", "has_coarse_edges"), [((SOLVER, "mgn-5-correction"), False), (("hood-5-correction",), True)]
 )
 def test_scenes_have_the_coarse_edges_that_their_networks_read(models, has_coarse_edges):
-    scene = example_scene("tshirt", "1k", "cmu_016_32", 2, models=models)
+    scene = example_scene("tshirt", "1k", "cmu_016_32", 2, has_coarse_edges=read_coarse_edges(models))
     assert (scene.garment.coarse is not None) == has_coarse_edges
