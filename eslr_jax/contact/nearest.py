@@ -41,8 +41,8 @@ def nearest_point(
 ) -> SurfacePoint:
     """Find the nearest surface point of every query point.
 
-    The two nearest surface vertices are exact, and so is the nearest point on the faces around them. Another
-    face is nearer by more than a millimetre for less than one point in a thousand.
+    It is the nearest point on the faces around two surface vertices: the nearest one, and another that is near.
+    Another face is nearer by more than a millimetre for less than one point in a thousand.
 
     Args:
         query: Points [m].

@@ -287,7 +287,7 @@ def _range(
 
 
 def _face_table(cloth: _Cloth) -> _FaceTable:
-    """Return the planes of every face; none is within reach of faces without area."""
+    """Return the planes of every face; none is within reach of faces without area, nor of copies in a block."""
     garment = cloth.garment
 
     def plane(normal: Array, through: Array) -> Array:
@@ -307,7 +307,14 @@ def _face_table(cloth: _Cloth) -> _FaceTable:
         planes.append(plane(safe_normalize(inwards, axis=0), here[k]))
     blocks = garment.face_blocks.T
     in_blocks = jnp.moveaxis(jnp.stack(planes)[:, :, blocks], 2, 0)
+    offset = jnp.where(_is_copy(garment.face_blocks).T, jnp.inf, in_blocks[:, 0, 3])
+    in_blocks = in_blocks.at[:, 0, 3].set(offset)
     return _FaceTable(in_blocks, jnp.moveaxis(garment.faces.T[:, blocks], 1, 0))
+
+
+def _is_copy(groups: Int[Array, "groups members"]) -> Bool[Array, "groups members"]:
+    """Return which members repeat the one before, as in the last group of `compact_groups` if it is not full."""
+    return jnp.pad(groups[:, 1:] == groups[:, :-1], ((0, 0), (1, 0)))
 
 
 def _candidates(
@@ -331,7 +338,7 @@ def _candidates(
     """
     radius, has_points = scope
     at, ahead = (tuple(end) for end in points.ends[:, :, ids])
-    is_point = points.mask[ids]
+    is_point = points.mask[ids] & ~_is_copy(ids)
 
     def add_member(k: Array, words: Int[Array, "pairs rows"]) -> Int[Array, "pairs rows"]:
         planes, corners = table.planes[k][..., faces], table.corners[k][:, faces]

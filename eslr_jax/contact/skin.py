@@ -89,7 +89,8 @@ def _places_over_vertices(
     The height is the lower one; it is infinite where the cloth is far, or beside the vertex.
     """
     body, next_body = bodies
-    vertex = _nearest_vertices(cloth.now, body, nearest, surface)
+    is_seed = nearest.is_near & garment.vertex_mask
+    vertex = _nearest_vertices(cloth.now, body, surface.faces[nearest.faces], is_seed, surface)
     vertex = _descend(vertex, cloth.now, body, garment)
     corners, weights, squared = _nearest_places(vertex, cloth.now, body, garment)
     both = jnp.concatenate(cloth, axis=1)[corners.T]
@@ -143,13 +144,14 @@ def lift_off_skin(
 def _nearest_vertices(
     position: Float[Array, "vertices 3"],
     body: Float[Array, "surface_vertices 3"],
-    nearest: Contacts,
+    corners: Int[Array, "vertices 3"],
+    is_seed: Bool[Array, " vertices"],
     surface: BodySurface,
 ) -> Int[Array, " surface_vertices"]:
     """Return a near cloth vertex for every body vertex.
 
-    Each cloth vertex is first assigned to the corners of its nearest body face. Then, a few times, every body
-    vertex takes the nearest of its own cloth vertex and those of its neighbours.
+    Each cloth vertex that is a seed is first assigned to the corners of its nearest body face. Then, a few times,
+    every body vertex takes the nearest of its own cloth vertex and those of its neighbours.
     """
     cloth, here = components(position), components(body)
     is_neighbor = surface.face_incidence < surface.faces.size
@@ -157,8 +159,7 @@ def _nearest_vertices(
     own = jnp.arange(body.shape[0], dtype=jnp.int32)[:, None]
     around = jnp.concatenate([own, jnp.where(is_neighbor, neighbors, own)], axis=1).T
     nobody = position.shape[0]
-    is_seed = nearest.is_near[:, None]
-    seeds = jnp.where(is_seed, surface.faces[nearest.faces], body.shape[0])
+    seeds = jnp.where(is_seed[:, None], corners, body.shape[0])
     vertex = jnp.full(body.shape[0], nobody, jnp.int32)
     ids = jnp.broadcast_to(jnp.arange(nobody, dtype=jnp.int32)[:, None], seeds.shape)
     vertex = vertex.at[seeds].set(ids, mode="drop")

@@ -33,7 +33,8 @@ _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest p
 _FAR_AT_REST = (
     2.0 * SEARCH_RADIUS
 )  # [m] between places of one piece that may come close; nearer ones bend towards
-_SAMPLED_FRAMES = 12  # frames in which reachable faces, and pieces that meet, are looked for
+_SAMPLED_FRAMES = 12  # in which is looked for pieces that meet, and for a ground in reach
+_REACH_SPACING = 0.1  # [s] between frames in which reachable faces are looked for
 Ground = Literal["auto", "on", "off"]
 _build = jax.jit(build_scene)
 _skin = jax.jit(skin_garment)
@@ -271,9 +272,9 @@ def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, ra
     return bool((lowest[is_free] < float(ground_height(poses))).any())
 
 
-def _sampled(num_frames: int) -> np.ndarray:
+def _sampled(num_frames: int, count: int = _SAMPLED_FRAMES) -> np.ndarray:
     """Return the frames that are looked at to decide what is modelled."""
-    return np.unique(np.linspace(0, num_frames - 1, _SAMPLED_FRAMES).astype(int))
+    return np.unique(np.linspace(0, num_frames - 1, count).astype(int))
 
 
 def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
@@ -324,14 +325,15 @@ def _meets_itself(garment: Garment, looseness: np.ndarray, skinned: np.ndarray) 
 def reachable_vertices(
     garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray
 ) -> np.ndarray:
-    """Return which body vertices the skinned garment can reach in a sample of frames.
+    """Return which body vertices the skinned garment can reach, looking ten times a second.
 
     A T-shirt's scene then searches no legs, no head and no feet. `radii` say how far each real vertex strays [m].
     """
     is_real = np.asarray(garment.vertex_mask)
     bodies = np.asarray(poses.positions)  # cut on the host, where it compiles nothing
     is_near = np.zeros(bodies.shape[1], bool)
-    for frame in _sampled(len(skinned)):
+    spacing = max(round(_REACH_SPACING / float(poses.timestep)), 1)
+    for frame in _sampled(len(skinned), max(_SAMPLED_FRAMES, -(-len(skinned) // spacing))):
         far = np.flatnonzero(~is_near)  # once is enough
         points = bodies[frame, far]
         is_near[far] = _within(radii, np.asarray(skinned[frame])[is_real], points)
@@ -371,6 +373,9 @@ def _looseness(garment: Garment, body: Body | BodyMotion) -> np.ndarray:
 def _within(radii: np.ndarray, centers: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return which points lie within the radius around any of the centers."""
     is_within = np.zeros(len(points), bool)
-    for hits in cKDTree(points).query_ball_point(centers, radii):
-        is_within[hits] = True
+    most = np.max(radii, initial=0.0)
+    low, high = centers.min(axis=0) - most, centers.max(axis=0) + most
+    boxed = np.flatnonzero(((points > low) & (points < high)).all(axis=1))  # a tree of few is quick to search
+    for hits in cKDTree(points[boxed]).query_ball_point(centers, radii):
+        is_within[boxed[hits]] = True
     return is_within

@@ -10,6 +10,8 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, lift_off_skin, skin_heights
 from eslr_jax.geometry.closest import closest_points
+from eslr_jax.geometry.padding import choose_bucket, pad_garment
+from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.physics.collision import skin_diagonal, skin_energy
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
@@ -132,3 +134,18 @@ def test_vertex_areas_of_a_body_sum_to_its_surface():
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.linalg.norm(crosses, axis=1).sum() / 2
     assert float(jnp.sum(prepare_surface(positions, faces).vertex_areas)) == pytest.approx(total, rel=1e-5)
+
+
+def test_padding_changes_no_row_of_skin():
+    """Padding lies in the middle of the cloth, here on the ball's top: the nearest of all to the skin there."""
+    garment, poses = square(side=9), drifting_ball(2, speed=0.0)
+    padded = to_device(pad_garment(garment, choose_bucket(garment)))
+    assert padded.vertex_mask.shape[0] > 81
+    rows = []
+    for one in (garment, padded):
+        scene = prepare_scene(one, poses, options=SceneOptions(has_skin=True))
+        rows.append(first_problem(scene).body.skin)
+    assert bool(rows[0].is_near.any())
+    np.testing.assert_array_equal(rows[0].is_near, rows[1].is_near)
+    is_near = np.asarray(rows[0].is_near)
+    np.testing.assert_array_equal(rows[0].corners[is_near], rows[1].corners[is_near])
