@@ -69,12 +69,13 @@ class ModelConfig:
             "latent_size",
             "attention_size",
             "attention_features",
+            "embedding_size",
             "refinement_steps",
         )
         for name in sizes:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("smoothing_steps", "attention_blocks", "hidden_layers", "embedding_size"):
+        for name in ("smoothing_steps", "attention_blocks", "hidden_layers"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("output_scale", "world_edge_radius"):
@@ -125,8 +126,8 @@ class Predictor(Protocol):
 class SimConfig:
     """How a frame is solved; static, so a change compiles anew.
 
-    Without a model the solver starts from its own guess. With one, it starts from the network's prediction;
-    `iterations=0` then leaves the prediction as it is.
+    Without a model the solver starts from its own guess. With one, it starts from the network's prediction, or
+    from the point that the prediction corrects if that has less energy; `iterations=0` ends the frame there.
     """
 
     model: ModelConfig | Predictor | None = None  # architecture, or a network of one's own; None: no network

@@ -15,7 +15,13 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.plate import prepare_plate
 from eslr_jax.geometry.topology import find_hinges, vertex_areas
 from eslr_jax.geometry.weave import warp_directions
-from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
+from eslr_jax.graph.features import (
+    BENDING_RANGE,
+    DENSITY_RANGE,
+    LAME_LAMBDA_RANGE,
+    LAME_MU_RANGE,
+    sheet_constants,
+)
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.bending import RIGIDITY_PER_STIFFNESS
 from eslr_jax.physics.materials import COTTON, WOVEN, Weave, fabric_material, fabric_names, isotropic_nearest
@@ -154,17 +160,21 @@ def _sheet_stiffness(sheet: Material) -> tuple[float, float, float, float]:
 
 
 def beyond_training(material: Material) -> tuple[str, ...]:
-    """Return the names of the constants outside the ranges that networks are trained on (HOOD's)."""
-    ranges = {
-        "lame_mu": LAME_MU_RANGE,
-        "lame_lambda": LAME_LAMBDA_RANGE,
-        "bending_stiffness": BENDING_RANGE,
+    """Return the names of the constants outside the ranges that networks are trained on (HOOD's).
+
+    Mu and lambda are compared for HOOD's thickness, as networks read them.
+    """
+    lame_mu, lame_lambda = sheet_constants(material)
+    values = {
+        "density": (material.density, DENSITY_RANGE),
+        "lame_mu": (lame_mu, LAME_MU_RANGE),
+        "lame_lambda": (lame_lambda, LAME_LAMBDA_RANGE),
+        "bending_stiffness": (material.bending_stiffness, BENDING_RANGE),
     }
-    values = {name: np.asarray(getattr(material, name)) for name in ranges}
     return tuple(
         name
-        for name, (low, high) in ranges.items()
-        if values[name].min() < 0.99 * low or values[name].max() > 1.01 * high
+        for name, (value, (low, high)) in values.items()
+        if np.min(value) < 0.99 * low or np.max(value) > 1.01 * high
     )
 
 

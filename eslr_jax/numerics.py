@@ -238,7 +238,7 @@ def _gather_flat_impl(x, flat, incidence):
 
 def _sum_flat_impl(values, flat, incidence):
     """Return for every row the sum of the values whose flat position its table names."""
-    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    padded = jnp.concatenate([values, jnp.zeros(1, values.dtype)])
     return sum(padded[incidence[:, k]] for k in range(incidence.shape[1]))
 
 
@@ -303,7 +303,7 @@ def sum_incident(
         corners: Corners of an item.
     """
     items = _incident_items(incidence, values.shape[0], corners=corners)
-    padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    padded = jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]), values.dtype)])
     return sum(padded[items[:, k]] for k in range(items.shape[1]))  # type: ignore[return-value]
 
 

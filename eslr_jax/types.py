@@ -51,6 +51,8 @@ class Garment:
     """A garment's rest mesh, its topology tables and its skinning; constant during a rollout."""
 
     rest_positions: Float[Array, "vertices 3"]  # [m], in the body's rest pose
+    # [m], on which lengths, areas and angles are measured; they differ where the garment was posed or cut anew
+    sewn_positions: Float[Array, "vertices 3"]
     faces: Int[Array, "faces 3"]  # counter-clockwise seen from outside
     rest_areas: Float[Array, " faces"]  # [m^2], zero where padded
     inverse_rest_frames: Float[Array, "faces 2 2"]  # inverse of D_m [1/m]
@@ -291,13 +293,16 @@ class PotentialTerms(NamedTuple):
 
 @struct.dataclass
 class Trajectory:
-    """A simulated garment. Frame 0 is the initial state; its energies, residual and iterations are zero."""
+    """A simulated garment. Frame 0 is the initial state; it has zero energies, residual and iterations."""
 
     positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
     friction_loads: Float[Array, "frames vertices"]  # normal forces that load the next frame's friction [N]
     terms: PotentialTerms  # energies that each frame ended with [J], shape [frames]
     residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame
+    gap_bounds: Float[
+        Array, " frames"
+    ]  # share of the initial gap that the solver left at most; inf without one
     iterations: Int[Array, " frames"]  # of the solver; with substeps, the most that one of them took
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # row of the first frame with a status; -1 while status is OK

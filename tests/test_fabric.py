@@ -183,3 +183,10 @@ def test_a_weave_of_another_mesh_is_refused(two_fabrics):
     material = garment_material(["suiting-woven"], garment, stored)
     with pytest.raises(ConfigError, match="plate is of"):
         validate_material(material, prepare_stored(stored, pad=True))
+
+
+def test_what_networks_have_not_seen_is_named():
+    thick = COTTON.replace(thickness=np.float32(2e-3))
+    assert beyond_training(COTTON) == ()
+    assert beyond_training(thick) == ("lame_mu", "lame_lambda")
+    assert beyond_training(COTTON.replace(density=np.float32(3.0))) == ("density",)

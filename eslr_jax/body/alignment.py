@@ -102,7 +102,7 @@ def align_rests(
             if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
                 continue
             turn = minimal_rotation(upright @ bone, other)
-            if beyond in ("lower_leg", "foot") and np.arccos((np.trace(turn) - 1) / 2) > MAX_LEG_TURN:
+            if beyond in ("lower_leg", "foot") and _angle(turn) > MAX_LEG_TURN:
                 raise MotionError(
                     f"motion {name}: its rest pose does not stand ({side} {chain} points elsewhere); "
                     "export it with a T-pose at rest"
@@ -111,6 +111,11 @@ def align_rests(
             for part in chains:
                 result[ours.get((side, part), [])] = turn @ upright
     return result
+
+
+def _angle(turn: NDArray) -> float:
+    """Return the angle of a rotation [rad]; rounding may leave its trace out of range."""
+    return float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
 
 
 def _bone(skeleton: Skeleton, parts: Parts, start: Part, end: Part) -> NDArray:

@@ -71,7 +71,7 @@ def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: f
     """
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
-        rotations = abduct_arms(rotations, body.joint_names, arm_angle)
+        rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=_front(body))
     root = np.asarray(body.joint_rest_positions)[0].copy()
     root[1] -= float(np.asarray(body.rest_positions)[:, 1].min())  # soles on the floor
     return Motion("still", rotations, np.tile(root, (num_frames, 1)), fps, body.joint_names)
@@ -170,7 +170,8 @@ def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *
 def obstacle_surface(body: Body) -> BodySurface:
     """Return the search tables of all faces of a body that cloth may touch."""
     faces = np.asarray(body.faces)[np.asarray(body.is_obstacle)]
-    return _search_tables(np.asarray(body.rest_positions).tobytes(), faces.tobytes())
+    rest = np.asarray(body.rest_positions, np.float32)
+    return _search_tables(rest.tobytes(), np.asarray(faces, np.int32).tobytes())
 
 
 @lru_cache(maxsize=4)

@@ -15,6 +15,7 @@ from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
 from eslr_jax.body.units import metres_per_unit
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.geometry.validate import check_outward
 from eslr_jax.io.mesh import shared_vertices
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.types import Body
@@ -41,6 +42,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
 
     Raises:
         AssetError: The mesh is empty or not finite, its weights and faces don't fit, or its unit is unknown.
+        MeshError: Its faces point inside.
     """
     _check_mesh(mesh)
     scale = metres_per_unit(f"body {mesh.name}", float(np.ptp(mesh.positions, axis=0).max()), units)
@@ -48,6 +50,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     faces = places[mesh.faces]
     corners = np.sort(faces, axis=1)
     faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
+    check_outward(mesh.positions[vertices], faces, name=f"body {mesh.name}")
     skeleton, order = hips_first(mesh.skeleton)
     joint_place = np.argsort(order)
     indices = joint_place[mesh.skin_indices[vertices]]

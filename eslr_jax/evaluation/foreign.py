@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from eslr_jax.evaluation.gap import map_frames, past_states, trajectory_states
 from eslr_jax.numerics import safe_norm
@@ -22,7 +22,7 @@ def foreign_trajectory(
     friction_loads: Float[ArrayLike, "frames vertices"] | None = None,
     iterations: int = 0,
 ) -> Trajectory:
-    """Return the trajectory of another simulator; energies and residuals, which it does not tell, are NaN.
+    """Return the trajectory of another simulator; what it does not tell, such as energies and residuals, is NaN.
 
     Args:
         positions: Vertex positions [m], shape [frames, vertices, 3].
@@ -43,6 +43,7 @@ def foreign_trajectory(
         friction_loads=loads,
         terms=PotentialTerms(*[unknown] * len(PotentialTerms._fields)),
         residuals=unknown,
+        gap_bounds=unknown,
         iterations=jnp.full(len(x), iterations, jnp.int32).at[0].set(0),
         status=jnp.int32(0),
         first_bad_frame=jnp.int32(-1),
@@ -89,22 +90,24 @@ def find_friction_loads(
 
 @jax.jit
 def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
-    """Return a trajectory with energies and residuals at its positions in our energy; frame 0 has none.
+    """Return a trajectory with energies, residuals and pairs of cloth at its positions; frame 0 has none.
 
     Args:
-        trajectory: Of any simulator; its own energies and residuals are replaced.
+        trajectory: Of any simulator; its own energies, residuals and demand of pairs are replaced by ours.
         scene: Its scene.
     """
 
     def measure(
         position: Float[Array, "vertices 3"], problem: FrameProblem
-    ) -> tuple[PotentialTerms, Float[Array, ""]]:
+    ) -> tuple[PotentialTerms, Float[Array, ""], Int[Array, ""] | None]:
         gradient = evaluate(position, problem).gradient
-        return potential_terms(position, problem), safe_norm(gradient.reshape(-1)) / weight_norm(problem)
+        residual = safe_norm(gradient.reshape(-1)) / weight_norm(problem)
+        demand = None if problem.layers is None else problem.layers.pairs.count
+        return potential_terms(position, problem), residual, demand
 
     states, inputs = trajectory_states(trajectory, scene)
     measured = map_frames(measure, trajectory.positions[1:], states, inputs, scene)
-    terms, residuals = jax.tree.map(
+    terms, residuals, demand = jax.tree.map(
         lambda track: jnp.concatenate([jnp.zeros_like(track[:1]), track]), measured
     )
-    return trajectory.replace(terms=terms, residuals=residuals)
+    return trajectory.replace(terms=terms, residuals=residuals, pair_demand=demand)

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFiniteError
+from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.errors import CapacityError, ConfigError, MissingExtraError, MotionError, NonFiniteError
 from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
 from eslr_jax.evaluation.metrics import face_stretches
@@ -67,14 +68,22 @@ def score_trajectory(
         ConfigError: `every` is less than one.
         MotionError: There are fewer than three frames, or another number of frames or vertices than in the scene.
         NonFiniteError: A position is NaN or infinite.
+        CapacityError: More cloth touches cloth than there is room for.
     """
     positions = np.asarray(trajectory.positions if isinstance(trajectory, Trajectory) else trajectory)
     _check(positions, scene, every)
+    if scene.self_contact is not None:  # the buffers that `simulate` begins with may be too small
+        scene = scene.replace(self_contact=default_capacity(positions.shape[1]))
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
-    report = trajectory_report(
-        with_energies(trajectory, scene), scene, parts=parts, poses=poses, outfit=outfit
-    )
+    trajectory = with_energies(trajectory, scene)
+    if (room := scene.self_contact) is not None:
+        pairs = int(np.max(np.asarray(trajectory.pair_demand)))
+        if pairs > room.pairs:
+            raise CapacityError(
+                f"{pairs} pairs of cloth touch, and the scene has room for {room.pairs}; cut it"
+            )
+    report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:
         skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)

@@ -137,6 +137,7 @@ def _padding_values(leaves: dict[str, np.ndarray], bucket: Bucket) -> dict[str, 
     return {
         "vertices": {
             "rest_positions": leaves["rest_positions"].mean(axis=0),
+            "sewn_positions": leaves["sewn_positions"].mean(axis=0),
             "vertex_areas": 0,
             "vertex_mask": False,
             "geodesic_embedding": 0,

@@ -81,6 +81,7 @@ def prepare_garment(
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
     leaves: dict[str, Any] = dict(
         rest_positions=positions,
+        sewn_positions=sewn,
         faces=faces,
         rest_areas=areas,
         inverse_rest_frames=topology.inverse_rest_frames(sewn, faces),

@@ -26,6 +26,7 @@ from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.inputs import GraphInputs, required
+from eslr_jax.numerics import safe_norm
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
@@ -106,7 +107,11 @@ def build_frame_graph(
             )
             senders[name], receivers[name] = level.senders, level.receivers
     if inputs.contacts is not None:
-        mask = (jnp.abs(inputs.contacts.distances) <= config.world_edge_radius) & garment.vertex_mask
+        # A contact of thrown cloth is measured on its path; HOOD's edges join what is near now.
+        away = inputs.contacts.distances
+        if is_hood:
+            away = safe_norm(inputs.contacts.points - inputs.position)
+        mask = (jnp.abs(away) <= config.world_edge_radius) & garment.vertex_mask
         topology["world_mask"] = mask
         if is_hood:
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)

@@ -16,9 +16,11 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.graph.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.physics.materials import COTTON
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
-LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD, training range)
+DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD, training range)
+LAME_MU_RANGE = (15909.0, 63636.0)  # [Pa] (HOOD)
 LAME_LAMBDA_RANGE = (3535.414406069427, 93333.73508005822)  # [Pa] (HOOD)
 BENDING_RANGE = (6.370782056371576e-8, 1.3139737991266374e-3)  # [J] (HOOD)
 REGULAR_TIMESTEP = 1 / 30  # [s] (HOOD)
@@ -72,11 +74,17 @@ def to_vertices(
     return jnp.where(sums[:, 1] > 0, sums[:, 0] / jnp.where(sums[:, 1] > 0, sums[:, 1], 1), mean)
 
 
+def sheet_constants(material: Material) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Return mu and lambda [Pa] of a sheet of HOOD's thickness that stretches as this one does."""
+    ratio = jnp.asarray(material.thickness) / float(COTTON.thickness)
+    return material.lame_mu * ratio, material.lame_lambda * ratio
+
+
 def material_inputs(garment: Garment, material: Material) -> Float[Array, "vertices 3"]:
     """Return bending stiffness, mu and lambda of every vertex, scaled to 0..1 over HOOD's training ranges.
 
     Bending stiffness and mu have a logarithmic scale, lambda a linear one. A fabric outside the ranges gives
-    values outside 0..1.
+    values outside 0..1. Mu and lambda are those of a sheet of HOOD's thickness that stretches alike.
 
     Source: HOOD's `runners/utils/material.py`.
     """
@@ -86,7 +94,7 @@ def material_inputs(garment: Garment, material: Material) -> Float[Array, "verti
     )
     mu, lam = (
         to_vertices(value, garment.rest_areas, garment.face_incidence, 3)
-        for value in (material.lame_mu, material.lame_lambda)
+        for value in sheet_constants(material)
     )
 
     def log_scale(x, low, high):
@@ -106,7 +114,7 @@ def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 def mean_edge_length(garment: Garment, edges: Garment | CoarseEdges) -> Float[Array, ""]:
     """Return the mean length at rest of the garment's edges, or of a coarse level's [m]."""
-    rest = _edge_vectors(edges, garment.rest_positions)
+    rest = _edge_vectors(edges, garment.sewn_positions)
     total = jnp.sum(jnp.where(edges.edge_mask, safe_norm(rest), 0))
     return total / jnp.maximum(jnp.sum(edges.edge_mask.astype(rest.dtype)), 1)
 
@@ -157,7 +165,7 @@ def hood_edge_features(
         edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
     """
     current = _edge_vectors(edges, inputs.position)
-    rest = _edge_vectors(edges, garment.rest_positions)
+    rest = _edge_vectors(edges, garment.sewn_positions)
     constants = material_inputs(garment, material)
     return jnp.concatenate(
         [
@@ -226,7 +234,7 @@ def frame_node_features(
             clip(inputs.velocity / VELOCITY_SCALE),
             vertex_normals(inputs.position, garment.faces, garment.face_incidence),
             jnp.stack(scalars, axis=1),
-            material_inputs(garment, material),
+            clip(material_inputs(garment, material)),
         ],
         axis=1,
     )
@@ -282,7 +290,7 @@ def frame_mesh_features(
         edge_length: Their mean length at rest [m].
     """
     current = _edge_vectors(edges, position)
-    rest = _edge_vectors(edges, garment.rest_positions)
+    rest = _edge_vectors(edges, garment.sewn_positions)
     rest_length = safe_norm(rest, keepdims=True)
     return jnp.concatenate(
         [
@@ -302,7 +310,7 @@ def refinement_mesh_features(
     edge_length: Float[Array, ""],
 ) -> Float[Array, "edges 4"]:
     """Return sender minus receiver at the guess 3, in mean lengths, and its strain; see `frame_mesh_features`."""
-    rest = _edge_vectors(edges, garment.rest_positions)
+    rest = _edge_vectors(edges, garment.sewn_positions)
     vector = _edge_vectors(edges, guess)
     return jnp.concatenate(
         [clip(vector / edge_length), _strain(vector, safe_norm(rest, keepdims=True))], axis=1

@@ -1,10 +1,8 @@
 """Read HOOD's checkpoints: its weights under our names.
 
 Three layouts are read: "postcvpr" (levels), "cvpr" (five lists of steps, one encoder for all coarse levels)
-and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from the same graph.
-Our graphs differ in two points. Every garment vertex has a body row of its own, at the nearest point of the
-body's surface, where HOOD joins it to the nearest body vertex. And that row's velocity is the body's way to the
-next frame, as in "cvpr" and the MeshGraphNets; "postcvpr" takes the way since the last one.
+and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from the same graph;
+`models.hood` says in what our graphs differ.
 
 Source: Grigorev, Black and Hilliges, "HOOD" (2023), repository at 9bc1076, models/ and utils/normalization.py.
 """

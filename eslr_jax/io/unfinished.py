@@ -13,13 +13,14 @@ from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.types import PotentialTerms, Trajectory
 
 NAME = "unfinished.npz"
-_FORMAT = "eslr-unfinished-1"
+_FORMAT = "eslr-unfinished-2"
 _TERMS = {name: f"terms_{name}" for name in PotentialTerms._fields}
 _FIELDS = {
     "positions": ("f", "frames vertices 3"),
     "velocities": ("f", "frames vertices 3"),
     "friction_loads": ("f", "frames vertices"),
     "residuals": ("f", "frames"),
+    "gap_bounds": ("f", "frames"),
     "iterations": ("iu", "frames"),
 }
 _PAIRS = "pair_demand"

@@ -5,9 +5,10 @@ back. So a message crosses the garment in few steps. On a stage without the mesh
 vertices that no edge of the stage joins. The third level, coarse2, is encoded and not used, as published;
 only a vertex's level reads it.
 
-Two things differ from the published network. Every garment vertex has a body row of its own at the nearest
-point of the body, where HOOD's garment vertices share the nearest body vertex. And the centre of the levels
-is not random.
+What differs from the published network: every garment vertex has a body row of its own, at the nearest point
+of the body's surface, where HOOD joins it to the nearest body vertex, or to none if that is on a hand; our bodies
+are searched without hands. That row's velocity is the body's way to the next frame, as in HOOD's "cvpr" and its
+MeshGraphNets; "postcvpr" takes the way since the last one. And the centre of the levels is not random.
 
 With features "gradient" the level's embedding stands behind a vertex's features, and body rows have an encoder
 of their own.
@@ -91,7 +92,7 @@ class HoodLayer(nn.Module):
             messages = edge.finish(edge.start(edges[name], 2 * size) + ends)
             hidden = hidden + vertex.start(sum_receivers(messages, table), place * size)
             edges[name] = edges[name] + messages
-        if world is not None and world.reverse is not None:
+        if world is not None:
             edge, column, mask = self.world_mlp, (1 + len(self.sets)) * size, tables.world_mask
             ends = edge.start(garment, 0) + edge.start(world.body, size)
             to_garment = mask * edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))

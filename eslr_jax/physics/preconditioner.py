@@ -38,7 +38,7 @@ def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " ver
     Moving one corner along its height changes the strain by 1/height, so the curvature is A h (lambda + 2 mu)
     / height^2 = h (lambda + 2 mu) |opposite edge|^2 / (4 A); with threads their mean stiffness.
     """
-    corners = garment.rest_positions[garment.faces]
+    corners = garment.sewn_positions[garment.faces]
     opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
     squared = jnp.sum(opposite * opposite, axis=-1)
     if material.threads is None:
@@ -61,23 +61,32 @@ def hessian_diagonal(
         problem: The frame's problem.
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
-    garment, constants = problem.garment, problem.constants
+    garment = problem.garment
     diagonal = problem.masses / problem.inertial_timestep**2 + _membrane_diagonal(problem)
     if problem.body is not None:
         body = problem.body
         depth = penetration(position, body.nearest, body.thickness)
         depth = depth + penetration(position, body.opposing, body.thickness)
-        slip = constants.friction_speed * problem.timestep
-        # The contact curvature acts along one of three axes, friction along two.
-        diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
-        diagonal = diagonal + constants.friction_coefficient * body.friction_load / (3.0 * slip)
+        diagonal = diagonal + _touch_diagonal(problem, depth, body.friction_load)
     if problem.ground is not None:
-        depth = penetration(position, problem.ground.contacts, problem.ground.thickness)
-        slip = constants.friction_speed * problem.timestep
-        diagonal = diagonal + 2.0 * constants.collision_stiffness * garment.vertex_areas * depth
-        diagonal = diagonal + constants.friction_coefficient * problem.ground.friction_load / (3.0 * slip)
+        ground = problem.ground
+        depth = penetration(position, ground.contacts, ground.thickness)
+        diagonal = diagonal + _touch_diagonal(problem, depth, ground.friction_load)
     diagonal = diagonal + pair_diagonal(problem, position)
     return jnp.where(garment.vertex_mask, diagonal, 1.0)
+
+
+def _touch_diagonal(
+    problem: FrameProblem, depth: Float[Array, " vertices"], load: Float[Array, " vertices"]
+) -> Float[Array, " vertices"]:
+    """Return the stiffness per vertex [N/m] of a contact so deep [m], with friction under a normal force [N].
+
+    The contact's curvature acts along one of three axes, that of friction along two.
+    """
+    constants = problem.constants
+    slip = constants.friction_speed * problem.timestep
+    touch = 2.0 * constants.collision_stiffness * problem.garment.vertex_areas * depth
+    return touch + constants.friction_coefficient * load / (3.0 * slip)
 
 
 def _membrane_diagonal(problem: FrameProblem) -> Float[Array, " vertices"]:
@@ -139,7 +148,7 @@ def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 
     """
     matrix = stiffness(problem, position)
     squared, rest = (
-        _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.rest_positions)
+        _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.sewn_positions)
     )
     is_spring = matrix.springs > 0
     stretched = jnp.where(is_spring, squared, 0.0) / jnp.where(is_spring, rest, 1.0)

@@ -29,6 +29,7 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
     thirds = jnp.broadcast_to((areas / 3.0)[:, None], garment.faces.shape)
     return garment.replace(
         rest_positions=rest_positions,
+        sewn_positions=rest_positions,
         rest_areas=areas,
         inverse_rest_frames=jnp.where(
             is_real[:, None, None], _inverse_rest_frames(rest_positions, garment), garment.inverse_rest_frames

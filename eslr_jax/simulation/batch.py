@@ -17,7 +17,7 @@ from eslr_jax.geometry.padding import choose_bucket
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, prepare_scenes
 from eslr_jax.simulation.rollout import check_network, rollout_scene
-from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, simulate
+from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, hold_last, simulate
 from eslr_jax.types import BodyMotion, Garment, Material, PhysicsConstants, Scene, Trajectory
 
 SCENES = "scenes"  # axis of the device mesh
@@ -90,6 +90,7 @@ def simulate_batch(
             one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
             if (larger := enlarge_buffers(scene, one)) is not None:
                 one = simulate(params, larger, config=config, raises=False).trajectory
+                one = hold_last(one, scene.num_frames)  # it ends where something else goes wrong
             done[i] = _first_vertices(one, garments[i].vertex_mask.shape[0])
     return [done[i] for i in range(len(garments))]
 

@@ -181,6 +181,7 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         friction_loads=with_start(start.friction_load, frames.friction_loads),
         terms=reports.terms,
         residuals=reports.residual,
+        gap_bounds=reports.gap_bound,
         iterations=reports.iterations,
         pair_demand=reports.pair_demand,
         status=end.status,

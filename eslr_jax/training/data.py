@@ -22,7 +22,7 @@ from eslr_jax.scene.plan import shared_surface
 from eslr_jax.types import Body, BodySurface, Garment
 
 FPS = 30.0  # frames per second of training
-_SMOOTHING_STEPS = 10  # of what a garment takes over from the body, as for its skin weights
+_SMOOTHING_STEPS = 10  # of what a garment takes over from the body
 
 
 @struct.dataclass
@@ -136,8 +136,10 @@ def build_training_data(
 
     Raises:
         ConfigError: The garments are not near the body, no clip has two frames, or the body has no shapes and
-            they are asked for.
+            they are asked for, or it has pose blend shapes.
     """
+    if body.pose_directions is not None:
+        raise ConfigError("the body has pose blend shapes, which training leaves out; train on one without")
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *garments)
     surface = shared_surface(garments, body)
     if surface is None:

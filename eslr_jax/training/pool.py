@@ -9,13 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.contact.nearest import clear_of_body
-from eslr_jax.graph.features import BENDING_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
+from eslr_jax.graph.features import BENDING_RANGE, DENSITY_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.types import ClothState, Material
-
-_DENSITY_RANGE = (0.0434, 0.7)  # [kg/m^2] (HOOD)
 
 
 @struct.dataclass
@@ -104,7 +102,7 @@ def sample_material(key: Array, probability: float) -> Material:
         return jnp.exp(uniform(k, (jnp.log(bounds[0]), jnp.log(bounds[1]))))
 
     drawn = Material(
-        density=uniform(keys[0], _DENSITY_RANGE),
+        density=uniform(keys[0], DENSITY_RANGE),
         lame_mu=log_uniform(keys[1], LAME_MU_RANGE),
         lame_lambda=uniform(keys[2], LAME_LAMBDA_RANGE),
         bending_stiffness=log_uniform(keys[3], BENDING_RANGE),

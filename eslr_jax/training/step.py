@@ -229,7 +229,7 @@ def _sample_gradient(
     (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(params["params"])
     statistics = {}
     if params["statistics"]:
-        statistics = _statistics(params, slot, problem, config)
+        statistics = _statistics(params, slot, problem, data, index, config)
     horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
     slot, is_astray = _advance(slot, problem, report, data, horizon)
     metrics = {
@@ -352,28 +352,35 @@ def _advance(
 ) -> tuple[Slot, Bool[Array, ""]]:
     """Move the trajectory on with the network's prediction, and tell whether it has gone astray.
 
-    It is done then, and at its horizon.
+    It is done then, and at its horizon. A simulated frame takes the solver's guess where that has less energy; a
+    trajectory goes on from the prediction all the same, since it is from there that the network has to learn.
     """
     state = next_state(report.onward, problem, slot.state, jnp.int32(0))
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
     moved = jnp.max(jnp.abs(state.position - slot.state.position))
     is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
+    is_astray |= (state.status & Status.BODY_TOO_FAST) > 0  # contacts can't follow: no frame for learning
     age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
     is_done = is_astray | (age >= horizon.frames)
     return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done), is_astray
 
 
-def _statistics(params: Any, slot: Slot, problem: FrameProblem, config: TrainConfig) -> dict[str, Normalizer]:
-    """Return what the normalisers see in this frame (HOOD).
-
-    An acceleration is the way from the cloth's inertial guess to the skinned garment. Over HOOD's horizon of five
-    frames that is the skinned garment's own acceleration. In a long trajectory the distance by which cloth hangs
-    away from its skinned place dominates it.
-    """
+def _statistics(
+    params: Any,
+    slot: Slot,
+    problem: FrameProblem,
+    data: TrainingData,
+    index: Int[Array, ""],
+    config: TrainConfig,
+) -> dict[str, Normalizer]:
+    """Return what the normalisers see in this frame (HOOD); an acceleration is that of the skinned garment."""
     inputs = graph_inputs(problem, slot.state)
     graph = build_graph(problem.garment, problem.material, inputs, config.model)
     acceleration = None
     if config.model.output == "acceleration":
-        guess = problem.pin_targets if problem.pin_targets is not None else problem.inertial_guess
-        acceleration = guess - problem.inertial_guess
+        frames = (slot.before, slot.frame, data.next_frame(slot.frame, slot.before))
+        before, now, later = (
+            data.skinned(index, data.transforms(frame, slot.yaw, slot.shape), slot.shape) for frame in frames
+        )
+        acceleration = later - 2.0 * now + before
     return measure_statistics(config.model, params, graph, problem.garment, acceleration)

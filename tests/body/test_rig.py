@@ -4,18 +4,19 @@ import dataclasses
 import json
 import warnings
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.joints import complete_map, find_parts, name_part, read_joint_map, torso_axes
-from eslr_jax.body.motion import pose_body
+from eslr_jax.body.motion import obstacle_surface, pose_body, still_motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.retarget import global_rotations
-from eslr_jax.body.rig import body_skeleton, hips_first, make_motion, skeleton_motion
-from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.skeleton import Skeleton, SkeletonMotion, chain_positions
+from eslr_jax.body.rig import body_skeleton, hips_first, make_body, make_motion, skeleton_motion
+from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 
 RIGS = {
     "Mixamo": """
@@ -181,3 +182,43 @@ def test_a_figure_that_lies_in_its_motion_alone_is_told_to_be_taken_as_z_up(body
         warnings.simplefilter("error")
         make_motion(crawling, body, up="y")
         make_motion(source, body, up="auto")
+
+
+def test_a_character_that_is_inside_out_is_refused(body):
+    mesh = RiggedMesh(
+        name="hero",
+        positions=np.asarray(body.rest_positions, np.float64),
+        faces=np.asarray(body.faces),
+        skin_weights=np.asarray(body.skin_weights, np.float64),
+        skin_indices=np.asarray(body.skin_indices),
+        skeleton=body_skeleton(body),
+    )
+    make_body(mesh)
+    with pytest.raises(MeshError, match="body hero: its faces point inside; flip the normals"):
+        make_body(dataclasses.replace(mesh, faces=mesh.faces[:, ::-1]))
+
+
+def test_only_a_bvh_is_told_which_axis_points_up(body):
+    for name in ("turn", "cmu_016_32"):
+        with pytest.raises(MotionError, match=f"{name} tells which axis points up.*--motion-up"):
+            load_motion(name, body=body, up="z")
+
+
+def test_arms_are_lifted_to_the_side_of_a_body_that_faces_elsewhere(body):
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # it faces +X
+    other = body.replace(
+        rest_positions=body.rest_positions @ turn.T, joint_rest_positions=body.joint_rest_positions @ turn.T
+    )
+    ours, theirs = (pose_body(one, still_motion(one, 2, arm_angle=20.0)) for one in (body, other))
+    away = np.asarray(theirs.positions[0]) - np.asarray(ours.positions[0]) @ turn.T
+    assert np.abs(away - away[0]).max() < 0.03, "a chest that faces nearly ahead is taken to face ahead"
+
+
+def test_a_body_in_float64_has_the_same_search_tables(body):
+    double = body.replace(
+        rest_positions=np.asarray(body.rest_positions, np.float64), faces=np.asarray(body.faces, np.int64)
+    )
+    for one, other in zip(
+        jax.tree.leaves(obstacle_surface(body)), jax.tree.leaves(obstacle_surface(double)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)

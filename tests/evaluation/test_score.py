@@ -14,6 +14,7 @@ from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.models.registry import init_model
 from eslr_jax.physics.air import blowing
+from eslr_jax.types import PairCapacity
 
 FRAMES = 7
 GUSTY = SceneOptions(air=blowing((3.0, 0.0, 0.0), 1.0))  # blows otherwise in every frame
@@ -132,3 +133,18 @@ def test_an_evaluation_without_the_gap_has_the_rollouts():
     assert not {"gap_median_j", "on_policy"} & set(result)
     assert [(row["garment"], row["clip"]) for row in result["scenes"]] == [("tshirt", "cmu_016_32")]
     assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}
+
+
+def test_a_scene_whose_buffers_are_too_small_is_scored_with_larger_ones():
+    """`prepare_scene` begins with a small buffer, which `simulate` enlarges in a scene of its own."""
+    scene = prepare_scene(square(), drifting_ball(4), options=SceneOptions(self_contact=True))
+    low = np.asarray(scene.initial_state.position)
+    folded = low.copy()
+    folded[:, 0] = np.where(low[:, 0] > 0, -low[:, 0], low[:, 0])  # one half lies 6 mm over the other
+    folded[:, 1] += np.where(low[:, 0] > 0, 6e-3, 0.0)
+    positions = np.repeat(folded[None], 4, axis=0)
+    little = scene.replace(self_contact=PairCapacity(pairs=2))
+    told = with_energies(foreign_trajectory(positions, little), little)
+    assert int(np.max(told.pair_demand)) > 2
+    expected = score_trajectory(positions, scene, every=1)
+    assert score_trajectory(positions, little, every=1)["total"] == expected["total"]

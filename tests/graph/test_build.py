@@ -240,3 +240,25 @@ def test_gradients_of_features_are_finite_where_lengths_vanish(config):
     zeros = jnp.zeros_like(inputs.position)
     for slope in quick_jit(jax.grad(total, argnums=(0, 1, 2)))(zeros, zeros, zeros):
         assert np.isfinite(slope).all()
+
+
+def test_cloth_that_is_not_stretched_as_sewn_has_no_strain_in_its_features(scene):
+    """The rest pose of a garment that was posed by `eslr fit` is not the shape that it was sewn in."""
+    garment, material, inputs = scene
+    rest = np.asarray(garment.rest_positions)
+    posed = garment.replace(rest_positions=garment.rest_positions * 1.3)
+    graph = build(GRADIENT, (posed, material, inputs.replace(position=garment.sewn_positions)))
+    np.testing.assert_allclose(graph.edges["mesh"][:, 7], 0.0, atol=1e-4)
+    sewn = rest[garment.senders] - rest[garment.receivers]
+    spacing = np.linalg.norm(sewn, axis=1).mean()
+    np.testing.assert_allclose(graph.edges["mesh"][:, 3:6], np.clip(sewn / spacing, -5, 5), atol=1e-5)
+
+
+def test_thicker_sheets_are_stiffer_to_the_network_and_no_input_is_larger_than_promised(scene):
+    garment, material, inputs = scene
+    thick = material.replace(thickness=material.thickness * 2.0)
+    stiff = material.replace(lame_mu=material.lame_mu * 2.0, lame_lambda=material.lame_lambda * 2.0)
+    rows = [build(GRADIENT, (garment, fabric, inputs)).nodes["garment"] for fabric in (thick, stiff)]
+    np.testing.assert_allclose(*rows, atol=1e-6)
+    hard = material.replace(lame_lambda=material.lame_lambda * 100.0)
+    assert float(jnp.abs(build(GRADIENT, (garment, hard, inputs)).nodes["garment"]).max()) <= 5.0

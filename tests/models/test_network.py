@@ -15,6 +15,7 @@ from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
 from eslr_jax.models import registry
+from eslr_jax.models.dense import TALL, matmul
 from eslr_jax.models.registry import MODELS, apply_model, init_model
 from eslr_jax.types import tree_cast
 
@@ -193,6 +194,7 @@ def permute_garment(garment, order):
     sort = np.lexsort((senders, receivers))
     return garment.replace(
         rest_positions=garment.rest_positions[order],
+        sewn_positions=garment.sewn_positions[order],
         faces=jnp.asarray(rank[garment.faces]),
         vertex_areas=garment.vertex_areas[order],
         senders=jnp.asarray(senders[sort]),
@@ -270,3 +272,41 @@ def test_a_batch_agrees_with_a_loop(way, scene):
     batched = jax.vmap(answer) if way == "vmap" else lambda batch: jax.lax.map(answer, batch)
     expected = jnp.stack([run(SMOOTHING, params, garment, material, one)[2] for one in (first, second)])
     assert_close(quick_jit(batched)(batch), expected)
+
+
+@pytest.mark.parametrize("rows", [TALL // 8, TALL + 88])
+def test_products_in_bfloat16_have_the_gradients_of_exact_ones(rows):
+    """The backward pass is written by hand, and otherwise for many rows."""
+    x, w, c = (
+        jax.random.normal(key, shape)
+        for key, shape in zip(
+            jax.random.split(jax.random.key(0), 3), [(rows, 24), (24, 16), (rows, 16)], strict=True
+        )
+    )
+
+    def gradients(precision):
+        return jax.jit(jax.grad(lambda x, w: jnp.sum(matmul(x, w, precision) * c), argnums=(0, 1)))(x, w)
+
+    for near, exact in zip(gradients("bfloat16"), gradients("float32"), strict=True):
+        assert float(jnp.abs(near - exact).max() / jnp.abs(exact).max()) < 0.01
+    both = jax.vmap(lambda w: jax.grad(lambda w: jnp.sum(matmul(x, w, "bfloat16") * c))(w))(
+        jnp.stack([w, 2 * w])
+    )
+    np.testing.assert_allclose(both[0], both[1], rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_what_a_layer_keeps_for_its_backward_pass_changes_no_gradient():
+    garment, material, inputs = make_scene(6, 5)
+    found = []
+    for remat in ("none", "products", "layers"):
+        config = dataclasses.replace(MODELS["eslr-5"], latent_size=8, remat=remat)
+        graph = build_graph(garment, material, inputs, config)
+        params = init_model(config)
+
+        def total(trained, config=config, graph=graph, params=params):
+            return jnp.sum(apply_model(config, {**params, "params": trained}, graph, garment) ** 2)
+
+        found.append(jax.jit(jax.grad(total))(params["params"]))
+    for other in found[1:]:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=1e-6), found[0], other)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from cloth import make_garment, make_sheet
+from draped_ball import drifting_ball
 from physics_cases import make_case, pad_case, to_numpy
 
 from eslr_jax.physics.bending import bending_energy, dihedral_angles
@@ -15,6 +16,8 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.membrane import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import PotentialTerms, contact_load, potential, potential_terms
 from eslr_jax.physics.problem import weight_norm
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import first_problem
 
 TERMS = PotentialTerms._fields[:6]  # repulsion is tested with self-contact
 
@@ -403,3 +406,18 @@ def test_energies_under_vmap_equal_a_loop(case32):
         value, gradient = alone(position, case32.problem)
         np.testing.assert_allclose(batched[0][k], value, rtol=1e-6)
         np.testing.assert_allclose(batched[1][k], gradient, atol=1e-6 * np.abs(gradient).max())
+
+
+def test_cloth_without_hinges_has_forces():
+    """One triangle bends nowhere; the tables of its hinges are empty."""
+    triangle = make_garment(
+        np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), np.array([[0, 1, 2]])
+    )
+    assert triangle.hinges.shape[0] == 0
+    scene = prepare_scene(triangle, drifting_ball(2), options=SceneOptions(has_body=False))
+    problem = first_problem(scene)
+    stretched = 1.1 * problem.position
+    value, gradient = jax.jit(jax.value_and_grad(potential))(stretched, problem)
+    assert float(value) > 0
+    assert bool(jnp.isfinite(gradient).all())
+    assert float(jnp.abs(gradient).max()) > 0

@@ -12,7 +12,8 @@ from cloth import make_garment, make_limb, make_sheet, swing_motion
 from eslr_jax.assets.load import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, NonFiniteError
-from eslr_jax.models.registry import init_model
+from eslr_jax.graph.normalizer import WARMUP_UPDATES
+from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train
@@ -137,3 +138,31 @@ def test_a_run_whose_cloth_needs_more_self_contact_than_fits_ends_with_a_remedy(
         train(layered, tmp_path, datasets=(data,))
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert json.loads(line)["overflows"] == 1.0
+
+
+def test_statistics_come_first_and_then_weights_move(small_data):
+    """HOOD: a hundred graphs for the normalisers, with the skinned garment's acceleration; then updates."""
+    model = dataclasses.replace(MODELS["mgn-15"], message_passing_steps=1, latent_size=8)
+    config = TrainConfig(model=model, steps=4, warmup=1, slots_per_garment=1, noise=0.0, horizon=1)
+    step = make_train_step(config, 0)
+    start = jax.device_get(init_train_state(config, (small_data,)))
+    state, _ = step(jax.tree.map(jnp.array, start), small_data)
+    jax.tree.map(np.testing.assert_array_equal, state.params["params"], start.params["params"])
+    output = state.params["statistics"]["output"]
+    assert int(output.num_updates) == 1
+    frames = [
+        small_data.skinned(jnp.int32(0), small_data.transforms(jnp.int32(k), jnp.float32(0.0)))
+        for k in range(12)
+    ]
+    largest = np.abs(np.diff(np.stack(frames), 2, axis=0)).max()  # [m per frame^2]
+    size = np.sqrt(np.asarray(output.mean) ** 2 + np.asarray(output.squared_deviations) / float(output.count))
+    assert 0.01 * largest < size.max() < 1.5 * largest
+    for name, one in start.params["statistics"].items():
+        start.params["statistics"][name] = one.replace(num_updates=jnp.int32(WARMUP_UPDATES))
+    moved = jax.tree.map(jnp.array, start)
+    for _ in range(2):  # the first has a learning rate of zero
+        moved, _ = step(moved, small_data)
+    changed = jax.tree.map(
+        lambda one, other: np.any(one != other), moved.params["params"], start.params["params"]
+    )
+    assert np.mean(jax.tree.leaves(changed)) > 0.8

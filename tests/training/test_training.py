@@ -324,6 +324,15 @@ def test_a_run_on_shapes_keeps_them_while_a_trajectory_lives(config, shaped_data
     assert np.isfinite(np.array(state.pools[0].state.position)).all()
 
 
+def test_a_body_with_pose_blend_shapes_is_refused(small_garment):
+    from cloth import make_limb, swing_motion
+
+    body = make_limb()
+    bends = body.replace(pose_directions=jnp.zeros((len(body.rest_positions), 3, 9)))
+    with pytest.raises(ConfigError, match="pose blend shapes"):
+        build_training_data([small_garment], bends, [swing_motion(body, 4)])
+
+
 def test_clips_of_one_frame_are_refused(small_garment):
     from cloth import make_limb, swing_motion
 
