@@ -187,6 +187,18 @@ def test_a_recording_ends_with_the_fabric_wind_and_garment_that_it_shows(player)
     controls["wind"].value, controls["fabric"].value = 0.0, "cotton"
 
 
+def test_a_recording_ends_where_the_garment_is_put_on_anew(player):
+    from eslr_jax.viewer.live import _restart
+
+    live, controls = player.live, player.live.controls
+    controls["record"].value = True
+    player.until(lambda: len(live.recorded) >= 3)
+    _restart(live)
+    player.until(lambda: not controls["record"].value and not live.recorded)
+    player.wait(1)
+    assert read_run(live.out / "6").trajectory.num_frames >= 3
+
+
 def test_what_does_not_load_is_said_and_the_choice_before_plays_on(player):
     controls = player.live.controls
     controls["garments"][1].value = "tshirt"  # over itself

@@ -139,7 +139,7 @@ def load_garment(
     cache: bool = True,
     **options: Any,
 ) -> Garment:
-    """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation.
+    """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation; warn of a doubtful fit.
 
     Args:
         name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
@@ -158,7 +158,14 @@ def load_garment(
         MeshError: The mesh can't be simulated, does not fit the body, or can't be carried to it.
     """
     stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
+    for text in fit_doubts(stored):
+        warnings.warn(f"{Path(name).name}: {text}", stacklevel=2)
     return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
+
+
+def fit_doubts(stored: GarmentFile) -> list[str]:
+    """Return what was doubtful when a garment was fitted; nothing if it was not."""
+    return stored.metadata.get("fit", {}).get("warnings", [])
 
 
 def load_garment_file(
@@ -187,7 +194,7 @@ def load_garment_file(
         )
         stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
         return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
-    path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name) else Path(name)
+    path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name).lower() else Path(name)
     if path.is_file() and is_garment_file(path):
         stored = read_garment_npz(path)
         if body is not None:
@@ -202,6 +209,23 @@ def load_garment_file(
     key = content_key("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
     arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
     return garment_from_arrays(arrays, source.name)
+
+
+def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
+    """Check that a resolution other than the usual one is asked for bundled garments.
+
+    Args:
+        names: Garments by name or path.
+        vertices: Resolution of those that are bundled.
+
+    Raises:
+        ConfigError: All of them are files, which have their own.
+    """
+    if vertices != "1k" and all(map(_is_path, names)):
+        raise ConfigError(
+            f"--vertices {vertices} is for bundled garments, and {' and '.join(names)} has its own vertices; "
+            "leave it out, or remesh: eslr fit --edge-length"
+        )
 
 
 def _refuse_fit(name: str, options: FitOptions) -> None:
@@ -344,15 +368,19 @@ def load_motion(
 
     Raises:
         AssetError: There is no such motion, or the file is damaged.
-        MotionError: The file holds no usable motion, or none that this body can follow.
+        MotionError: The file holds no usable motion, or none that this body can follow; or `up` is given for
+            another format.
         MissingExtraError: The file needs an extra that is not installed.
     """
     text = str(name)
+    file, _, clip = text.partition("#")
+    is_bvh = Path(file).suffix.lower() == ".bvh"
+    if up != "auto" and not is_bvh:
+        raise MotionError(f"motion {text} tells which axis points up; leave that out (--motion-up)")
     if text in PROCEDURAL:
         if joint_map:
             raise MotionError(f"{text} is computed from the body's own joints; leave out the map of joints")
         return make_procedural(text, load_body() if body is None else body)
-    file, _, clip = text.partition("#")
     if _is_archived(text):
         motion = _bundled_motion(text)
         if body is None or (_is_made_for(motion, body, is_bundled=not _is_path(text)) and not joint_map):
@@ -363,7 +391,6 @@ def load_motion(
     source, skipped = skip_start_pose(whole)
     if skipped:
         warnings.warn(skipped, stacklevel=2)
-    is_bvh = Path(file).suffix.lower() == ".bvh"
     motion = make_motion(
         source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
     )

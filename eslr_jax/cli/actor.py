@@ -23,6 +23,27 @@ class Actor(NamedTuple):
     start: float  # time of the first frame in the motion's file [s]
 
 
+def is_moving_mesh(body: str) -> bool:
+    """Tell a mesh in motion from a rigged body; a folder that has the name of a bundled body is none."""
+    from eslr_jax.assets import asset_names
+    from eslr_jax.io.mesh_sequence import is_mesh_sequence
+
+    return Path(body).exists() and body not in asset_names("body") and is_mesh_sequence(body)
+
+
+def load_wearer(body: str, *, units: str | None = None, betas: tuple[float, ...] = ()) -> Body:
+    """Load a body at rest; a moving mesh rests in its first frame."""
+    from eslr_jax.assets import load_body
+    from eslr_jax.body.sequence import pose_sequence
+    from eslr_jax.io.mesh_sequence import read_mesh_sequence
+
+    if not is_moving_mesh(body):
+        return load_body(body, units=units, betas=betas)
+    if betas:
+        raise ConfigError(f"{body} is a mesh in motion and has no shapes; leave out --betas")
+    return pose_sequence(read_mesh_sequence(body), units=units)[0]
+
+
 def load_actor(options: Options) -> Actor:
     """Load a body and set it in motion."""
     from eslr_jax.assets import load_body, load_motion
@@ -32,16 +53,17 @@ def load_actor(options: Options) -> Actor:
     from eslr_jax.body.sequence import pose_sequence
     from eslr_jax.body.timing import cut_start, loop_motion
     from eslr_jax.cli.moment import parse_seconds
-    from eslr_jax.io.mesh_sequence import is_mesh_sequence, read_mesh_sequence
+    from eslr_jax.io.mesh_sequence import read_mesh_sequence
 
     body = options.body
-    if Path(body).exists() and is_mesh_sequence(body):
+    if is_moving_mesh(body):
         given = {
             "--motion": options.motion,
             "--start": options.start,
             "--loop": options.loop,
             "--joint-map": options.joint_map,
             "--arm-abduction": options.arm_abduction,
+            "--motion-up": None if options.motion_up == "auto" else options.motion_up,
             "--betas": options.betas or None,
         }
         for option, value in given.items():

@@ -31,9 +31,9 @@ def assets(
     Args:
         kind: List only this kind.
         verify: Compare every file with its checksum.
-        export: Write the rest body to this OBJ file instead, to model a garment on: in metres, Y up, facing Z,
-            the feet at the origin.
-        body: Body to export: name of a bundled one, or a body file.
+        export: Write the rest body to this OBJ file instead, to model a garment on: in metres, the feet at height
+            0. The bundled body has Y up and faces Z; another stands as its file has it.
+        body: Body to export: name of a bundled one, a body file, or a moving mesh, whose first frame is taken.
         json_: Print as JSON.
     """
     from eslr_jax.assets.catalog import is_intact, list_assets
@@ -74,7 +74,7 @@ def _export_body(path: Path, name: str) -> None:
     """Write a body's rest pose as an OBJ file, standing on the origin."""
     import numpy as np
 
-    from eslr_jax.assets import load_body
+    from eslr_jax.cli.actor import load_wearer
     from eslr_jax.io.atomic import atomic_write
     from eslr_jax.io.mesh_sequence import obj_text
 
@@ -82,12 +82,12 @@ def _export_body(path: Path, name: str) -> None:
         raise AssetError(
             f"--export {path}: a body is exported as an obj file; name it such as {path.stem}.obj"
         )
-    rig = load_body(name)
+    rig = load_wearer(name)
     positions = np.asarray(rig.rest_positions, np.float64)
     positions[:, 1] -= positions[:, 1].min()
     with atomic_write(path) as temporary:
         temporary.write_text(obj_text("body", positions, np.asarray(rig.faces)))
-    print(f"{path}: {positions[:, 1].max():.2f} m tall, metres, Y up, facing Z, feet at the origin")
+    print(f"{path}: {positions[:, 1].max():.2f} m tall, in metres, its feet at height 0")
 
 
 def _list_fabrics(as_json: bool) -> None:
@@ -179,7 +179,7 @@ def _show_scene(
 ) -> None:
     """Print the parts that a scene models, those it leaves out, and their costs."""
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-    from eslr_jax.assets.load import default_model
+    from eslr_jax.assets.load import check_resolution, default_model
     from eslr_jax.body.motion import pose_body
     from eslr_jax.cli.simulate import BEHIND_NETWORK, ITERATIONS
     from eslr_jax.config import SimConfig
@@ -188,6 +188,7 @@ def _show_scene(
 
     use_compile_cache()
     params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
+    check_resolution([garment], vertices)
     config = SimConfig(model=architecture, iterations=ITERATIONS if architecture is None else BEHIND_NETWORK)
     options = SceneOptions(  # those of `eslr simulate`
         self_contact=self_contact or None, has_folds=True, has_skin=True, integrator="bdf2"

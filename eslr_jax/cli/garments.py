@@ -41,7 +41,7 @@ def fit(
         garment: A mesh (obj, ply, stl, glb, npz), FILE.pkl#NAME of HOOD's garments, or the name of a bundled
             garment for another body than the bundled one.
         out: The garment file to write, such as shirt.npz; the picture is then shirt_fit.png.
-        body: Name of a bundled body, or a body file.
+        body: Name of a bundled body, a body file, or a moving mesh, which rests in its first frame.
         body_units: Unit of the body's file: m, cm, mm, in or ft; recognised if not given.
         betas: Shape of a body with shapes, in standard deviations.
         made_for: The body that the mesh was modelled on, if that is another one: a name or a file.
@@ -50,7 +50,8 @@ def fit(
         picture: Render the picture (extra `render`).
         json_: Print the report as JSON.
     """
-    from eslr_jax.assets import load_body, load_garment_file, prepare_stored
+    from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.cli.actor import load_wearer
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.report import describe_cost, describe_fit, describe_transfer
     from eslr_jax.io.garment import is_garment_file, write_garment_npz
@@ -73,11 +74,11 @@ def fit(
             say(text)
 
     with waiting("fitting"):
-        rig = load_body(body, units=body_units, betas=betas)
+        rig = load_wearer(body, units=body_units, betas=betas)
         if made_for is None:
             stored = load_garment_file(garment, body=rig, fit=options, on_source=describe_source)
         else:
-            stored = _carry(garment, (rig, load_body(made_for)), options, describe_source)
+            stored = _carry(garment, (rig, load_wearer(made_for)), options, describe_source)
         report = stored.metadata.get("fit") or stored.metadata.get("transfer")
         if report is None:
             raise AssetError(

@@ -143,6 +143,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     import inspect
 
     from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.assets.load import check_resolution, fit_doubts
     from eslr_jax.cli.simulate import simulate
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import garment_names, wear_together
@@ -160,8 +161,12 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     values: dict[str, Any] = {field.name: usual[field.name].default for field in dataclasses.fields(Options)}
     values.update(given, garment=files, frames=len(sequences[0].positions))
     options = Options(**values)
+    check_resolution(files, options.vertices)
     rig, poses, motion, _ = load_actor(options)
     garments = [load_garment_file(file, vertices=options.vertices, body=rig) for file in files]
+    for file, worn in zip(files, garments, strict=True):
+        for text in fit_doubts(worn):
+            say(f"{file}: {text}")
     stored, label = wear_together(garments, files), "+".join(files)
     by_name = dict(zip(garment_names(files), garments, strict=True))
     positions = in_outfit_order(sequences, stored, by_name)

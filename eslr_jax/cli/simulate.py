@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from eslr_jax.config import SimConfig
     from eslr_jax.io.garment import GarmentFile
     from eslr_jax.simulation.budget import Choice
+    from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
@@ -87,12 +88,13 @@ def simulate(
             (.pkl), glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else
             cmu_016_32.
         body: Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
-            character (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files).
+            character (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files). FILE#MESH,MESH picks the
+            meshes of a character that are its body, without its clothes.
         simulator: physics is the solver alone; network is a trained network, from whose prediction the solver
             starts.
         model: Name of a bundled network or an exported file; the default network if a network is asked for and
             none is named.
-        vertices: Resolution of a bundled garment; from 50k on it is made at run time.
+        vertices: Resolution of bundled garments; from 50k on it is made at run time.
         fabric: Name of a fabric (see `eslr assets --kind fabric`), or numbers as in
             density=0.2,bending_stiffness=1e-5 or flexural_rigidity=5e-6. PART:FABRIC is the fabric of one part
             or of one garment of an outfit; the rest keeps its own. By default that of the fitted file, or cotton.
@@ -109,7 +111,7 @@ def simulate(
             for the body's own motion.
         body_fps: Frames per second of a body that is a moving mesh.
         body_units: Unit of the body's file: m, dm, cm, mm, in, ft, or metres per unit; recognised if not given.
-        betas: Shape of a SMPL body, in standard deviations.
+        betas: Shape of the bundled body or of a SMPL body, in standard deviations.
         start: Where to begin in the motion: a frame, such as 375, or a time, such as 12.5s.
         loop: How long to repeat the motion: frames or a time, such as 30s.
         settle: Frames before frame 0 in which the garment settles: the limbs move from the body's rest pose to
@@ -133,8 +135,12 @@ def simulate(
         json_: Print the report as JSON.
     """
     given = locals()
+    from eslr_jax.simulation.interrupt import Interruption
+
     options = Options(**{field.name: given[field.name] for field in dataclasses.fields(Options)})
-    report = _simulate(options, out, is_resumed=resume, has_pictures=pictures)
+    words = "stopping when these frames are written; Ctrl-C again stops at once and loses them"
+    with Interruption(lambda: say(words)) as stop:
+        report = _simulate(options, out, stop, is_resumed=resume, has_pictures=pictures)
     if json_:
         print(json.dumps(report, indent=2))
     else:
@@ -166,8 +172,10 @@ class _Method(NamedTuple):
         return getattr(self.config.model, "garment_options", {})
 
 
-def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bool) -> dict[str, Any]:
-    """Simulate, write the run's folder, and return the report."""
+def _simulate(
+    options: Options, out: Path, stop: Interruption, *, is_resumed: bool, has_pictures: bool
+) -> dict[str, Any]:
+    """Simulate, write the run's folder, and return the report; from the first frames on, `stop` takes Ctrl-C."""
     from eslr_jax.io.atomic import ensure_output_dir
     from eslr_jax.io.unfinished import NAME, write_unfinished
 
@@ -185,6 +193,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
     import numpy as np
 
     from eslr_jax.assets import load_garment_file, prepare_stored
+    from eslr_jax.assets.load import check_resolution
     from eslr_jax.body.motion import first_poses
     from eslr_jax.body.timing import SETTLE_FRAMES, begins_at_rest, check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
@@ -206,6 +215,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
 
     request = _read_request(options)
     names = options.garment or (DEFAULT_GARMENT,)
+    check_resolution(names, options.vertices)
     label = "+".join(names)
     with waiting("preparing garment, body and motion"):
         rig, poses, motion, motion_start = load_actor(options)
@@ -243,7 +253,9 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         )
         scene = prepare_scene(cloth, settling, material=material, options=modelled, on_shapes=begin)
         if scene.body is not None:
-            check_speed(poses, MAX_APPROACH, vertices=np.asarray(scene.body.surface.vertex_ids))
+            check_speed(
+                poses, MAX_APPROACH * options.substeps, vertices=np.asarray(scene.body.surface.vertex_ids)
+            )
         if done is not None:
             check_same_scene(done, scene, out)
             scene = scene.replace(self_contact=capacity)
@@ -260,7 +272,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
             say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
     if num_vertices >= LARGE:
         say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
-    whole, timing, scene = _run(method, scene, done, poses.positions.shape[0])
+    whole, timing, scene = _run(method, scene, done, poses.positions.shape[0], stop)
     if timing.compile_s > _LONG:
         say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
@@ -306,7 +318,7 @@ def _simulate(options: Options, out: Path, *, is_resumed: bool, has_pictures: bo
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
-    if has_pictures and not is_unfinished:
+    if has_pictures and not is_unfinished and not stop.is_wanted:
         _write_sheet(out, np.asarray(trajectory.positions), stored, (rig, poses))
     return report
 
@@ -350,7 +362,9 @@ def _choose_method(
     return _Method(simulator, model, params, config, choice, budget_ms, tolerance)
 
 
-def _run(method: _Method, scene: Scene, done: Trajectory | None, num_frames: int) -> Simulation:
+def _run(
+    method: _Method, scene: Scene, done: Trajectory | None, num_frames: int, stop: Interruption
+) -> Simulation:
     """Compile and simulate with progress; Ctrl-C ends it after the frames in work.
 
     Args:
@@ -358,20 +372,16 @@ def _run(method: _Method, scene: Scene, done: Trajectory | None, num_frames: int
         scene: With the frames in which the garment settles.
         done: First frames of the scene, simulated before.
         num_frames: Of the run, whose measures are compiled while its frames are.
+        stop: Takes Ctrl-C over once the first frames are done.
     """
     from eslr_jax.simulation.budget import keep_budget
-    from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import simulate as run
 
     pace = None
     if method.choice is not None and method.budget_ms is not None:
         pace = keep_budget(method.choice, method.budget_ms)
-    words = "stopping after these frames; Ctrl-C again stops at once and loses them"
     # The first frames compile; the bar counts the time.
-    with (
-        Interruption(lambda: say(words)) as stop,
-        progress("compiling a frame", scene.num_frames - 1) as advance,
-    ):
+    with progress("compiling a frame", scene.num_frames - 1) as advance:
 
         def on_frames(count: int, total: int) -> None:
             advance(count, total, "simulating")
@@ -420,7 +430,9 @@ def _measure(
     trajectory, timing, scene = simulation
     parts = stored.face_parts, stored.part_names
     skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-    has_stopped = np.asarray(trajectory.iterations)[1:] < method.config.iterations
+    # The bound is that of the solver's stop, but for rounding; where no force is left there is none.
+    is_kept = np.asarray(trajectory.gap_bounds)[1:] <= (1 + 1e-5) * method.config.tolerance
+    is_kept |= np.asarray(trajectory.residuals)[1:] == 0
     return {
         "simulator": method.simulator,
         "model": method.model,
@@ -434,7 +446,7 @@ def _measure(
         **wear_report(trajectory.positions, scene.garment, skinned, poses, parts=parts),
         "choice": None if method.choice is None else dataclasses.asdict(method.choice),
         "tolerance": method.tolerance,
-        "within_tolerance": None if method.tolerance is None else float(np.mean(has_stopped)),
+        "within_tolerance": None if method.tolerance is None else float(np.mean(is_kept)),
         "frame_ms": timing.frame_ms,
         "compile_s": timing.compile_s,
         **environment(),

@@ -51,7 +51,7 @@ def _describe_tolerance(report: dict[str, Any], words: Words) -> None:
         words.good.append(f"within {tolerance:g} % of the optimum on every frame")
     else:
         words.warnings.append(
-            f"{100 * (1 - share):.1f} % of the frames ran out of iterations before they were within "
+            f"{100 * (1 - share):.1f} % of the frames ended before they were within "
             f"{tolerance:g} % of the optimum"
         )
 

@@ -45,9 +45,17 @@ def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np
 
 
 def penetration(heights: Float[np.ndarray, " points"]) -> dict[str, float]:
-    """Return the number of points inside the body and their largest depth, given signed distances [m]."""
-    depth = np.maximum(-heights[heights > -MAX_DEPTH], 0.0)
-    return {"inside": int(np.sum(depth > 0)), "depth_max_mm": round(float(depth.max(initial=0.0)) * 1e3, 3)}
+    """Return the number of points inside the body and their largest depth, given signed distances [m].
+
+    Points deeper than 6 cm are counted apart.
+    """
+    is_deeper = heights <= -MAX_DEPTH
+    depth = np.maximum(-heights[~is_deeper], 0.0)
+    return {
+        "inside": int(np.sum(depth > 0)),
+        "depth_max_mm": round(float(depth.max(initial=0.0)) * 1e3, 3),
+        "deeper": int(np.sum(is_deeper)),
+    }
 
 
 def push_out(

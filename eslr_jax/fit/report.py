@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from eslr_jax.fit.clearance import MAX_DEPTH
+
 LARGE = 30_000  # vertices from which the cost is told before it is paid
 
 
@@ -19,7 +21,7 @@ def describe_fit(report: dict[str, Any]) -> str:
         f"recognised: {place['what']}, arms {posed}; moved by ({moved}) cm; confidence {place['confidence']:.0%}",
         f"mesh: {mesh['source_vertices']} vertices, {mesh['welded_vertices']} welded, "
         f"{mesh['loose_vertices']} loose, {mesh['dropped_faces']} faces dropped, {mesh['turned_faces']} turned, "
-        f"{mesh['components']} parts; now {mesh['vertices']} vertices, {mesh['faces']} faces",
+        f"{mesh['components']} pieces; now {mesh['vertices']} vertices, {mesh['faces']} faces",
     ]
     if inside:
         before, after = inside["before"], inside["after"]
@@ -28,6 +30,10 @@ def describe_fit(report: dict[str, Any]) -> str:
             f"{after['inside']}, {after['depth_max_mm']:.1f} mm, after; moved by at most "
             f"{inside['push_out']['moved_max_mm']:.1f} mm"
         )
+        if after.get("deeper"):  # older files lack it
+            lines.append(
+                f"deeper than {1e3 * MAX_DEPTH:.0f} mm inside: {after['deeper']} vertices, which stay there"
+            )
     if "transfer" in report:
         lines.append(f"carried to the body: {describe_transfer(report['transfer'])}")
     lines.append(f"pinned: {report['pinned']} vertices ({report['pinned_by']})")

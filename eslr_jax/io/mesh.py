@@ -73,7 +73,7 @@ def _read_obj(path: Path) -> MeshFile:
     names: dict[str, list[str]] = {"usemtl": [], "g": [], "o": []}
     current = dict.fromkeys(names, "")
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        key, _, rest = line.partition("#")[0].strip().partition(" ")
+        key, rest = (*line.partition("#")[0].split(maxsplit=1), "", "")[:2]
         if key == "v":
             positions.append([float(value) for value in rest.split()[:3]])
         elif key == "vt":

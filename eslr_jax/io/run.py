@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -49,7 +50,7 @@ def write_run(
     *,
     report: dict[str, Any],
 ) -> None:
-    """Write the folder of a run, file by file and each of them whole.
+    """Write the folder of a run: all of its files, or none, so that files of two runs never mix.
 
     Args:
         folder: It is made if it is not there.
@@ -63,9 +64,6 @@ def write_run(
     """
     rig, poses, stored = actor
     ensure_output_dir(folder)
-    with atomic_write(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2))
-    write_garment_npz(folder / "garment.npz", stored)
     file = TrajectoryFile(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
@@ -77,8 +75,15 @@ def write_run(
         ground=None if scene.ground is None else float(scene.ground),
         material=jax.tree.map(_stored_number, scene.material),
     )
-    write_trajectory(folder / "trajectory.npz", file)
-    export_trajectory(file, folder / "animation.glb", garment=stored)
+    with contextlib.ExitStack() as stack:
+        names = ("report.json", "garment.npz", "trajectory.npz", "animation.glb")
+        said, garment, trajectory, animation = (
+            stack.enter_context(atomic_write(folder / name)) for name in names
+        )
+        said.write_text(json.dumps(report, indent=2))
+        write_garment_npz(garment, stored)
+        write_trajectory(trajectory, file)
+        export_trajectory(file, animation, garment=stored)
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.assets.load import fit_doubts
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
@@ -107,10 +109,11 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
 
     Raises:
         AssetError: There is no such body.
+        ConfigError: It has fewer shapes than `choice` gives.
         MissingExtraError: The extra `view` is not installed.
     """
     viser = require("viser", extra="view")
-    num_shapes = load_body(choice.body).shape_directions.shape[-1]
+    num_shapes = load_body(choice.body, betas=choice.betas).shape_directions.shape[-1]
     server = viser.ViserServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="fixed")
     server.gui.set_panel_label("eslr play")
@@ -141,21 +144,25 @@ def run_live(
     """
     until = until or threading.Event()
     due = time.perf_counter()
-    while not until.is_set():
-        choice = read_choice(live.controls, live.body)
-        try:
-            is_moved = one_frame(live, choice)
-        except EslrError as error:
-            live.refused = choice  # not what the controls say by now
-            live.controls["status"].content = f"**{error}**"
-            is_moved = False
-        if is_moved:
-            on_frame()
-        timestep = 1 / 30 if live.cast is None else float(live.cast.poses.timestep)
-        # Due a timestep after the last frame was, not after it began: waits that last too long would add up.
-        now = time.perf_counter()
-        due = max(due + timestep, now)
-        until.wait(max(due - now, 0.5 * _PAGE))
+    try:
+        while not until.is_set():
+            choice = read_choice(live.controls, live.body)
+            try:
+                is_moved = one_frame(live, choice)
+            except EslrError as error:
+                live.refused = choice  # not what the controls say by now
+                live.controls["status"].content = f"**{error}**"
+                is_moved = False
+            if is_moved:
+                on_frame()
+            timestep = 1 / 30 if live.cast is None else float(live.cast.poses.timestep)
+            # Due a timestep after the last frame was, not after it began: waits that last too long would add up.
+            now = time.perf_counter()
+            due = max(due + timestep, now)
+            until.wait(max(due - now, 0.5 * _PAGE))
+    finally:
+        if live.recorded:  # Ctrl-C ends a recording, and does not lose it
+            _save(live)
 
 
 def one_frame(live: Live, choice: Choice) -> bool:
@@ -174,7 +181,8 @@ def one_frame(live: Live, choice: Choice) -> bool:
     setting = fabric, wind = read_fabric(live.controls), read_wind(live.controls)
     if live.recorded:
         is_over = not live.controls["record"].value or len(live.recorded) >= MOST_RECORDED
-        # A run has one garment, body, motion, fabric and wind.
+        # A run has one garment, body, motion, fabric and wind, and puts the garment on once.
+        is_over = is_over or live.state is None
         if is_over or is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting):
             live.controls["record"].value = False
             _save(live)
@@ -269,6 +277,9 @@ def _load(live: Live, choice: Choice) -> None:
             load_garment_file(name, vertices=choice.vertices, body=rig, cache=not choice.betas)  # type: ignore[arg-type]
             for name in choice.garments
         ]
+        for name, worn in zip(choice.garments, garments, strict=True):
+            for text in fit_doubts(worn):
+                warnings.warn(f"{name}: {text}", stacklevel=2)
         stored = wear_together(garments, choice.garments)
         cloth = prepare_stored(stored, name="+".join(Path(name).name for name in choice.garments))
         stage = set_stage(cloth, poses, read_fabric(live.controls))

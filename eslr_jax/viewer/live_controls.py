@@ -14,7 +14,7 @@ from eslr_jax.types import Material
 
 NOTHING = "nothing"  # no garment over the others
 FACTORS = (0.1, 10.0)  # of a fabric's constants
-_MOST_BETAS = 2.5  # [standard deviations]
+_MOST_BETAS = 2.5  # [standard deviations], of the sliders unless more is asked for
 _STRONGEST = 12.0  # [m/s], of the wind
 _TOLERANCES = (0.1, 10.0)  # [%]
 # What the first shapes of the bundled body change, in words; it has more, which change little.
@@ -133,9 +133,10 @@ def _shape(gui: Any, number: int, choice: Choice) -> Any:
     """Add the slider of one shape of the body."""
     is_named = choice.body == "anny" and number < len(_BUNDLED_SHAPES)
     label = _BUNDLED_SHAPES[number] if is_named else f"shape {number + 1}"
-    value = float(np.clip((*choice.betas[number : number + 1], 0.0)[0], -_MOST_BETAS, _MOST_BETAS))
+    value = float((*choice.betas[number : number + 1], 0.0)[0])
+    most = max(_MOST_BETAS, abs(value))
     hint = "standard deviations; the garments are cut anew"
-    return gui.add_slider(label, -_MOST_BETAS, _MOST_BETAS, 0.25, value, hint=hint)
+    return gui.add_slider(label, -most, most, 0.25, value, hint=hint)
 
 
 def _with(names: Sequence[str], *more: str) -> tuple[str, ...]:

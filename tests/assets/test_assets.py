@@ -16,8 +16,10 @@ from eslr_jax.assets import (
     load_splits,
 )
 from eslr_jax.assets.catalog import is_intact, list_assets
+from eslr_jax.assets.load import check_resolution
 from eslr_jax.body.motion import Motion, pose_body, shape_body, still_motion
-from eslr_jax.errors import AssetError, CheckpointError, MotionError
+from eslr_jax.cli.actor import is_moving_mesh, load_wearer
+from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError
 from eslr_jax.io.weights import read_weights, write_weights
 from eslr_jax.models.registry import MODELS, init_model
 
@@ -153,3 +155,23 @@ def test_weights_without_their_json_are_refused(tmp_path, network):
     (tmp_path / "model.json").unlink()
     with pytest.raises(CheckpointError, match="copy both"):
         read_weights(tmp_path / "model.npz")
+
+
+def test_a_resolution_is_for_bundled_garments():
+    check_resolution(["tshirt"], "4k")
+    check_resolution(["shirt.obj", "tshirt"], "4k")
+    check_resolution(["shirt.obj"], "1k")
+    with pytest.raises(ConfigError, match=r"--vertices 4k is for bundled garments.*--edge-length"):
+        check_resolution(["shirt.obj"], "4k")
+
+
+def test_a_moving_mesh_is_a_body_at_rest_and_a_folder_named_like_a_body_is_none(tmp_path, monkeypatch, body):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "anny").mkdir()
+    assert not is_moving_mesh("anny")
+    assert load_wearer("anny").joint_names == body.joint_names
+    rest = np.asarray(body.rest_positions)
+    np.savez("scan.npz", positions=np.stack([rest, rest + 0.1]), faces=np.asarray(body.faces))
+    np.testing.assert_allclose(load_wearer("scan.npz").rest_positions, rest, atol=1e-6)
+    with pytest.raises(ConfigError, match="has no shapes; leave out --betas"):
+        load_wearer("scan.npz", betas=(1.0,))

@@ -134,3 +134,13 @@ def test_all_that_computes_an_entry_is_part_of_its_name():
             source = package / (module.replace(".", "/") + ".py")
             if source.exists() and file.parent.name in ("fit", "geometry"):
                 assert source in listed | makes_nothing, f"{file.name} imports {module}"
+
+
+def test_a_doubtful_fit_is_told_with_every_load(empty_cache, tmp_path, body, monkeypatch):
+    garment = bundled("tank_1k")
+    np.savez(tmp_path / "tank.npz", positions=garment.rest_positions, faces=garment.faces)
+    fitted = load_garment_file(tmp_path / "tank.npz", body=body)
+    fitted.metadata["fit"]["warnings"] = ["the place is doubtful"]
+    monkeypatch.setattr(load, "load_garment_file", lambda *_, **__: fitted)
+    with pytest.warns(UserWarning, match="tank.npz: the place is doubtful"):
+        load_garment(tmp_path / "tank.npz", body=body)

@@ -11,6 +11,7 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
 from eslr_jax.fit.postures import arm_postures, find_arms, unpose
+from eslr_jax.fit.report import describe_fit
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.topology import vertex_components
 from eslr_jax.io.garment import read_garment_source
@@ -127,7 +128,7 @@ def test_penetration_is_resolved_and_reported_and_lengths_stay(body, shirt):
     report = fitted.metadata["fit"]["penetration"]
     assert report["before"]["inside"] >= count
     assert report["before"]["depth_max_mm"] == pytest.approx(5.0, abs=0.3)
-    assert report["after"] == {"inside": 0, "depth_max_mm": 0.0}
+    assert report["after"] == {"inside": 0, "depth_max_mm": 0.0, "deeper": 0}
     assert 7.0 < report["push_out"]["moved_max_mm"] < 12.0
     back = positions[:, 2] < 0
     np.testing.assert_array_equal(fitted.rest_positions[back], positions[back])
@@ -294,3 +295,11 @@ def test_pins_that_remeshing_replaces_are_refused_or_told(body, shirt):
     held = dataclasses.replace(shirt_source, is_pinned=np.arange(len(shirt.rest_positions)) < 5)
     with pytest.warns(UserWarning, match="the pins of the file are lost"):
         fit_garment(held, body, FitOptions(edge_length=0.03))
+
+
+def test_vertices_too_deep_to_be_moved_out_are_counted_and_told(body, shirt):
+    positions, count = dent(shirt, body, 0.075)
+    report = fit_garment(source(positions, shirt.faces), body).metadata["fit"]
+    deeper = report["penetration"]["after"]["deeper"]
+    assert 0 < deeper <= count
+    assert f"deeper than 60 mm inside: {deeper} vertices, which stay there" in describe_fit(report)

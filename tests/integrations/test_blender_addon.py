@@ -27,6 +27,7 @@ sys.path.insert(0, str(ADDON))
 from build import build  # noqa: E402
 
 sys.path.insert(0, str(ADDON / "eslr_garments"))
+import job  # noqa: E402
 from job import Job, JobError, simulation_steps  # noqa: E402
 
 
@@ -173,3 +174,12 @@ def test_from_install_to_a_garment_that_moves_with_the_body_and_stays_out_of_it(
     refused = blender(folder / "refused.npz", sys.executable, "denin")
     assert "did you mean denim" in str(refused["error"])
     np.testing.assert_array_equal(refused["cloth"][-1], refused["before"])
+
+
+def test_warnings_of_fit_and_simulation_are_collected_and_no_lost_folder_is_named(tmp_path):
+    (tmp_path / "fit.txt").write_text(json.dumps({"warnings": ["the place is doubtful"], "pinned": 0}))
+    (tmp_path / "simulate.txt").write_text("good: stretched by 3 %\nwarning: skin shows\nframes 3\n")
+    assert job._warnings(tmp_path / "fit.txt") == ["the place is doubtful"]
+    assert job._warnings(tmp_path / "simulate.txt") == ["skin shows"]
+    log = "\n".join(["compiling 3/9", "eslr: frame 3 is not finite; the frames before are kept in /tmp/a"])
+    assert job._reason(log, 2) == "frame 3 is not finite"

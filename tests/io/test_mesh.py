@@ -203,3 +203,10 @@ def test_garment_file_without_weights_is_named(tmp_path):
     np.savez(tmp_path / "scarf.npz", rest_positions=POSITIONS, faces=FACES)
     with pytest.raises(AssetError, match="lacks skin_weights, skin_indices; it has faces, rest_positions"):
         read_garment_npz(tmp_path / "scarf.npz")
+
+
+def test_obj_may_be_written_with_tabs(tmp_path):
+    (tmp_path / "a.obj").write_text("v\t0 0 0\nv\t1\t0\t0\n\t\nv 0 1 0\nf\t1\t2\t3\n")
+    positions, faces = read_mesh(tmp_path / "a.obj")
+    assert positions.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert faces.tolist() == [[0, 1, 2]]

@@ -8,10 +8,13 @@ import os
 import numpy as np
 import pytest
 
+from eslr_jax.assets import load_garment_file, prepare_stored
+from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import AssetError
-from eslr_jax.io.run import read_run
+from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.types import Material, Plate, Threads
 
 RNG = np.random.default_rng(0)
@@ -201,3 +204,32 @@ def test_read_trajectory_survives_truncation_and_flipped_bytes(tmp_path):
         damaged.write_bytes(mutated)
         with contextlib.suppress(AssetError):  # a flip in unused bytes may leave a valid file
             read_trajectory(damaged)
+
+
+def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
+    """What an earlier run left in the folder stays then, so that no report is of another trajectory."""
+    garment, rig = load_garment_file("tshirt"), body
+    poses = pose_body(rig, still_motion(rig, 3))
+    scene = prepare_scene(prepare_stored(garment), poses)
+    moved = np.repeat(np.asarray(scene.initial_state.position)[None], 3, axis=0)
+    track = ClothTrack(moved, np.zeros_like(moved), np.zeros(moved.shape[:2]))
+    write_run(tmp_path, track, scene, (rig, poses, garment), report={"total": 1.0})
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["animation.glb", "garment.npz", "report.json", "trajectory.npz"]
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("eslr_jax.io.run.export_trajectory", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_run(
+            tmp_path,
+            track._replace(positions=moved + 1.0),
+            scene,
+            (rig, poses, garment),
+            report={"total": 2.0},
+        )
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    kept = read_run(tmp_path)
+    assert kept.report == {"total": 1.0}
+    np.testing.assert_allclose(kept.trajectory.positions, moved, atol=1e-5)

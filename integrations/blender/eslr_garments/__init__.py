@@ -33,7 +33,7 @@ class GarmentPreferences(bpy.types.AddonPreferences):
 
     python: bpy.props.StringProperty(
         name="Python",
-        description="Path of the Python that has eslr_jax: pip install eslr-jax",
+        description="Path of the Python that has eslr_jax (pip install . in its folder)",
         default="python3",
         subtype="FILE_PATH",
     )
@@ -119,13 +119,13 @@ class ESLR_OT_simulate(bpy.types.Operator):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         result = self._go_on(context)
+        if result is not None:
+            return result
         context.window_manager.progress_update(100 * self._job.share)
         context.workspace.status_text_set(f"{self._job.text}; Esc cancels")
         for area in context.screen.areas:
             area.tag_redraw()
-        if result is None:
-            return {"RUNNING_MODAL"}
-        return result
+        return {"RUNNING_MODAL"}
 
     def _begin(self, context) -> bool:
         """Write what the simulator reads; return whether it can start."""
@@ -168,6 +168,8 @@ class ESLR_OT_simulate(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         self._end(context)
+        for text in self._job.warnings:
+            self.report({"WARNING"}, text)
         self.report({"INFO"}, f"{self._garment.name} follows {len(positions)} simulated frames")
         return {"FINISHED"}
 

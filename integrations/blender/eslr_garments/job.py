@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -37,6 +38,7 @@ class Job:
         self.text = "starting"
         self.share = 0.0  # of all frames that are simulated
         self.num_done = 0  # steps
+        self.warnings: list[str] = []  # of the steps that are done
 
     @property
     def _log(self) -> Path:
@@ -61,6 +63,7 @@ class Job:
         self._process = None
         if code:
             raise JobError(_reason(log, code))
+        self.warnings += _warnings(self._folder / self._steps[self.num_done].output)
         self.num_done += 1
         return self.num_done == len(self._steps)
 
@@ -103,6 +106,15 @@ class Job:
         threading.Thread(target=insist, daemon=True).start()
 
 
+def _warnings(output: Path) -> list[str]:
+    """Return the warnings in what a command printed: those of `eslr fit --json`, or lines of `eslr simulate`."""
+    text = output.read_text(encoding="utf-8", errors="replace")
+    try:
+        return list(json.loads(text).get("warnings", ()))
+    except ValueError:  # it printed no JSON
+        return [line.removeprefix("warning: ") for line in text.splitlines() if line.startswith("warning: ")]
+
+
 def _reason(log: str, code: int) -> str:
     """Return why a command failed: its own line, or the last one that it wrote."""
     lines = [line.strip() for line in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", log).splitlines() if line.strip()]
@@ -110,7 +122,12 @@ def _reason(log: str, code: int) -> str:
         return (
             "this Python has no eslr_jax; install it there (pip install), or name another in the preferences"
         )
-    own = [line.removeprefix("eslr: ") for line in lines if line.startswith("eslr: ")]
+    # What `eslr simulate` keeps lies in the job's folder, which goes with it.
+    own = [
+        line.removeprefix("eslr: ").partition("; the frames before are kept")[0]
+        for line in lines
+        if line.startswith("eslr: ")
+    ]
     return own[-1] if own else (lines[-1] if lines else f"the command ended with code {code}")
 
 
