@@ -40,6 +40,7 @@ from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.graph.build import incoming_edges
 from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.operators import mesh_tables, sum_receivers
+from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.lsdmp import Latents, LayerTables, LsdmpLayer
 from eslr_jax.models.mlp import MLP
 from eslr_jax.models.registry import draw_weights
@@ -484,7 +485,8 @@ def main() -> None:
         **environment(),
     }
     chosen.out.mkdir(parents=True, exist_ok=True)
-    (chosen.out / "learned_preconditioner.json").write_text(json.dumps(result, indent=1) + "\n")
+    with atomic_write(chosen.out / "learned_preconditioner.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
@@ -236,7 +237,8 @@ def main() -> None:
             result["scenes"][what] = measure_scene(what, options.frames, options.newton_iterations)
         result["scenes"] = {name: result["scenes"][name] for name in names if name in result["scenes"]}
         result |= environment()
-        path.write_text(json.dumps(result, indent=1) + "\n")
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

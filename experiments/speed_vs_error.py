@@ -194,7 +194,7 @@ def main() -> None:
             ]
             for name, counts in (
                 (SOLVER, solver_counts),
-                *((model, network_counts) for model in arguments.models[:1]),
+                *((model, network_counts) for model in arguments.models if model == START_MODEL),
             )
         }
         result["sizes"][size] = {

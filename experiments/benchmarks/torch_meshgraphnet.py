@@ -104,8 +104,3 @@ def make_forward(senders, receivers, num_vertices: int, num_layers: int = 15):
             return network(*rows, index)
 
     return forward
-
-
-def count_parameters(num_layers: int) -> int:
-    """Return the number of weights, without the 81 of the type embedding."""
-    return sum(weight.numel() for weight in MeshGraphNet(num_layers).parameters())

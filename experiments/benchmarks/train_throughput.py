@@ -25,6 +25,7 @@ from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
+from eslr_jax.training.memory import keep_memory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import init_train_state, make_optimizer, make_train_step
 
@@ -59,6 +60,7 @@ def main() -> None:
         updates, moments = optimizer.update(gradient, moments, trained)
         return optax.apply_updates(trained, updates), moments
 
+    keep_memory()  # as `eslr train` does
     step = make_train_step(config, 0)
     times = take_turns(
         {

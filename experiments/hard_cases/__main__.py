@@ -71,6 +71,16 @@ def find_simulator(arguments: argparse.Namespace):
     from hard_cases import network_simulator, solver_simulator
 
     name = arguments.simulator
+    stepping = {
+        "--integrator": arguments.integrator != "euler",
+        "--skin": arguments.skin,
+        "--substeps": arguments.substeps > 1,
+    }
+    if name != "physics" and any(stepping.values()):
+        given = ", ".join(option for option, is_given in stepping.items() if is_given)
+        raise ConfigError(f"{given} is for the simulator physics; leave it out for {name}")
+    if name not in ITERATIONS and arguments.model != DEFAULT_MODEL:
+        raise ConfigError(f"--model is for networks; leave it out for {name}")
     if name == "physics":
         return solver_simulator(
             arguments.iterations, arguments.integrator, has_skin=arguments.skin, substeps=arguments.substeps

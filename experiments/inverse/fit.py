@@ -21,12 +21,13 @@ from sheet import keep, parse_options
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.config import SimConfig
+from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.render.pictures import render_frame
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Body, Garment, Scene
+from eslr_jax.types import Body, Scene
 
 BAR = 1.08  # largest principal stretch
 TIGHT = -0.03  # [m], how far the shirt is taken in
@@ -45,15 +46,6 @@ def band_weights(rest: np.ndarray) -> np.ndarray:
     return np.concatenate([trunk * (1 - sleeve), sleeve], axis=1)
 
 
-def vertex_normals(garment: Garment) -> np.ndarray:
-    """Return the unit normals of the rest mesh, zero where padded, shape [vertices, 3]."""
-    rest, faces = np.asarray(garment.rest_positions), np.asarray(garment.faces)
-    a, b, c = (rest[faces[:, corner]] for corner in range(3))
-    normals = np.zeros_like(rest)
-    np.add.at(normals, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
 def make_scene(body: Body, num_frames: int) -> Scene:
     """Return the T-shirt as it is cut, on a body that stands still."""
     scene = prepare_scene(load_garment("tshirt"), pose_body(body, still_motion(body, num_frames)))
@@ -69,7 +61,9 @@ def main() -> None:
     scene = make_scene(body, frames)
     garment = scene.garment
     weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
-    normals = jnp.asarray(vertex_normals(garment), jnp.float32)
+    normals = jnp.asarray(
+        vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces)), jnp.float32
+    )
 
     def wear(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the shirt on the body [m], and the larger principal stretch of every face."""

@@ -16,11 +16,12 @@ same network untrained.
 
 --train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
 paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
-A table is never written over one of another setting: give another --out.
+A table is never written over one of another setting, and no row over one of other networks: give another --out.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -54,8 +55,15 @@ from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 
+WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
 # Trained alike, applied once a frame (configs/paper/1k.toml); the rest have recipes of their own.
-DEEP = tuple(f"{name}-5={name}-5-correction" for name in ("mgn", "hood", "lsdmp", "gsa", "eslr"))
+DEEP = (
+    f"mgn-5=mgn-5-correction,{WEIGHTS / 'mgn-5_60k_s1.npz'}",
+    "hood-5=hood-5-correction",
+    "gsa-5=gsa-5-correction",
+    "lsdmp-5=lsdmp-5-correction",
+    f"eslr-5=eslr-5-correction,{WEIGHTS / 'eslr-5_60k_s1.npz'}",
+)
 CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
 RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
 BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20")
@@ -105,16 +113,15 @@ def main() -> None:
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
     }
+    if "model_cost" in chosen.tables:  # before anything is trained and measured
+        check_costs(cost_file(chosen), (*rows, *full_size(chosen.vertices, chosen.smoke)))
     if chosen.train:
         rows, trainings = plan_trainings(rows, chosen.out)
         for training in trainings:
             run_training(training, ("steps=2",) if chosen.smoke else ())
     for name in chosen.tables:
         if name == "model_cost":
-            file = chosen.out / f"{name}_{chosen.vertices}.json"
-            names = (*rows, *full_size(chosen.vertices, chosen.smoke))
-            check_costs(file, names)
-            write(cost_table(rows, chosen.vertices, chosen.smoke), file)
+            write(cost_table(rows, chosen.vertices, chosen.smoke), cost_file(chosen))
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
             if not (setting.garments and setting.clips):
@@ -126,6 +133,8 @@ def main() -> None:
             parts = rows_of_setting(file, setting)
             has_controls = chosen.controls or (chosen.smoke and name == TABLES[0])
             asked = with_changes(rows, name, has_controls)
+            if not chosen.anew:
+                check_networks(file, asked, parts["networks"])
             missing = asked if chosen.anew else {k: row for k, row in asked.items() if k not in parts["mean"]}
             if missing:  # else the near-optimal rollouts would be made for nothing
                 for result in energy_table(missing, setting, parts):
@@ -215,6 +224,8 @@ def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]])
         }
         parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **training_cost(names)}
         parts["garments"][label] = means
+        parts["networks"][label] = [Path(name).name for name in names]
+        parts["seeds"].pop(label, None)  # of the row before
         if len(seeds) > 1:
             parts["seeds"][label] = {
                 column: [seed["all"][column] for seed in seeds] for column in seeds[0]["all"]
@@ -229,8 +240,8 @@ def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]])
 def training_cost(names: Sequence[str]) -> dict[str, float]:
     """Return parameters of a row's network, and the core-hours of all its seeds where each is known."""
     costs = [read_system(name).cost for name in names]
-    hours = {"core_hours": sum(cost["core_hours"] for cost in costs)} if "core_hours" in costs[0] else {}
-    return {**costs[0], **hours}
+    hours = [cost["core_hours"] for cost in costs if "core_hours" in cost]
+    return {**costs[0], **({"core_hours": sum(hours)} if len(hours) == len(costs) else {})}
 
 
 def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
@@ -241,7 +252,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
             differ, and what to give.
     """
     found = json.loads(file.read_text()) if file.exists() else {}
-    parts = {name: found.get(name, {}) for name in ("mean", "seeds", "garments")}
+    parts = {name: found.get(name, {}) for name in ("mean", "seeds", "garments", "networks")}
     asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
     differs = [name for name, value in asked.items() if found.get(name, value) != value]
     if any(set(row) != set(setting.garments) for row in parts["garments"].values()):
@@ -251,6 +262,25 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
             f"{file} is of other {', '.join(differs)}; give another --out, or move the file away"
         )
     return parts
+
+
+def check_networks(file: Path, rows: Rows, kept: dict[str, list[str]]) -> None:
+    """Refuse to take a row that the table has for one of other networks.
+
+    Raises:
+        SystemExit: Names the row and its networks.
+    """
+    for label, names in rows.items():
+        if label in kept and kept[label] != [Path(name).name for name in names]:
+            own = ", ".join(kept[label])
+            raise SystemExit(
+                f"{file} has a row {label} of {own}; give another label, or --anew to replace it"
+            )
+
+
+def cost_file(chosen: argparse.Namespace) -> Path:
+    """Return the file of the table of costs."""
+    return chosen.out / f"model_cost_{chosen.vertices}.json"
 
 
 def full_size(vertices: str, is_smoke: bool) -> tuple[str, ...]:

@@ -1,10 +1,11 @@
 """Tables of the paper that grow row by row."""
 
 import json
+from pathlib import Path
 
 import pytest
 from paper.rollouts import Setting, read_system
-from paper.tables import DEEP, check_costs, plan_trainings, rows_of_setting, table_setting
+from paper.tables import DEEP, check_costs, check_networks, plan_trainings, rows_of_setting, table_setting
 
 from eslr_jax.assets.catalog import asset_names
 from eslr_jax.training.recipe import load_recipe
@@ -16,7 +17,9 @@ TABLE = {
     "mean": {"mgn-5": ROW},
     "seeds": {},
     "garments": {"mgn-5": {"tshirt": ROW, "dress": ROW}},
+    "networks": {"mgn-5": ["mgn-5-correction", "second.npz"]},
 }
+PARTS = ("mean", "seeds", "garments", "networks")
 
 
 @pytest.fixture
@@ -28,11 +31,11 @@ def file(tmp_path):
 
 
 def test_rows_of_the_same_setting_are_kept(file):
-    assert rows_of_setting(file, SETTING) == {name: TABLE[name] for name in ("mean", "seeds", "garments")}
+    assert rows_of_setting(file, SETTING) == {name: TABLE[name] for name in PARTS}
 
 
 def test_without_a_table_there_are_no_rows(tmp_path):
-    assert rows_of_setting(tmp_path / "table.json", SETTING) == {"mean": {}, "seeds": {}, "garments": {}}
+    assert rows_of_setting(tmp_path / "table.json", SETTING) == {name: {} for name in PARTS}
 
 
 @pytest.mark.parametrize(
@@ -75,7 +78,18 @@ def test_controls_of_weights_show_no_training_cost():
 
 def test_default_rows_have_every_bundled_network_of_five_layers():
     bundled = {name for name in asset_names("model") if name.endswith("-5-correction")}
-    assert {row.split("=")[1] for row in DEEP} == bundled
+    rows = [row.split("=")[1].split(",") for row in DEEP]
+    assert {first for first, *_ in rows} == bundled
+    assert all(Path(file).is_file() for _, *others in rows for file in others)
+
+
+def test_a_row_is_of_the_networks_that_it_was_measured_with(file):
+    kept = rows_of_setting(file, SETTING)["networks"]
+    check_networks(
+        file, {"mgn-5": ("mgn-5-correction", "else/where/second.npz"), "new": ("eslr-small",)}, kept
+    )
+    with pytest.raises(SystemExit, match=r"a row mgn-5 of mgn-5-correction, second.npz; give another label"):
+        check_networks(file, {"mgn-5": ("mgn-5-correction",)}, kept)
 
 
 def test_rows_of_architectures_are_trained_by_their_recipe(tmp_path):
