@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.physics.preconditioner import solve_stiffness, stretched_stiffness
@@ -77,8 +76,15 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         "layers of cloth keep apart",
         "no layers that can meet; see --self-contact",
     )
-    varied = [field for field, leaf in dataclasses.asdict(scene.material).items() if np.ndim(leaf)]
+    material = {
+        field.name: getattr(scene.material, field.name) for field in dataclasses.fields(scene.material)
+    }
+    varied = [name for name, part in material.items() if any(map(np.ndim, jax.tree.leaves(part)))]
     sort("fabric by part", bool(varied), ", ".join(varied), "one fabric: scalars")
+    if scene.initial_state.past is not None:
+        modelled["BDF2"] = "swinging cloth keeps its energy"
+    if scene.substeps > 1:
+        modelled["substeps"] = f"{scene.substeps} a frame"
     sort("network", config.model is not None, "before the solver", "solver alone")
     return SceneParts(modelled, left_out)
 
@@ -109,11 +115,7 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
         ),
     }
     if scene.body is not None:
-        surface = scene.body.surface
-        parts["contact search"] = (
-            lambda x: find_both_sides(x, *inputs.body, surface, scene.garment.vertex_blocks),
-            (state.position,),
-        )
+        parts["searches for contacts"] = (lambda state: frame_problem(scene, state, inputs), (state,))
     if config.model is not None:
         model = config.model
         parts["network"] = (lambda state: predict(params, problem, state, model).position, (state,))

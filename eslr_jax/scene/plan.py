@@ -188,7 +188,7 @@ def prepare_scenes(
     Args:
         garments: Unpadded garments of like sizes.
         poses: As many motions of bodies with the same faces and of the same length.
-        materials: As many fabrics.
+        materials: As many fabrics, isotropic and the same all over a garment.
         constants: Physical constants of all; by default those for each fabric.
         options: What to leave out or add.
 
@@ -198,6 +198,11 @@ def prepare_scenes(
         ConfigError: An option has a value that it can't have.
     """
     options = options or SceneOptions()
+    if any(np.ndim(leaf) for material in materials for leaf in jax.tree.leaves(material)):
+        raise ConfigError(
+            "a batch takes one isotropic fabric for each garment; simulate garments with fabrics by part or with "
+            "threads one by one"
+        )
     padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
     surface = shared_surface(padded, poses[0]) if options.has_body else None
     plans = [

@@ -45,7 +45,7 @@ def simulate_batch(
         garments: Of `load_garment` or `prepare_garment`; any sizes.
         poses: As many motions, of `pose_body`.
         config: Network, iterations and tolerance; the solver alone by default.
-        material: Fabric of all, or one for each.
+        material: Fabric of all, or one for each; isotropic and the same all over a garment.
         constants: Physical constants of all.
         options: What the scenes leave out or add.
         batch_size: Scenes per step on a device, see `rollout_scenes`.

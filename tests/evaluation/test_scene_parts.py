@@ -5,7 +5,7 @@ import pytest
 
 from eslr_jax.evaluation.scene_parts import describe_scene, take_turns, time_parts
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.types import Air
+from eslr_jax.types import Air, Threads
 
 
 def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene, small_config):
@@ -22,6 +22,13 @@ def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene,
     assert bare.left_out["collision and friction"] == "no body in reach"
     assert "self-contact" in bare.modelled
     assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
+    scene = prepare_scene(small_garment, small_poses, options=SceneOptions(integrator="bdf2", substeps=2))
+    threads = Threads(warp=jnp.ones((100, 2)), stiffness=jnp.ones((4, 100)))
+    woven = scene.replace(material=scene.material.replace(threads=threads))
+    parts = describe_scene(woven, small_poses, small_config)
+    assert parts.modelled["fabric by part"] == "threads"
+    assert parts.modelled["substeps"] == "2 a frame"
+    assert "BDF2" in parts.modelled
 
 
 def multiply(x):
@@ -39,5 +46,5 @@ def test_the_slower_of_two_functions_takes_longer_in_turns():
 @pytest.mark.slow
 def test_parts_of_a_frame_are_timed(small_scene, small_config):
     times = time_parts(None, small_scene, small_config)
-    assert times["whole frame"] > times["contact search"]
+    assert times["whole frame"] > times["searches for contacts"]
     assert times["whole frame"] > times["preconditioner"]

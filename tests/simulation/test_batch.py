@@ -63,6 +63,26 @@ def test_counts_must_match(garments, poses):
         simulate_batch(None, garments, [poses] * 3, material=FABRICS[:2])
 
 
+def test_fabrics_that_lie_on_one_mesh_are_refused(garments, poses):
+    by_face = COTTON.replace(lame_mu=np.full(garments[0].faces.shape[0], 2e4, np.float32))
+    with pytest.raises(ConfigError, match=r"one isotropic fabric for each garment.*one by one"):
+        simulate_batch(None, garments[:1], [poses], material=by_face)
+
+
+@pytest.mark.slow
+def test_all_that_a_scene_can_model_maps_over_scenes(poses):
+    options = SceneOptions(
+        has_skin=True, integrator="bdf2", substeps=2, ground="on", self_contact=True, damping=0.002
+    )
+    scenes = prepare_scenes(
+        [square(8), square(7, is_pinned=np.array([0]))], [poses] * 2, FABRICS[:2], options=options
+    )
+    together = rollout_scenes(None, stack_scenes(scenes), QUICK, batch_size=2)
+    for row, scene in enumerate(scenes):
+        alone = rollout_scene(None, scene, QUICK)
+        np.testing.assert_allclose(together.positions[row], alone.positions, atol=2e-5)
+
+
 def test_unlike_scenes_are_not_stacked(garments, poses):
     scene = prepare_scene(garments[0], poses)
     bare = prepare_scene(garments[0], poses, options=SceneOptions(has_body=False))

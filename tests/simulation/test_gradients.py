@@ -16,11 +16,12 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.physics.solve import solve_hessian
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.rollout import rollout, rollout_scene
 from eslr_jax.types import Air, tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends
@@ -226,6 +227,23 @@ def test_forward_mode_agrees_with_reverse_mode():
     gradient = jax.jit(jax.grad(lambda change: losses(change)[-1]))(zeros)
     reverse = sum(float(jnp.sum(gradient[name] * along[name])) for name in along)
     assert float(forward[-1]) == pytest.approx(reverse, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_scene_that_is_moved_whole_moves_the_cloth_with_it():
+    """Through skinning, the push off the body, contacts and time: by a shift the cloth's derivative is one."""
+    garment, poses = wide(square(4, 0.08)), wide(drifting_ball(4))
+
+    def place(shift):
+        moved = poses.replace(
+            positions=poses.positions + shift[None, None],
+            joint_transforms=poses.joint_transforms.at[..., 3].add(shift[None, None]),
+        )
+        material = tree_cast(COTTON, jnp.float64)
+        return rollout(None, garment, moved, config=TIGHT, material=material).positions[-1]
+
+    derivative = jax.jit(jax.jacrev(place))(jnp.zeros(3))
+    np.testing.assert_allclose(derivative, np.broadcast_to(np.eye(3), derivative.shape), atol=1e-5)
 
 
 def test_the_linear_system_reports_what_it_did():
