@@ -79,6 +79,37 @@ def test_a_simulation_interrupted_again_and_again_ends_as_the_whole_one(tmp_path
     assert not (part / "unfinished.npz").exists()
 
 
+STOPPED_WHILE_IT_IS_MEASURED = """
+import os, signal, sys
+from eslr_jax.cli import main
+from eslr_jax.evaluation import report
+
+measure = report.environment
+def stop():
+    os.kill(os.getpid(), signal.SIGINT)
+    return measure()
+report.environment = stop
+sys.argv = ["eslr", "simulate", "--simulator", "physics", "--iterations", "20", "--frames", "4", "--settle", "0",
+            "--out", sys.argv[1]]
+main()
+"""
+
+
+def test_ctrl_c_while_a_run_is_measured_loses_no_frame(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED_WHILE_IT_IS_MEASURED, tmp_path / "run"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "stopping when these frames are written" in done.stderr
+    with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
+        assert len(arrays["positions"]) == 4
+    assert not (tmp_path / "run" / "unfinished.npz").exists()
+    assert not (tmp_path / "run" / "sheet.png").exists(), "pictures are not waited for"
+
+
 @pytest.mark.parametrize("words", [
     ("simulate", "--body", "nobody"),
     ("simulate", "--resume"),
