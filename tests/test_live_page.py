@@ -72,8 +72,12 @@ def player(tmp_path_factory):
     player = Player(tmp_path_factory.mktemp("live"))
     player.wait(5)
     yield player
+    runs = len(list(player.live.out.iterdir()))
+    player.live.controls["record"].value = True
+    player.until(lambda: len(player.live.recorded) >= 3)
     player.end.set()
     player.thread.join(timeout=60)
+    assert len(list(player.live.out.iterdir())) == runs + 1, "the end of the page ends a recording"
     player.live.server.stop()
     assert not player.thread.is_alive()
 
@@ -196,7 +200,8 @@ def test_a_recording_ends_where_the_garment_is_put_on_anew(player):
     _restart(live)
     player.until(lambda: not controls["record"].value and not live.recorded)
     player.wait(1)
-    assert read_run(live.out / "6").trajectory.num_frames >= 3
+    newest = max(live.out.iterdir(), key=lambda folder: int(folder.name))
+    assert read_run(newest).trajectory.num_frames >= 3
 
 
 def test_what_does_not_load_is_said_and_the_choice_before_plays_on(player):

@@ -78,7 +78,7 @@ def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Seq
         AssetError: There is no such body, the file is damaged, or its unit is unknown.
         ConfigError: The body has fewer shapes than betas, or a unit is given and it is always in metres.
         MissingExtraError: The file needs an extra that is not installed.
-        MeshError: A body in the bundled format is not closed, or inside out.
+        MeshError: A body is inside out, or in the bundled format not closed.
     """
     body = _read_body(str(name), units)
     return shape_body(body, betas) if len(betas) else body
@@ -158,14 +158,9 @@ def load_garment(
         MeshError: The mesh can't be simulated, does not fit the body, or can't be carried to it.
     """
     stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
-    for text in fit_doubts(stored):
+    for text in stored.fit_warnings:
         warnings.warn(f"{Path(name).name}: {text}", stacklevel=2)
     return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
-
-
-def fit_doubts(stored: GarmentFile) -> list[str]:
-    """Return what was doubtful when a garment was fitted; nothing if it was not."""
-    return stored.metadata.get("fit", {}).get("warnings", [])
 
 
 def load_garment_file(
@@ -223,8 +218,8 @@ def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
     """
     if vertices != "1k" and all(map(_is_path, names)):
         raise ConfigError(
-            f"--vertices {vertices} is for bundled garments, and {' and '.join(names)} has its own vertices; "
-            "leave it out, or remesh: eslr fit --edge-length"
+            f"--vertices {vertices} is for bundled garments, and the mesh of a file stays as it is; leave "
+            "it out, or remesh the file: eslr fit --edge-length"
         )
 
 
@@ -376,7 +371,9 @@ def load_motion(
     file, _, clip = text.partition("#")
     is_bvh = Path(file).suffix.lower() == ".bvh"
     if up != "auto" and not is_bvh:
-        raise MotionError(f"motion {text} tells which axis points up; leave that out (--motion-up)")
+        raise MotionError(
+            f"motion {text} has its own up axis, which only a BVH file lacks; leave out --motion-up"
+        )
     if text in PROCEDURAL:
         if joint_map:
             raise MotionError(f"{text} is computed from the body's own joints; leave out the map of joints")

@@ -41,7 +41,7 @@ def load_wearer(body: str, *, units: str | None = None, betas: tuple[float, ...]
         return load_body(body, units=units, betas=betas)
     if betas:
         raise ConfigError(f"{body} is a mesh in motion and has no shapes; leave out --betas")
-    return pose_sequence(read_mesh_sequence(body), units=units)[0]
+    return pose_sequence(read_mesh_sequence(body), num_frames=1, units=units)[0]
 
 
 def load_actor(options: Options) -> Actor:

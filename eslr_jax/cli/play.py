@@ -39,11 +39,12 @@ def play(
         host: Address to listen on; 0.0.0.0 shows it to the whole network.
         opens: Open the page in the browser, if this is a terminal with a screen. Its address is printed anyway.
     """
-    from eslr_jax.assets.load import own_motion
+    from eslr_jax.assets.load import check_resolution, own_motion
     from eslr_jax.viewer.live import open_live, run_live
     from eslr_jax.viewer.live_controls import Choice
 
     use_compile_cache()
+    check_resolution(garment or (DEFAULT_GARMENT,), vertices)
     choice = Choice(garment or (DEFAULT_GARMENT,), vertices, motion or own_motion(body), body, betas)
     live = open_live(choice, out=out, host=host, port=port)
     print(live.url, flush=True)

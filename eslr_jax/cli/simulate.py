@@ -318,6 +318,7 @@ def _simulate(
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
+    stop.end()
     if has_pictures and not is_unfinished and not stop.is_wanted:
         _write_sheet(out, np.asarray(trajectory.positions), stored, (rig, poses))
     return report
@@ -426,13 +427,13 @@ def _measure(
     from eslr_jax.evaluation.report import environment, trajectory_report
     from eslr_jax.evaluation.wear import wear_report
     from eslr_jax.scene.build import skin_garment
+    from eslr_jax.simulation.stepper import keeps_tolerance
 
     trajectory, timing, scene = simulation
     parts = stored.face_parts, stored.part_names
     skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-    # The bound is that of the solver's stop, but for rounding; where no force is left there is none.
-    is_kept = np.asarray(trajectory.gap_bounds)[1:] <= (1 + 1e-5) * method.config.tolerance
-    is_kept |= np.asarray(trajectory.residuals)[1:] == 0
+    bounds, residuals = np.asarray(trajectory.gap_bounds)[1:], np.asarray(trajectory.residuals)[1:]
+    is_kept = keeps_tolerance(bounds, residuals, method.config.tolerance)
     return {
         "simulator": method.simulator,
         "model": method.model,

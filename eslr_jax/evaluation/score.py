@@ -19,9 +19,10 @@ from eslr_jax.evaluation.report import Parts, trajectory_report
 from eslr_jax.evaluation.wear import wear_report
 from eslr_jax.io.garment import split_outfit
 from eslr_jax.scene.build import skin_garment
-from eslr_jax.types import BodyMotion, Scene, Trajectory
+from eslr_jax.types import BodyMotion, PairCapacity, Scene, Trajectory
 
 EVERY = 4  # frames between those whose gap and intersections are measured, as in `eslr evaluate`
+_ROWS = 256  # of self-contact, to whose multiple buffers are rounded: few sizes are compiled
 _LEAST_FRAMES = (
     3  # the gap is measured from the second simulated frame on: the first one's velocity is guessed
 )
@@ -73,16 +74,20 @@ def score_trajectory(
     positions = np.asarray(trajectory.positions if isinstance(trajectory, Trajectory) else trajectory)
     _check(positions, scene, every)
     if scene.self_contact is not None:  # the buffers that `simulate` begins with may be too small
-        scene = scene.replace(self_contact=default_capacity(positions.shape[1]))
+        room = max(scene.self_contact.pairs, default_capacity(positions.shape[1]).pairs)
+        scene = scene.replace(self_contact=PairCapacity(pairs=room))
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
     trajectory = with_energies(trajectory, scene)
-    if (room := scene.self_contact) is not None:
-        pairs = int(np.max(np.asarray(trajectory.pair_demand)))
-        if pairs > room.pairs:
+    if scene.self_contact is not None:
+        pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
+        if pairs > room:
             raise CapacityError(
-                f"{pairs} pairs of cloth touch, and the scene has room for {room.pairs}; cut it"
+                f"{pairs} pairs of cloth touch, and the scene has room for {room}; give one with more in "
+                "self_contact"
             )
+        # What is left is solved often, and every row costs in every iteration.
+        scene = scene.replace(self_contact=PairCapacity(pairs=_ROWS * -(-max(pairs, 1) // _ROWS)))
     report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:

@@ -76,6 +76,22 @@ def ensure_output_dir(path: str | Path) -> Path:
     return folder
 
 
+def move_files(source: Path, target: Path) -> None:
+    """Move the files of a folder that are written and flushed into another on the same disk.
+
+    Raises:
+        AssetError: A name is taken by a folder.
+    """
+    for file in sorted(source.iterdir()):
+        try:
+            os.replace(file, target / file.name)
+        except OSError as error:
+            raise AssetError(
+                f"can't write {target / file.name}: {_reason(error)}; free the name or choose another folder"
+            ) from error
+    _flush(target)
+
+
 def _flush(path: Path) -> None:
     """Flush a file's bytes, or a folder's entries, to the disk."""
     try:

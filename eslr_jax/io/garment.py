@@ -59,6 +59,11 @@ class GarmentFile:
         """Numbers of vertices of the garments that are worn together, by name; one entry for a single garment."""
         return self.metadata.get("outfit") or {"garment": len(self.rest_positions)}
 
+    @property
+    def fit_warnings(self) -> list[str]:
+        """What was doubtful when the garment was fitted."""
+        return self.metadata.get("fit", {}).get("warnings", [])
+
 
 def split_outfit(
     faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]

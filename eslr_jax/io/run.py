@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+from eslr_jax.io.atomic import atomic_write, ensure_output_dir, move_files
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.io.npz import read_arrays
@@ -50,7 +50,7 @@ def write_run(
     *,
     report: dict[str, Any],
 ) -> None:
-    """Write the folder of a run: all of its files, or none, so that files of two runs never mix.
+    """Write the folder of a run; files are moved there when all are written, so that those of two runs don't mix.
 
     Args:
         folder: It is made if it is not there.
@@ -75,15 +75,14 @@ def write_run(
         ground=None if scene.ground is None else float(scene.ground),
         material=jax.tree.map(_stored_number, scene.material),
     )
-    with contextlib.ExitStack() as stack:
-        names = ("report.json", "garment.npz", "trajectory.npz", "animation.glb")
-        said, garment, trajectory, animation = (
-            stack.enter_context(atomic_write(folder / name)) for name in names
-        )
-        said.write_text(json.dumps(report, indent=2))
-        write_garment_npz(garment, stored)
-        write_trajectory(trajectory, file)
-        export_trajectory(file, animation, garment=stored)
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as name:
+        new = Path(name)
+        with atomic_write(new / "report.json") as temporary:
+            temporary.write_text(json.dumps(report, indent=2))
+        write_garment_npz(new / "garment.npz", stored)
+        write_trajectory(new / "trajectory.npz", file)
+        export_trajectory(file, new / "animation.glb", garment=stored)
+        move_files(new, folder)
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:

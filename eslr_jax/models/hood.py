@@ -92,8 +92,7 @@ class HoodLayer(nn.Module):
             messages = edge.finish(edge.start(edges[name], 2 * size) + ends)
             hidden = hidden + vertex.start(sum_receivers(messages, table), place * size)
             edges[name] = edges[name] + messages
-        if world is not None:
-            assert world.reverse is not None, "a hierarchical network updates the body's rows"
+        if world is not None and world.reverse is not None:
             edge, column, mask = self.world_mlp, (1 + len(self.sets)) * size, tables.world_mask
             ends = edge.start(garment, 0) + edge.start(world.body, size)
             to_garment = mask * edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))

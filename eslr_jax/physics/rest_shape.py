@@ -19,7 +19,8 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
 
     Args:
         garment: A prepared garment.
-        rest_positions: The new shape [m], shape [vertices, 3].
+        rest_positions: The new shape [m], shape [vertices, 3]: `garment.sewn_positions`, changed. The place from
+            which the garment is skinned moves as much.
     """
     is_real = garment.rest_areas > 0
     areas = jnp.where(is_real, _areas(rest_positions, garment.faces), 0.0)
@@ -28,7 +29,7 @@ def with_rest_positions(garment: Garment, rest_positions: Float[Array, "vertices
     hinge_edges = rest_positions[garment.hinges[:, 1]] - rest_positions[garment.hinges[:, 0]]
     thirds = jnp.broadcast_to((areas / 3.0)[:, None], garment.faces.shape)
     return garment.replace(
-        rest_positions=rest_positions,
+        rest_positions=garment.rest_positions + (rest_positions - garment.sewn_positions),
         sewn_positions=rest_positions,
         rest_areas=areas,
         inverse_rest_frames=jnp.where(

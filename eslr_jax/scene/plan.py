@@ -33,8 +33,10 @@ _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest p
 _FAR_AT_REST = (
     2.0 * SEARCH_RADIUS
 )  # [m] between places of one piece that may come close; nearer ones bend towards
-_SAMPLED_FRAMES = 12  # in which is looked for pieces that meet, and for a ground in reach
-_REACH_SPACING = 0.1  # [s] between frames in which reachable faces are looked for
+_SPACING = 0.1  # [s] between the frames that are looked at to decide what is modelled
+_MOST_COMPARED = (
+    4000  # vertices of a piece that are compared with each other; a part of a finer one is enough
+)
 Ground = Literal["auto", "on", "off"]
 _build = jax.jit(build_scene)
 _skin = jax.jit(skin_garment)
@@ -108,9 +110,9 @@ def plan_scene(
     if is_undecided:
         is_real = np.asarray(garment.vertex_mask)
         has_layers = (
-            _pieces_meet(piece[is_real], skinned[:, is_real])
+            _pieces_meet(piece[is_real], skinned[_sampled(poses)][:, is_real])
             if num_pieces > 1
-            else _meets_itself(garment, looseness, skinned[:, is_real])
+            else _meets_itself(garment, looseness, skinned[_sampled(poses)][:, is_real])
         )
     if not options.has_body:
         surface = None
@@ -200,8 +202,8 @@ def prepare_scenes(
     options = options or SceneOptions()
     if any(np.ndim(leaf) for material in materials for leaf in jax.tree.leaves(material)):
         raise ConfigError(
-            "a batch takes one isotropic fabric for each garment; simulate garments with fabrics by part or with "
-            "threads one by one"
+            "a batch takes one isotropic fabric for each garment, with bending_stiffness; simulate garments with "
+            "fabrics by part, threads or bending in N m one by one"
         )
     padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
     surface = shared_surface(padded, poses[0]) if options.has_body else None
@@ -270,16 +272,17 @@ def _could_fall(garment: Garment, poses: BodyMotion, piece: np.ndarray) -> bool:
 
 
 def _reaches_ground(garment: Garment, skinned: np.ndarray, poses: BodyMotion, radii: np.ndarray) -> bool:
-    """Tell whether a free vertex comes as near to the ground as it may stray, in a sample of frames."""
+    """Tell whether a free vertex comes as near to the ground as it may stray."""
     is_real = np.asarray(garment.vertex_mask)
-    lowest = skinned[_sampled(len(skinned))][:, is_real, 1].min(axis=0) - radii
+    lowest = skinned[:, is_real, 1].min(axis=0) - radii
     is_free = ~np.asarray(garment.is_pinned)[is_real]
     return bool((lowest[is_free] < float(ground_height(poses))).any())
 
 
-def _sampled(num_frames: int, count: int = _SAMPLED_FRAMES) -> np.ndarray:
-    """Return the frames that are looked at to decide what is modelled."""
-    return np.unique(np.linspace(0, num_frames - 1, count).astype(int))
+def _sampled(poses: BodyMotion) -> np.ndarray:
+    """Return the frames that are looked at to decide what is modelled: ten a second, first and last included."""
+    last, spacing = poses.positions.shape[0] - 1, max(round(_SPACING / float(poses.timestep)), 1)
+    return np.unique(np.linspace(0, last, -(-last // spacing) + 1).astype(int))
 
 
 def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
@@ -292,15 +295,15 @@ def piece_of_vertices(garment: Garment) -> Int[np.ndarray, " vertices"]:
 
 
 def _pieces_meet(piece: np.ndarray, skinned: np.ndarray) -> bool:
-    """Return whether two pieces come close enough to touch, in a sample of skinned frames.
+    """Return whether two pieces come close enough to touch.
 
     Args:
         piece: Number of the piece of every vertex, shape [vertices].
-        skinned: Positions [m], shape [frames, vertices, 3].
+        skinned: Positions in a sample of frames [m], shape [frames, vertices, 3].
     """
-    for frame in _sampled(len(skinned)):
+    for positions in skinned:
         for number in range(1, piece.max() + 1):
-            one, others = skinned[frame][piece == number], skinned[frame][piece < number]
+            one, others = positions[piece == number], positions[piece < number]
             if np.isfinite(cKDTree(others).query(one, distance_upper_bound=SEARCH_RADIUS)[0]).any():
                 return True
     return False
@@ -309,19 +312,21 @@ def _pieces_meet(piece: np.ndarray, skinned: np.ndarray) -> bool:
 def _meets_itself(garment: Garment, looseness: np.ndarray, skinned: np.ndarray) -> bool:
     """Return whether cloth of one piece can touch itself.
 
-    It hangs so far off the body that it can fold, or two places that are far apart at rest come close in a sample
-    of skinned frames, such as a sleeve and the trunk.
+    It hangs so far off the body that it can fold, or two places that are far apart at rest come close, such as a
+    sleeve and the trunk.
 
     Args:
         garment: A prepared garment.
         looseness: How far its real vertices hang from the body at rest [m].
-        skinned: Positions of its real vertices [m], shape [frames, vertices, 3].
+        skinned: Positions of its real vertices in a sample of frames [m], shape [frames, vertices, 3].
     """
     if np.max(looseness, initial=0.0) > SEARCH_RADIUS:
         return True
     rest = np.asarray(garment.rest_positions)[np.asarray(garment.vertex_mask)]
-    for frame in _sampled(len(skinned)):
-        pairs = cKDTree(skinned[frame]).query_pairs(SEARCH_RADIUS, output_type="ndarray")
+    stride = -(-len(rest) // _MOST_COMPARED)
+    rest = rest[::stride]
+    for positions in skinned[:, ::stride]:
+        pairs = cKDTree(positions).query_pairs(SEARCH_RADIUS, output_type="ndarray")
         if np.any(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > _FAR_AT_REST):
             return True
     return False
@@ -337,8 +342,7 @@ def reachable_vertices(
     is_real = np.asarray(garment.vertex_mask)
     bodies = np.asarray(poses.positions)  # cut on the host, where it compiles nothing
     is_near = np.zeros(bodies.shape[1], bool)
-    spacing = max(round(_REACH_SPACING / float(poses.timestep)), 1)
-    for frame in _sampled(len(skinned), max(_SAMPLED_FRAMES, -(-len(skinned) // spacing))):
+    for frame in _sampled(poses):
         far = np.flatnonzero(~is_near)  # once is enough
         points = bodies[frame, far]
         is_near[far] = _within(radii, np.asarray(skinned[frame])[is_real], points)

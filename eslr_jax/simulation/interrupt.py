@@ -10,7 +10,7 @@ from collections.abc import Callable
 class Interruption:
     """Turns Ctrl-C and SIGTERM into a question, from `begin` on; a second signal acts at once.
 
-    A context: at its end the signals act as before.
+    A context: at its end, or from `end` on, the signals act as before.
     """
 
     def __init__(self, on_wanted: Callable[[], None] = lambda: None):
@@ -25,20 +25,21 @@ class Interruption:
 
     def __exit__(self, *_: object) -> None:
         """Give the signals back."""
-        self._end()
+        self.end()
 
     def begin(self) -> None:
-        """Take over the signals; outside the main thread they are left alone, as Python asks."""
-        if not self._before and threading.current_thread() is threading.main_thread():
+        """Take over the signals, unless one came; outside the main thread they are left alone, as Python asks."""
+        if not self.is_wanted and not self._before and threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._before[number] = signal.signal(number, self._remember)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """Give the signals back."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before = {}
 
     def _remember(self, number: int, frame: object) -> None:
         self.is_wanted = True
-        self._end()
+        self.end()
         self._on_wanted()

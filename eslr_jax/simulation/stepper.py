@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach
@@ -38,6 +38,19 @@ MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth l
 
 Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
 """Advances the cloth by one frame; the common interface of the solver, of networks, and of both together."""
+
+
+def keeps_tolerance(
+    gap_bound: Float[Array, "*frames"], residual: Float[Array, "*frames"], tolerance: float
+) -> Bool[Array, "*frames"]:
+    """Return whether frames ended within a tolerance, by the solver's own bound.
+
+    Args:
+        gap_bound: Of `FrameReport` or `Trajectory`.
+        residual: Likewise; where no force is left, there is nothing to bound.
+        tolerance: Share of the initial gap that may be left.
+    """
+    return (gap_bound <= (1 + 1e-5) * tolerance) | (residual == 0)  # the solver's stop, but for rounding
 
 
 def make_stepper(

@@ -382,5 +382,7 @@ def _statistics(
         before, now, later = (
             data.skinned(index, data.transforms(frame, slot.yaw, slot.shape), slot.shape) for frame in frames
         )
-        acceleration = later - 2.0 * now + before
+        # A trajectory at a clip's first frame has none before it, and begins with the velocity to the next.
+        is_turned = (slot.age == 0) & (frames[0] == frames[2])
+        acceleration = jnp.where(is_turned, 0.0, later - 2.0 * now + before)
     return measure_statistics(config.model, params, graph, problem.garment, acceleration)

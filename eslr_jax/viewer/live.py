@@ -16,7 +16,6 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
-from eslr_jax.assets.load import fit_doubts
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
@@ -38,7 +37,7 @@ from eslr_jax.simulation.live import (
     no_hand,
     set_stage,
 )
-from eslr_jax.simulation.stepper import FrameReport
+from eslr_jax.simulation.stepper import FrameReport, keeps_tolerance
 from eslr_jax.types import Body, BodyMotion, ClothState, Material
 from eslr_jax.viewer.live_controls import (
     Choice,
@@ -278,7 +277,7 @@ def _load(live: Live, choice: Choice) -> None:
             for name in choice.garments
         ]
         for name, worn in zip(choice.garments, garments, strict=True):
-            for text in fit_doubts(worn):
+            for text in worn.fit_warnings:
                 warnings.warn(f"{name}: {text}", stacklevel=2)
         stored = wear_together(garments, choice.garments)
         cloth = prepare_stored(stored, name="+".join(Path(name).name for name in choice.garments))
@@ -356,7 +355,7 @@ def _tell(live: Live, cast: Cast, report: FrameReport, tolerance: float) -> None
         live.iterations = MOST_ITERATIONS
     exact = (
         f"within {100 * tolerance:.3g} % of the optimum"
-        if bound <= tolerance
+        if keeps_tolerance(report.gap_bound, report.residual, tolerance)
         else "stopped before the tolerance"
     )
     speed = "in real time" if took <= timestep else f"at {timestep / took:.2f} of real time"

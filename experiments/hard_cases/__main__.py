@@ -31,6 +31,7 @@ PEERS = {
 }  # substeps, iterations: in peers.json the least gap on its own rollout
 BLENDER = (45, 2)  # steps per frame, rounds of collision per step: likewise
 ITERATIONS = {"physics": 200, "corrected": 20, "network": 0}  # of the solver, per frame
+NETWORKS = ("corrected", "network")
 DEFAULT_MODEL = "eslr-small"
 
 
@@ -54,7 +55,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--smoke", action="store_true")
     arguments = parser.parse_args()
     if arguments.smoke:
-        arguments.model, arguments.case = "smooth-small", ["pull"]
+        arguments.case = ["pull"]
+        if arguments.simulator in NETWORKS:
+            arguments.model = "smooth-small"
     if arguments.iterations is None:
         arguments.iterations = ITERATIONS.get(arguments.simulator)
     return arguments
@@ -79,7 +82,7 @@ def find_simulator(arguments: argparse.Namespace):
     if name != "physics" and any(stepping.values()):
         given = ", ".join(option for option, is_given in stepping.items() if is_given)
         raise ConfigError(f"{given} is for the simulator physics; leave it out for {name}")
-    if name not in ITERATIONS and arguments.model != DEFAULT_MODEL:
+    if name not in NETWORKS and arguments.model != DEFAULT_MODEL:
         raise ConfigError(f"--model is for networks; leave it out for {name}")
     if name == "physics":
         return solver_simulator(

@@ -16,7 +16,8 @@ same network untrained.
 
 --train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
 paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
-A table is never written over one of another setting, and no row over one of other networks: give another --out.
+A table is never written over one of another setting, nor a row that names its networks over one of others: give
+another --out or label.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]])
         }
         parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **training_cost(names)}
         parts["garments"][label] = means
-        parts["networks"][label] = [Path(name).name for name in names]
+        parts["networks"][label] = [short_name(name) for name in names]
         parts["seeds"].pop(label, None)  # of the row before
         if len(seeds) > 1:
             parts["seeds"][label] = {
@@ -239,9 +240,9 @@ def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]])
 
 def training_cost(names: Sequence[str]) -> dict[str, float]:
     """Return parameters of a row's network, and the core-hours of all its seeds where each is known."""
-    costs = [read_system(name).cost for name in names]
-    hours = [cost["core_hours"] for cost in costs if "core_hours" in cost]
-    return {**costs[0], **({"core_hours": sum(hours)} if len(hours) == len(costs) else {})}
+    costs = [dict(read_system(name).cost) for name in names]
+    hours = [cost.pop("core_hours", None) for cost in costs]
+    return costs[0] if None in hours else {**costs[0], "core_hours": sum(hours)}
 
 
 def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
@@ -271,11 +272,16 @@ def check_networks(file: Path, rows: Rows, kept: dict[str, list[str]]) -> None:
         SystemExit: Names the row and its networks.
     """
     for label, names in rows.items():
-        if label in kept and kept[label] != [Path(name).name for name in names]:
+        if label in kept and kept[label] != [short_name(name) for name in names]:
             own = ", ".join(kept[label])
             raise SystemExit(
                 f"{file} has a row {label} of {own}; give another label, or --anew to replace it"
             )
+
+
+def short_name(name: str) -> str:
+    """Return a name of `read_system` that is the same on another machine: of a path the last two parts."""
+    return "/".join(Path(name).parts[-2:])
 
 
 def cost_file(chosen: argparse.Namespace) -> Path:

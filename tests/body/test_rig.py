@@ -200,7 +200,7 @@ def test_a_character_that_is_inside_out_is_refused(body):
 
 def test_only_a_bvh_is_told_which_axis_points_up(body):
     for name in ("turn", "cmu_016_32"):
-        with pytest.raises(MotionError, match=f"{name} tells which axis points up.*--motion-up"):
+        with pytest.raises(MotionError, match=f"{name} has its own up axis.*--motion-up"):
             load_motion(name, body=body, up="z")
 
 

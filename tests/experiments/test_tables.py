@@ -17,7 +17,7 @@ TABLE = {
     "mean": {"mgn-5": ROW},
     "seeds": {},
     "garments": {"mgn-5": {"tshirt": ROW, "dress": ROW}},
-    "networks": {"mgn-5": ["mgn-5-correction", "second.npz"]},
+    "networks": {"mgn-5": ["mgn-5-correction", "weights/second.npz"]},
 }
 PARTS = ("mean", "seeds", "garments", "networks")
 
@@ -86,10 +86,10 @@ def test_default_rows_have_every_bundled_network_of_five_layers():
 def test_a_row_is_of_the_networks_that_it_was_measured_with(file):
     kept = rows_of_setting(file, SETTING)["networks"]
     check_networks(
-        file, {"mgn-5": ("mgn-5-correction", "else/where/second.npz"), "new": ("eslr-small",)}, kept
+        file, {"mgn-5": ("mgn-5-correction", "/else/where/weights/second.npz"), "new": ("eslr-small",)}, kept
     )
-    with pytest.raises(SystemExit, match=r"a row mgn-5 of mgn-5-correction, second.npz; give another label"):
-        check_networks(file, {"mgn-5": ("mgn-5-correction",)}, kept)
+    with pytest.raises(SystemExit, match=r"a row mgn-5 of mgn-5-correction, weights/second.npz; give"):
+        check_networks(file, {"mgn-5": ("mgn-5-correction", "other/second.npz")}, kept)
 
 
 def test_rows_of_architectures_are_trained_by_their_recipe(tmp_path):

@@ -262,3 +262,14 @@ def test_thicker_sheets_are_stiffer_to_the_network_and_no_input_is_larger_than_p
     np.testing.assert_allclose(*rows, atol=1e-6)
     hard = material.replace(lame_lambda=material.lame_lambda * 100.0)
     assert float(jnp.abs(build(GRADIENT, (garment, hard, inputs)).nodes["garment"]).max()) <= 5.0
+
+
+def test_hoods_world_edges_join_what_is_near_now(scene):
+    """A contact of thrown cloth is measured on its path; its body point may be half a metre ahead."""
+    garment, material, inputs = scene
+    ahead = inputs.contacts.replace(
+        points=inputs.contacts.points + jnp.array([[0.5, 0.0, 0.0]]),
+        distances=jnp.full_like(inputs.contacts.distances, 0.001),
+    )
+    graph = build(HOOD, (garment, material, inputs.replace(contacts=ahead)))
+    assert not bool(graph.globals["world_mask"].any())

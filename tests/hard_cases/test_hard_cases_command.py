@@ -81,3 +81,13 @@ def test_sheet_shows_every_case(outcome):
     twice = draw_sheet([outcome, outcome])
     assert twice.dtype == np.uint8
     assert twice.shape[1] > 2 * 200
+
+
+@pytest.mark.parametrize(("words", "option"), [
+    (("corrected", "--integrator", "bdf2", "--skin"), "--integrator, --skin"),
+    (("physics", "--model", "smooth-small"), "--model"),
+])  # fmt: skip
+def test_options_of_another_simulator_are_refused(tmp_path, words, option):
+    code, lines = command(*words, "--out", tmp_path)
+    assert (code, len(lines)) == (2, 1)
+    assert option in lines[0]

@@ -178,7 +178,9 @@ def test_from_install_to_a_garment_that_moves_with_the_body_and_stays_out_of_it(
 
 def test_warnings_of_fit_and_simulation_are_collected_and_no_lost_folder_is_named(tmp_path):
     (tmp_path / "fit.txt").write_text(json.dumps({"warnings": ["the place is doubtful"], "pinned": 0}))
-    (tmp_path / "simulate.txt").write_text("good: stretched by 3 %\nwarning: skin shows\nframes 3\n")
+    (tmp_path / "simulate.txt").write_text(
+        "good: stretched by 3 %\n\x1b[33mwarning:\x1b[0m skin shows\nframes 3\n"
+    )
     assert job._warnings(tmp_path / "fit.txt") == ["the place is doubtful"]
     assert job._warnings(tmp_path / "simulate.txt") == ["skin shows"]
     log = "\n".join(["compiling 3/9", "eslr: frame 3 is not finite; the frames before are kept in /tmp/a"])

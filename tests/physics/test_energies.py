@@ -15,6 +15,7 @@ from eslr_jax.physics.bending import bending_energy, dihedral_angles
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.membrane import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import PotentialTerms, contact_load, potential, potential_terms
+from eslr_jax.physics.preconditioner import stretch_diagonal
 from eslr_jax.physics.problem import weight_norm
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
@@ -421,3 +422,10 @@ def test_cloth_without_hinges_has_forces():
     assert float(value) > 0
     assert bool(jnp.isfinite(gradient).all())
     assert float(jnp.abs(gradient).max()) > 0
+
+
+def test_the_preconditioner_measures_cloth_as_it_is_sewn():
+    """Where the rest pose distorts a garment, its stiffness is that of the lengths that its energy measures."""
+    cloth = make_garment(*make_sheet(5, 5, 0.02, jitter=0))
+    posed = cloth.replace(rest_positions=1.3 * cloth.rest_positions)
+    np.testing.assert_array_equal(stretch_diagonal(posed, COTTON), stretch_diagonal(cloth, COTTON))

@@ -11,11 +11,13 @@ from draped_ball import TIMESTEP, drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
+from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
 from eslr_jax.simulation.rollout import rollout, rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
+from eslr_jax.simulation.stepper import keeps_tolerance
 
 SOLVER = SimConfig(iterations=15)
 SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
@@ -198,3 +200,18 @@ def test_gradient_through_five_frames_of_the_network(cloth):
         for sign in (1, -1)
     ]
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(length), rel=0.05)
+
+
+def test_a_frame_tells_what_share_of_its_gap_it_left_at_most():
+    scene = prepare_scene(square(), drifting_ball(4))
+    few, enough = (
+        rollout_scene(None, scene, SimConfig(iterations=count, tolerance=0.01)) for count in (2, 200)
+    )
+    for trajectory, is_kept in ((few, False), (enough, True)):
+        bounds, residuals = trajectory.gap_bounds[1:], trajectory.residuals[1:]
+        assert float(trajectory.gap_bounds[0]) == 0.0
+        np.testing.assert_array_equal(keeps_tolerance(bounds, residuals, 0.01), is_kept)
+    left = trajectory_gap(enough, scene, every=1)
+    assert float(jnp.max(left.share(left.reached))) < 0.01
+    stuck, still = jnp.array([jnp.inf, jnp.inf]), jnp.array([0.1, 0.0])
+    assert keeps_tolerance(stuck, still, 0.01).tolist() == [False, True], "without a force nothing is left"

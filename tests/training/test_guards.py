@@ -11,7 +11,7 @@ from cloth import make_garment, make_limb, make_sheet, swing_motion
 
 from eslr_jax.assets.load import load_model
 from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CapacityError, NonFiniteError
+from eslr_jax.errors import CapacityError, NonFiniteError, Status
 from eslr_jax.graph.normalizer import WARMUP_UPDATES
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.training.checkpoint import Checkpoints
@@ -107,6 +107,14 @@ def test_a_trajectory_is_astray_where_it_stretches_or_jumps_too_far_and_done_at_
     np.testing.assert_array_equal(moved.state.position, onward)
 
 
+def test_a_body_that_contacts_cannot_follow_ends_a_trajectory(advance):
+    slot, at = advance
+    state = slot.state.replace(status=jnp.int32(Status.BODY_TOO_FAST))
+    moved, is_astray = at(np.asarray(slot.state.position), 2, state)
+    assert bool(is_astray)
+    assert bool(moved.is_done)
+
+
 @pytest.fixture(scope="module")
 def advance(config, small_data):
     """A trajectory at its start, and a function that moves it to where the network would take it."""
@@ -116,11 +124,14 @@ def advance(config, small_data):
     terms = PotentialTerms(*jnp.zeros(len(PotentialTerms._fields)))
 
     @jax.jit
-    def at(onward, frames):
+    def at(onward, frames, state):
         horizon = _Horizon(frames, config.reset_stretch, config.reset_displacement)
-        return _advance(slot, problem, LossReport(onward, terms, jnp.float32(0.0)), small_data, horizon)
+        report = LossReport(onward, terms, jnp.float32(0.0))
+        return _advance(slot.replace(state=state), problem, report, small_data, horizon)
 
-    return slot, lambda onward, frames: at(jnp.asarray(onward, jnp.float32), jnp.int32(frames))
+    return slot, lambda onward, frames, state=slot.state: at(
+        jnp.asarray(onward, jnp.float32), jnp.int32(frames), state
+    )
 
 
 def test_a_run_whose_cloth_needs_more_self_contact_than_fits_ends_with_a_remedy(config, tmp_path):

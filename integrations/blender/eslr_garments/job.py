@@ -106,9 +106,14 @@ class Job:
         threading.Thread(target=insist, daemon=True).start()
 
 
+def _plain(text: str) -> str:
+    """Return text without the codes that colour it in a terminal."""
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+
+
 def _warnings(output: Path) -> list[str]:
     """Return the warnings in what a command printed: those of `eslr fit --json`, or lines of `eslr simulate`."""
-    text = output.read_text(encoding="utf-8", errors="replace")
+    text = _plain(output.read_text(encoding="utf-8", errors="replace"))
     try:
         return list(json.loads(text).get("warnings", ()))
     except ValueError:  # it printed no JSON
@@ -117,7 +122,7 @@ def _warnings(output: Path) -> list[str]:
 
 def _reason(log: str, code: int) -> str:
     """Return why a command failed: its own line, or the last one that it wrote."""
-    lines = [line.strip() for line in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", log).splitlines() if line.strip()]
+    lines = [line.strip() for line in _plain(log).splitlines() if line.strip()]
     if any("No module named" in line and "eslr_jax" in line for line in lines):
         return (
             "this Python has no eslr_jax; install it there (pip install), or name another in the preferences"
