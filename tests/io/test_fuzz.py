@@ -246,7 +246,8 @@ def character():
     motion = small_motion()
     rng = np.random.default_rng(0)
     return content(
-        write_character, motion.skeleton, rng.uniform(0, 1, (9, 3)), np.arange(9).reshape(3, 3),
+        write_character, motion.skeleton, rng.uniform(0, 1, (9, 3)),
+        np.arange(9).reshape(3, 3)[:, ::-1],  # so that they point outside
         np.tile([0.5, 0.5, 0, 0], (9, 1)), np.tile([0, 1, 2, 3], (9, 1)),
         motion=(motion.rotations, motion.positions),
     )  # fmt: skip
