@@ -158,9 +158,14 @@ def load_garment(
         MeshError: The mesh can't be simulated, does not fit the body, or can't be carried to it.
     """
     stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
-    for text in stored.fit_warnings:
-        warnings.warn(f"{Path(name).name}: {text}", stacklevel=2)
+    warn_of_fit(Path(name).name, stored)
     return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
+
+
+def warn_of_fit(name: str, stored: GarmentFile) -> None:
+    """Warn of what was doubtful when a garment was fitted."""
+    for text in stored.fit_warnings:
+        warnings.warn(f"{name}: {text}", stacklevel=3)
 
 
 def load_garment_file(

@@ -102,7 +102,7 @@ def align_rests(
             if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
                 continue
             turn = minimal_rotation(upright @ bone, other)
-            if beyond in ("lower_leg", "foot") and _angle(turn) > MAX_LEG_TURN:
+            if beyond in ("lower_leg", "foot") and _angle(np.trace(turn)) > MAX_LEG_TURN:
                 raise MotionError(
                     f"motion {name}: its rest pose does not stand ({side} {chain} points elsewhere); "
                     "export it with a T-pose at rest"
@@ -113,9 +113,9 @@ def align_rests(
     return result
 
 
-def _angle(turn: NDArray) -> float:
-    """Return the angle of a rotation [rad]; rounding may leave its trace out of range."""
-    return float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+def _angle(trace: NDArray) -> NDArray:
+    """Return the angles of rotations [rad] from the traces of their matrices; rounding may exceed the range."""
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def _bone(skeleton: Skeleton, parts: Parts, start: Part, end: Part) -> NDArray:
@@ -134,6 +134,6 @@ def _torso_turn(target: Skeleton, ours: Parts, source: Skeleton, theirs: Parts) 
         return np.eye(3)
     turn = other @ one.T
     quarters = Rotation.create_group("O").as_matrix()
-    angles = np.arccos(np.clip((np.einsum("nab,ab->n", quarters, turn) - 1) / 2, -1, 1))
+    angles = _angle(np.einsum("nab,ab->n", quarters, turn))
     is_near = angles.min() < ORDINARY_TILT
     return np.round(quarters[angles.argmin()]) if is_near else turn

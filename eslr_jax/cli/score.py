@@ -143,7 +143,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     import inspect
 
     from eslr_jax.assets import load_garment_file, prepare_stored
-    from eslr_jax.assets.load import check_resolution
+    from eslr_jax.assets.load import check_resolution, warn_of_fit
     from eslr_jax.cli.simulate import simulate
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import garment_names, wear_together
@@ -165,8 +165,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     rig, poses, motion, _ = load_actor(options)
     garments = [load_garment_file(file, vertices=options.vertices, body=rig) for file in files]
     for file, worn in zip(files, garments, strict=True):
-        for text in worn.fit_warnings:
-            say(f"{file}: {text}")
+        warn_of_fit(file, worn)
     stored, label = wear_together(garments, files), "+".join(files)
     by_name = dict(zip(garment_names(files), garments, strict=True))
     positions = in_outfit_order(sequences, stored, by_name)

@@ -109,10 +109,11 @@ def plan_scene(
     radii = options.reach + looseness
     if is_undecided:
         is_real = np.asarray(garment.vertex_mask)
+        looked_at = skinned[_sampled(poses)][:, is_real]
         has_layers = (
-            _pieces_meet(piece[is_real], skinned[_sampled(poses)][:, is_real])
+            _pieces_meet(piece[is_real], looked_at)
             if num_pieces > 1
-            else _meets_itself(garment, looseness, skinned[_sampled(poses)][:, is_real])
+            else _meets_itself(garment, looseness, looked_at)
         )
     if not options.has_body:
         surface = None

@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
+from eslr_jax.assets.load import warn_of_fit
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
@@ -277,8 +277,7 @@ def _load(live: Live, choice: Choice) -> None:
             for name in choice.garments
         ]
         for name, worn in zip(choice.garments, garments, strict=True):
-            for text in worn.fit_warnings:
-                warnings.warn(f"{name}: {text}", stacklevel=2)
+            warn_of_fit(name, worn)
         stored = wear_together(garments, choice.garments)
         cloth = prepare_stored(stored, name="+".join(Path(name).name for name in choice.garments))
         stage = set_stage(cloth, poses, read_fabric(live.controls))
