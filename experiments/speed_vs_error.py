@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import asset_names
-from eslr_jax.assets.load import START_MODEL
+from eslr_jax.assets.models import START_MODEL
 from eslr_jax.evaluation.calibrate import (
     example_scene,
     measure_methods,

@@ -1,14 +1,10 @@
 """Bundled bodies, garments, motions and networks, loaded by name, and those of a user by path."""
 
+from eslr_jax.assets.bodies import load_body
 from eslr_jax.assets.catalog import Asset, asset_names, data_folder, list_assets, load_splits, split_clips
-from eslr_jax.assets.load import (
-    load_body,
-    load_garment,
-    load_garment_file,
-    load_model,
-    load_motion,
-    prepare_stored,
-)
+from eslr_jax.assets.garments import load_garment, load_garment_file, prepare_stored
+from eslr_jax.assets.models import load_model
+from eslr_jax.assets.motions import load_motion
 
 __all__ = [
     "Asset",

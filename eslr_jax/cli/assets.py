@@ -179,7 +179,8 @@ def _show_scene(
 ) -> None:
     """Print the parts that a scene models, those it leaves out, and their costs."""
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-    from eslr_jax.assets.load import check_resolution, default_model
+    from eslr_jax.assets.garments import check_resolution
+    from eslr_jax.assets.models import DEFAULT_MODEL
     from eslr_jax.body.motion import pose_body
     from eslr_jax.cli.simulate import BEHIND_NETWORK, ITERATIONS
     from eslr_jax.config import SimConfig
@@ -187,7 +188,7 @@ def _show_scene(
     from eslr_jax.scene.plan import SceneOptions, prepare_scene
 
     use_compile_cache()
-    params, architecture = load_model(default_model()) if simulator == "network" else (None, None)
+    params, architecture = load_model(DEFAULT_MODEL) if simulator == "network" else (None, None)
     check_resolution([garment], vertices)
     config = SimConfig(model=architecture, iterations=ITERATIONS if architecture is None else BEHIND_NETWORK)
     options = SceneOptions(  # those of `eslr simulate`

@@ -31,7 +31,7 @@ def joints(
         json_: Print as JSON.
     """
     from eslr_jax.assets import load_body
-    from eslr_jax.assets.load import motion_skeleton
+    from eslr_jax.assets.motions import motion_skeleton
     from eslr_jax.body.joints import change_map, read_joint_map
     from eslr_jax.body.rig import body_skeleton
     from eslr_jax.io.atomic import atomic_write

@@ -103,7 +103,7 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
             was trained as a start for the solver.
         out: File to write to, instead of the one that `eslr simulate` reads.
     """
-    from eslr_jax.assets.load import START_MODEL, default_model
+    from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
     from eslr_jax.evaluation.calibrate import calibrate as run
     from eslr_jax.evaluation.report import environment
     from eslr_jax.io.atomic import ensure_output_dir
@@ -113,7 +113,7 @@ def calibrate(models: tuple[str, ...] = (), out: Path | None = None) -> None:
     path = out or cache_path()
     ensure_output_dir(path.parent)  # before minutes are spent
     with waiting("measuring"):
-        measured = run(models or (START_MODEL, default_model()))
+        measured = run(models or (START_MODEL, DEFAULT_MODEL))
     write_calibration(measured, path, environment())
     table = Table("", "vertices", "per frame [ms]", "per iteration [ms]", "gap after 20", box=None)
     for method in measured.methods:

@@ -39,7 +39,8 @@ def play(
         host: Address to listen on; 0.0.0.0 shows it to the whole network.
         opens: Open the page in the browser, if this is a terminal with a screen. Its address is printed anyway.
     """
-    from eslr_jax.assets.load import check_resolution, own_motion
+    from eslr_jax.assets.garments import check_resolution
+    from eslr_jax.assets.motions import own_motion
     from eslr_jax.viewer.live import open_live, run_live
     from eslr_jax.viewer.live_controls import Choice
 

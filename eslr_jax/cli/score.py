@@ -143,7 +143,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     import inspect
 
     from eslr_jax.assets import load_garment_file, prepare_stored
-    from eslr_jax.assets.load import check_resolution, warn_of_fit
+    from eslr_jax.assets.garments import check_resolution, warn_of_fit
     from eslr_jax.cli.simulate import simulate
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import garment_names, wear_together

@@ -193,7 +193,7 @@ def _simulate(
     import numpy as np
 
     from eslr_jax.assets import load_garment_file, prepare_stored
-    from eslr_jax.assets.load import check_resolution
+    from eslr_jax.assets.garments import check_resolution
     from eslr_jax.body.motion import first_poses
     from eslr_jax.body.timing import SETTLE_FRAMES, begins_at_rest, check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
@@ -337,7 +337,7 @@ def _choose_method(
 ) -> _Method:
     """Return how to simulate a garment of this size; `choice` is that of an interrupted run."""
     from eslr_jax.assets import load_model
-    from eslr_jax.assets.load import default_model
+    from eslr_jax.assets.models import DEFAULT_MODEL
     from eslr_jax.config import SimConfig
     from eslr_jax.simulation.budget import SOLVER, choose, read_calibration
 
@@ -352,7 +352,7 @@ def _choose_method(
     simulator = simulator or ("physics" if iterations and model is None else "network")
     params, architecture = None, None
     if simulator == "network":
-        model = model or default_model()
+        model = model or DEFAULT_MODEL
         params, architecture = load_model(model)
     usual = ITERATIONS if architecture is None else BEHIND_NETWORK
     config = SimConfig(

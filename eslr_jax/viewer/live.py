@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
-from eslr_jax.assets.load import warn_of_fit
+from eslr_jax.assets.garments import warn_of_fit
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling

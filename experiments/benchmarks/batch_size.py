@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
-from eslr_jax.assets.load import Resolution
+from eslr_jax.assets.garments import Resolution
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.report import environment

@@ -18,7 +18,7 @@ from hood_metrics import hood_metrics
 from mat_space import prepare_space
 from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
 
-from eslr_jax.assets.load import model_record
+from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params

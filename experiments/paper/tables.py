@@ -45,7 +45,7 @@ from rollouts import (
 )
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.assets.load import START_MODEL, default_model
+from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
 from eslr_jax.body.motion import pose_body
 from eslr_jax.cli.train import train
 from eslr_jax.config import ModelConfig, SimConfig
@@ -67,7 +67,7 @@ DEEP = (
 )
 CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
 RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
-BUNDLED = (f"eslr-small={default_model()}", f"{START_MODEL}+20={START_MODEL}+20")
+BUNDLED = (f"eslr-small={DEFAULT_MODEL}", f"{START_MODEL}+20={START_MODEL}+20")
 SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
 TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")

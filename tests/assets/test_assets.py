@@ -16,7 +16,7 @@ from eslr_jax.assets import (
     load_splits,
 )
 from eslr_jax.assets.catalog import is_intact, list_assets
-from eslr_jax.assets.load import check_resolution
+from eslr_jax.assets.garments import check_resolution
 from eslr_jax.body.motion import Motion, pose_body, shape_body, still_motion
 from eslr_jax.cli.actor import is_moving_mesh, load_wearer
 from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError

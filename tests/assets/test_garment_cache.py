@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from garment_files import bundled, scanned_tshirt
 
-from eslr_jax.assets import cache, load, load_garment, load_garment_file
+from eslr_jax.assets import cache, garments, load_garment, load_garment_file
 from eslr_jax.assets.cache import cache_folder, cached_arrays, content_key
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.io.garment import write_garment_npz
@@ -29,8 +29,8 @@ def scan(tmp_path_factory, body):
 def test_second_load_computes_nothing(empty_cache, scan, body, monkeypatch):
     first = load_garment(scan, body=body)
     assert len(list(empty_cache.iterdir())) == 2
-    monkeypatch.setattr(load, "fit_garment", None)
-    monkeypatch.setattr(load, "prepare_garment", None)
+    monkeypatch.setattr(garments, "fit_garment", None)
+    monkeypatch.setattr(garments, "prepare_garment", None)
     again = load_garment(scan, body=body)
     for name in first.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
@@ -141,6 +141,6 @@ def test_a_doubtful_fit_is_told_with_every_load(empty_cache, tmp_path, body, mon
     np.savez(tmp_path / "tank.npz", positions=garment.rest_positions, faces=garment.faces)
     fitted = load_garment_file(tmp_path / "tank.npz", body=body)
     fitted.metadata["fit"]["warnings"] = ["the place is doubtful"]
-    monkeypatch.setattr(load, "load_garment_file", lambda *_, **__: fitted)
+    monkeypatch.setattr(garments, "load_garment_file", lambda *_, **__: fitted)
     with pytest.warns(UserWarning, match="tank.npz: the place is doubtful"):
         load_garment(tmp_path / "tank.npz", body=body)

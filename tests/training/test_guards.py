@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
-from eslr_jax.assets.load import load_model
+from eslr_jax.assets.models import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, NonFiniteError, Status
 from eslr_jax.graph.normalizer import WARMUP_UPDATES

@@ -1,0 +1,66 @@
+"""Load rigged bodies by name or by path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from eslr_jax.assets.catalog import find_asset
+from eslr_jax.assets.names import is_path, split_name, unknown_suffix
+from eslr_jax.body.motion import shape_body
+from eslr_jax.body.rig import make_body
+from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.validate import validate_body
+from eslr_jax.io.body import read_body
+from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, read_gltf_body
+from eslr_jax.io.smpl import is_smpl_model, read_smpl_body
+from eslr_jax.types import Body
+
+
+def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Sequence[float] = ()) -> Body:
+    """Load a rigged body; warn if the unit of its file is a guess.
+
+    Args:
+        name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
+            character (.gltf, .glb, .vrm), or an npz file in the bundled format. `FILE#MESH,MESH` picks
+            the meshes of a character that make up the body.
+        units: Unit of the file: m, dm, cm, mm, in, ft, or metres per unit; by default recognised.
+        betas: Shape coefficients [standard deviations] of a body with shapes, such as a SMPL model.
+
+    Raises:
+        AssetError: There is no such body, the file is damaged, or its unit is unknown.
+        ConfigError: The body has fewer shapes than betas, or a unit is given and it is always in metres.
+        MissingExtraError: The file needs an extra that is not installed.
+        MeshError: A body is inside out, or in the bundled format not closed.
+    """
+    body = _read_body(str(name), units)
+    return shape_body(body, betas) if len(betas) else body
+
+
+def _read_body(text: str, units: str | None) -> Body:
+    """Return a body by name or file, in its average shape."""
+    file, meshes = split_name(text)
+    suffix = Path(file).suffix.lower()
+    is_bundled = not is_path(text) or (suffix == ".npz" and not is_smpl_model(file))
+    if is_bundled and units is not None:
+        raise ConfigError(f"body {text} is in metres; leave out its unit")
+    if not is_path(text):
+        return _closed(read_body(find_asset("body", text)), text)
+    if suffix in GLTF_SUFFIXES:
+        return make_body(read_gltf_body(file, meshes), units=units)
+    if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
+        return make_body(read_smpl_body(file), units=units)
+    if suffix == ".npz":
+        return _closed(read_body(file), Path(file).name)
+    raise unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
+
+
+def _closed(body: Body, name: str) -> Body:
+    """Return the body if it has an inside; raise a MeshError if not."""
+    positions, faces, is_obstacle = (
+        np.asarray(leaf) for leaf in (body.rest_positions, body.faces, body.is_obstacle)
+    )
+    validate_body(positions, faces, is_obstacle, name=name)
+    return body

@@ -1,0 +1,177 @@
+"""Load motions by name or by path, carried over to a body."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from eslr_jax.assets.bodies import load_body
+from eslr_jax.assets.catalog import find_asset
+from eslr_jax.assets.names import is_path, split_name, unknown_suffix
+from eslr_jax.body.motion import Motion
+from eslr_jax.body.procedural import PROCEDURAL, make_procedural
+from eslr_jax.body.rig import make_motion, skeleton_motion
+from eslr_jax.body.timing import skip_start_pose
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.asf import read_amc
+from eslr_jax.io.bvh import read_bvh
+from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_motion
+from eslr_jax.io.motion import read_motion_archive
+from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.skeleton import Skeleton, SkeletonMotion
+from eslr_jax.io.smpl import read_amass, read_smpl_pickle
+from eslr_jax.types import Body
+
+DEFAULT_MOTION = "cmu_016_32"
+
+
+def load_motion(
+    name: str | Path = DEFAULT_MOTION,
+    *,
+    body: Body | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    up: Literal["auto", "y", "z"] = "auto",
+) -> Motion:
+    """Load a motion, for the bundled body or carried over to another one.
+
+    A T-pose before the motion of a file is skipped with a warning.
+
+    Args:
+        name: Name of a bundled clip, or turn, jump or swing, which are computed; or path of a motion: .bvh,
+            AMASS (.npz), HOOD or VTO (.pkl), an animated character (.gltf, .glb, .vrm), or an archive in
+            the bundled format. `FILE#CLIP` picks one of several clips.
+        body: The body that is to move; the bundled one by default.
+        joint_map: Changes to the map from the body's joints to the motion's; "" keeps a joint still.
+        up: Axis that points up in a BVH file; by default the one along which the figure stands.
+
+    Raises:
+        AssetError: There is no such motion, or the file is damaged.
+        MotionError: The file holds no usable motion, or none that this body can follow; or `up` is given for
+            another format.
+        MissingExtraError: The file needs an extra that is not installed.
+    """
+    text = str(name)
+    file, _, clip = text.partition("#")
+    is_bvh = Path(file).suffix.lower() == ".bvh"
+    if up != "auto" and not is_bvh:
+        raise MotionError(
+            f"motion {text} has its own up axis, which only a BVH file lacks; leave out --motion-up"
+        )
+    if text in PROCEDURAL:
+        if joint_map:
+            raise MotionError(f"{text} is computed from the body's own joints; leave out the map of joints")
+        return make_procedural(text, load_body() if body is None else body)
+    if _is_archived(text):
+        motion = _bundled_motion(text)
+        if body is None or (_is_made_for(motion, body, is_bundled=not is_path(text)) and not joint_map):
+            return motion
+        # An archive holds no skeleton, so that of the bundled body is used.
+        return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
+    whole = read_skeleton_motion(file, clip)
+    source, skipped = skip_start_pose(whole)
+    if skipped:
+        warnings.warn(skipped, stacklevel=2)
+    motion = make_motion(
+        source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
+    )
+    return dataclasses.replace(motion, start=(len(whole.positions) - len(source.positions)) / source.fps)
+
+
+def own_motion(body: str) -> str:
+    """Return the animation in a body's file, or a bundled walk if it has none."""
+    file, _ = split_name(body)
+    suffix = Path(file).suffix.lower()
+    if suffix in GLTF_SUFFIXES and gltf_clip_names(file):
+        return file
+    return DEFAULT_MOTION
+
+
+def motion_skeleton(name: str) -> Skeleton:
+    """Return the skeleton whose joints a body follows in a motion.
+
+    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body.
+
+    Args:
+        name: See `load_motion`.
+
+    Raises:
+        AssetError: There is no such motion, or the file is damaged.
+        MotionError: The motion is computed for every body, or it is for another skeleton than its archive has.
+        MissingExtraError: The file needs an extra that is not installed.
+    """
+    if name in PROCEDURAL:
+        raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
+    if _is_archived(name):
+        return skeleton_motion(_bundled_motion(name), load_body()).skeleton
+    file, _, clip = name.partition("#")
+    return read_skeleton_motion(file, clip).skeleton
+
+
+def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
+    """Read a motion with the skeleton of its file.
+
+    Args:
+        file: .bvh, .amc with its .asf, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
+        clip: Which of several animations.
+
+    Raises:
+        AssetError: The file is missing, damaged, or of an unknown kind.
+        MotionError: The file holds no usable motion.
+        MissingExtraError: The file needs an extra that is not installed.
+    """
+    suffix = Path(file).suffix.lower()
+    if suffix in GLTF_SUFFIXES:
+        return read_gltf_motion(file, clip)
+    readers = {".bvh": read_bvh, ".amc": read_amc, ".npz": read_amass, ".pkl": read_smpl_pickle}
+    if suffix not in readers:
+        raise unknown_suffix("motion", file, (*readers, *GLTF_SUFFIXES))
+    return readers[suffix](file)
+
+
+def _is_archived(text: str) -> bool:
+    """Tell a clip of the bundled format, by its name or in a user's archive, from a motion with its skeleton."""
+    file = text.partition("#")[0]
+    return not is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file))
+
+
+def _is_amass(file: str) -> bool:
+    """Tell an archive of AMASS from one in the bundled format."""
+    return "poses" in read_arrays(file, content="motion", names=("poses",))
+
+
+def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
+    """Tell whether a clip can move this body without retargeting; a user's archive by its joint names."""
+    if motion.joint_names != body.joint_names:
+        return False
+    rest = np.asarray(body.joint_rest_positions)
+    return not is_bundled or np.allclose(rest, np.asarray(load_body().joint_rest_positions), atol=1e-4)
+
+
+def _bundled_motion(text: str) -> Motion:
+    """Load a clip by name, or from an archive in the bundled format."""
+    if is_path(text):
+        file, _, clip = text.partition("#")
+        if not Path(file).exists():
+            raise AssetError(f"motion file {file} doesn't exist; check the path")
+        clips = _motion_archive(Path(file), Path(file).stat().st_mtime)
+        if not clip and len(clips) > 1:
+            raise MotionError(f"{file} holds {len(clips)} clips; name one, as in {file}#{next(iter(clips))}")
+        clip = clip or next(iter(clips))
+        if clip not in clips:
+            raise MotionError(f"{file} has no clip {clip!r}; it has {', '.join(clips)}")
+    else:
+        path, clip = find_asset("motion", text), text
+        clips = _motion_archive(path, path.stat().st_mtime)
+    return Motion(clip, *clips[clip])
+
+
+@lru_cache(maxsize=4)
+def _motion_archive(path: Path, modified: float):
+    del modified  # part of the key: a changed file is read again
+    return read_motion_archive(path)
