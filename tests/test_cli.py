@@ -268,8 +268,9 @@ def test_a_garment_is_fitted_to_a_shape_of_the_body(tmp_path, capsys):
 
 
 def test_no_iterations_are_those_of_a_network_alone():
+    from eslr_jax.cli.method import choose_method
     from eslr_jax.cli.options import Options
-    from eslr_jax.cli.simulate import _choose_method, simulate
+    from eslr_jax.cli.simulate import simulate
 
     usual = {name: option.default for name, option in inspect.signature(simulate).parameters.items()}
     options = Options(**{field.name: usual[field.name] for field in dataclasses.fields(Options)})
@@ -278,7 +279,7 @@ def test_no_iterations_are_those_of_a_network_alone():
         ({"iterations": 7}, ("physics", 7)),
         ({"iterations": 0, "simulator": "physics"}, ("physics", 0)),
     ):
-        method = _choose_method(dataclasses.replace(options, **given), (None, None), 1000, None)
+        method = choose_method(dataclasses.replace(options, **given), (None, None), 1000, None)
         assert (method.simulator, method.config.iterations) == expected
 
 

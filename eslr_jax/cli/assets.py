@@ -182,7 +182,7 @@ def _show_scene(
     from eslr_jax.assets.garments import check_resolution
     from eslr_jax.assets.models import DEFAULT_MODEL
     from eslr_jax.body.motion import pose_body
-    from eslr_jax.cli.simulate import BEHIND_NETWORK, ITERATIONS
+    from eslr_jax.cli.method import BEHIND_NETWORK, ITERATIONS
     from eslr_jax.config import SimConfig
     from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
     from eslr_jax.scene.plan import SceneOptions, prepare_scene

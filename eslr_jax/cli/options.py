@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from eslr_jax.errors import AssetError, ConfigError
 
@@ -81,17 +81,21 @@ def interrupted_record(
     }
 
 
-def read_interrupted(
-    out: Path, given: Options
-) -> tuple[Trajectory, Options, Choice | None, PairCapacity | None]:
+class Interrupted(NamedTuple):
+    """What an interrupted simulation goes on with."""
+
+    done: Trajectory  # the first frames
+    options: Options
+    choice: Choice | None  # what a budget or a tolerance led to
+    capacity: PairCapacity | None  # buffers of self-contact that sufficed
+
+
+def read_interrupted(out: Path, given: Options) -> Interrupted:
     """Read an interrupted simulation with its own options; a given option must agree with them.
 
     Args:
         out: Its folder.
         given: The options of this command.
-
-    Returns:
-        The frames that are done, the options, the simulator that was chosen, and the buffers of self-contact.
 
     Raises:
         AssetError: The folder holds no interrupted simulation.
@@ -124,7 +128,7 @@ def read_interrupted(
                 f"{out} was simulated with {name.replace('_', '-')} = {_text(own)}, not {_text(_plain(value))}; "
                 "leave out all options but --out to go on, or start in another folder without --resume"
             )
-    return done, options, choice, capacity
+    return Interrupted(done, options, choice, capacity)
 
 
 def check_same_scene(done: Trajectory, scene: Scene, out: Path) -> None:

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from eslr_jax.cli.actor import load_actor
-from eslr_jax.cli.budget import describe_load, parse_request
+from eslr_jax.cli.actor import Actor, load_actor
+from eslr_jax.cli.budget import describe_load
 from eslr_jax.cli.console import app, print_report, progress, say, use_compile_cache, waiting
 from eslr_jax.cli.interrupt import EXIT_CODE
+from eslr_jax.cli.method import Method, choose_method, expected_frame_ms, read_request
 from eslr_jax.cli.options import (
     DEFAULT_GARMENT,
+    Interrupted,
     Options,
     check_same_scene,
     interrupted_record,
@@ -27,15 +29,13 @@ from eslr_jax.cli.options import (
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
 
 if TYPE_CHECKING:
-    from eslr_jax.config import SimConfig
+    from jax import Array
+
     from eslr_jax.io.garment import GarmentFile
-    from eslr_jax.simulation.budget import Choice
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.types import BodyMotion, Scene, Trajectory
+    from eslr_jax.types import BodyMotion, Material, Scene, Trajectory
 
-ITERATIONS = 100  # of the solver alone: at 1k they leave a median gap of 0.002 %
-BEHIND_NETWORK = 10  # of the solver after a network
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
 _KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
 
@@ -155,21 +155,17 @@ def simulate(
         sys.exit(EXIT_CODE)
 
 
-class _Method(NamedTuple):
-    """How a scene is simulated: the options with their defaults filled in."""
+class _Setting(NamedTuple):
+    """What is simulated, and how."""
 
-    simulator: str  # "physics" or "network"
-    model: str | None
-    params: Any  # weights; None without a network
-    config: SimConfig
-    choice: Choice | None  # what a budget or a tolerance led to
-    budget_ms: float | None
-    tolerance: float | None
-
-    @property
-    def garment_options(self) -> dict[str, Any]:
-        """What the network asks of a garment."""
-        return getattr(self.config.model, "garment_options", {})
+    names: tuple[str, ...]  # of the garments
+    garments: list[GarmentFile]  # each of them as the body wears it
+    stored: GarmentFile  # all of them together
+    actor: Actor
+    material: Material
+    method: Method
+    settle: int  # frames before frame 0
+    scene: Scene  # with these frames
 
 
 def _simulate(
@@ -177,12 +173,37 @@ def _simulate(
 ) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report; from the first frames on, `stop` takes Ctrl-C."""
     from eslr_jax.io.atomic import ensure_output_dir
-    from eslr_jax.io.unfinished import NAME, write_unfinished
 
     use_compile_cache()
-    done, choice, capacity = None, None, None
-    if is_resumed:
-        done, options, choice, capacity = read_interrupted(out, options)
+    interrupted = read_interrupted(out, options) if is_resumed else None
+    options = options if interrupted is None else interrupted.options
+    _check_counts(options)
+    with waiting("preparing garment, body and motion"):
+        setting = _prepare(options, interrupted)
+        if interrupted is not None:
+            check_same_scene(interrupted.done, setting.scene, out)
+            setting = setting._replace(scene=setting.scene.replace(self_contact=interrupted.capacity))
+    out = ensure_output_dir(out)
+    _announce(options, setting)
+    done = None if interrupted is None else interrupted.done
+    simulation = _run(setting, done, stop)
+    timing, budget_ms = simulation.timing, setting.method.budget_ms
+    if timing.compile_s > _LONG:
+        say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
+    if budget_ms is not None and timing.frame_ms > _KEPT * budget_ms:
+        say(
+            f"missed --budget {options.budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells "
+            "what the scene costs, eslr calibrate what this machine can do"
+        )
+    report = _write(options, out, setting, simulation)
+    stop.end()
+    if has_pictures and report["interrupted_at"] is None and not stop.is_wanted:
+        _write_sheet(out, setting, simulation.trajectory.positions[setting.settle :])
+    return report
+
+
+def _check_counts(options: Options) -> None:
+    """Check the options that are counts."""
     if options.frames is not None and options.frames < 2:
         raise AssetError(f"--frames {options.frames}: a simulation needs two frames or more")
     if options.settle is not None and options.settle < 0:
@@ -190,95 +211,109 @@ def _simulate(
     if options.iterations is not None and options.iterations < 0:
         raise ConfigError(f"--iterations {options.iterations}: give a number, 0 or more")
 
+
+def _prepare(options: Options, interrupted: Interrupted | None) -> _Setting:
+    """Load garments, body and motion, choose how to simulate them, and begin to compile it."""
     import numpy as np
 
     from eslr_jax.assets import load_garment_file, prepare_stored
     from eslr_jax.assets.garments import check_resolution
-    from eslr_jax.body.motion import first_poses
-    from eslr_jax.body.timing import SETTLE_FRAMES, begins_at_rest, check_speed, with_settling
+    from eslr_jax.body.timing import SETTLE_FRAMES, check_speed, with_settling
     from eslr_jax.contact.nearest import MAX_APPROACH
-    from eslr_jax.evaluation.report import start_crossing
-    from eslr_jax.evaluation.words import describe_start
-    from eslr_jax.fabric import beyond_training, garment_material, worn_fabrics
+    from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import wear_together
-    from eslr_jax.fit.report import LARGE, describe_cost, describe_fit, describe_transfer
-    from eslr_jax.io.run import ClothTrack, scene_record, write_run
+    from eslr_jax.fit.report import describe_cost
     from eslr_jax.physics.air import blowing
-    from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-    from eslr_jax.simulation.simulate import (
-        Simulation,
-        begin_compiling,
-        good_frames,
-        last_frames,
-        raise_for_status,
-    )
+    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+    from eslr_jax.simulation.simulate import begin_compiling
 
-    request = _read_request(options)
+    request = read_request(options)
     names = options.garment or (DEFAULT_GARMENT,)
     check_resolution(names, options.vertices)
-    label = "+".join(names)
-    with waiting("preparing garment, body and motion"):
-        rig, poses, motion, motion_start = load_actor(options)
-        garments = [
-            load_garment_file(
-                name,
-                vertices=options.vertices,
-                body=rig,
-                on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
-            )
-            for name in names
-        ]
-        stored = wear_together(garments, names)
-        num_vertices = len(stored.rest_positions)
-        method = _choose_method(options, request, num_vertices, choice)
-        cloth = prepare_stored(stored, name=label, **method.garment_options)
-        material = garment_material(options.fabric, cloth, stored)
-        settle = options.settle
-        if settle is None:
-            settle = SETTLE_FRAMES if method.config.iterations else 0
-        settling = with_settling(poses, settle, rig)
-        integrator = options.integrator or ("bdf2" if method.config.iterations else "euler")
-        modelled = SceneOptions(
-            self_contact=wanted_self_contact(options),
-            has_folds=method.config.iterations > 0,
-            ground=options.ground,
-            has_skin=method.config.iterations > 0,
-            integrator=integrator,
-            substeps=options.substeps,
-            air=blowing(options.wind, options.gust),
-            damping=options.damping,
+    actor = load_actor(options)
+    garments = [
+        load_garment_file(
+            name,
+            vertices=options.vertices,
+            body=actor.rig,
+            on_source=lambda source: _say_if_any(describe_cost(len(source.mesh.positions))),
         )
-        begin = partial(
-            begin_compiling, method.params, config=method.config, is_paced=method.budget_ms is not None
-        )
-        scene = prepare_scene(cloth, settling, material=material, options=modelled, on_shapes=begin)
-        if scene.body is not None:
-            check_speed(
-                poses, MAX_APPROACH * options.substeps, vertices=np.asarray(scene.body.surface.vertex_ids)
-            )
-        if done is not None:
-            check_same_scene(done, scene, out)
-            scene = scene.replace(self_contact=capacity)
-    out = ensure_output_dir(out)
+        for name in names
+    ]
+    stored = wear_together(garments, names)
+    choice = None if interrupted is None else interrupted.choice
+    method = choose_method(options, request, len(stored.rest_positions), choice)
+    cloth = prepare_stored(stored, name="+".join(names), **method.garment_options)
+    material = garment_material(options.fabric, cloth, stored)
+    has_solver = method.config.iterations > 0
+    settle = options.settle
+    if settle is None:
+        settle = SETTLE_FRAMES if has_solver else 0
+    modelled = SceneOptions(
+        self_contact=wanted_self_contact(options),
+        has_folds=has_solver,
+        ground=options.ground,
+        has_skin=has_solver,
+        integrator=options.integrator or ("bdf2" if has_solver else "euler"),
+        substeps=options.substeps,
+        air=blowing(options.wind, options.gust),
+        damping=options.damping,
+    )
+    begin = partial(
+        begin_compiling, method.params, config=method.config, is_paced=method.budget_ms is not None
+    )
+    settling = with_settling(actor.poses, settle, actor.rig)
+    scene = prepare_scene(cloth, settling, material=material, options=modelled, on_shapes=begin)
+    if scene.body is not None:
+        vertices = np.asarray(scene.body.surface.vertex_ids)
+        check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
+    return _Setting(names, garments, stored, actor, material, method, settle, scene)
+
+
+def _announce(options: Options, setting: _Setting) -> None:
+    """Say what a person wants to know before the simulation begins."""
+    from eslr_jax.body.timing import begins_at_rest
+    from eslr_jax.evaluation.report import start_crossing
+    from eslr_jax.evaluation.words import describe_start
+    from eslr_jax.fabric import beyond_training
+    from eslr_jax.fit.report import LARGE, describe_fit, describe_transfer
+
+    method, stored, scene = setting.method, setting.stored, setting.scene
     # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
-    if method.model is not None and method.tolerance is None and (unseen := beyond_training(material)):
+    if (
+        method.model is not None
+        and method.tolerance is None
+        and (unseen := beyond_training(setting.material))
+    ):
         say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     crossing = start_crossing(scene, parts=(stored.face_parts, stored.part_names))
-    _say_if_any(describe_start(crossing, is_put_on=begins_at_rest(settle, rig)))
-    for name, worn in zip(names, garments, strict=True):
+    is_put_on = begins_at_rest(setting.settle, setting.actor.rig)
+    _say_if_any(describe_start(crossing, is_put_on=is_put_on))
+    for name, worn in zip(setting.names, setting.garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))
         if "transfer" in worn.metadata:
             say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
+    num_vertices = len(stored.rest_positions)
     if num_vertices >= LARGE:
-        say(describe_load(num_vertices, scene.num_frames, _expected_ms(method, num_vertices)))
-    whole, timing, scene = _run(method, scene, done, poses.positions.shape[0], stop)
-    if timing.compile_s > _LONG:
-        say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
+        say(describe_load(num_vertices, scene.num_frames, expected_frame_ms(method, num_vertices)))
+
+
+def _write(options: Options, out: Path, setting: _Setting, simulation: Simulation) -> dict[str, Any]:
+    """Write the good frames of a simulation, and what --resume needs if some are missing; return the report."""
+    from eslr_jax.body.motion import first_poses
+    from eslr_jax.fabric import worn_fabrics
+    from eslr_jax.io.run import ClothTrack, scene_record, write_run
+    from eslr_jax.io.unfinished import NAME, write_unfinished
+    from eslr_jax.scene.plan import first_frames
+    from eslr_jax.simulation.simulate import Simulation, good_frames, last_frames, raise_for_status
+
+    whole, scene = simulation.trajectory, simulation.scene
+    (rig, poses, motion, motion_start), stored = setting.actor, setting.stored
     kept, total, error = good_frames(whole), poses.positions.shape[0], None
-    count = kept.num_frames - settle
+    count = kept.num_frames - setting.settle
     try:
-        raise_for_status(whole, settle=settle)
+        raise_for_status(whole, settle=setting.settle)
     except EslrError as raised:
         if count < 2:
             raise
@@ -287,30 +322,27 @@ def _simulate(
     if is_unfinished:
         if count < 2:
             raise KeyboardInterrupt
-        write_unfinished(out, kept, interrupted_record(options, method.choice, scene.self_contact))
+        record = interrupted_record(options, setting.method.choice, scene.self_contact)
+        write_unfinished(out, kept, record)
         poses = first_poses(poses, count)
         scene = first_frames(scene, kept.num_frames)
     trajectory, scene = last_frames(kept, scene, count)
-    if method.budget_ms is not None and timing.frame_ms > _KEPT * method.budget_ms:
-        say(
-            f"missed --budget {options.budget}: a frame took {timing.frame_ms:.1f} ms; eslr info --scene tells "
-            "what the scene costs, eslr calibrate what this machine can do"
-        )
+    shown = Simulation(trajectory, simulation.timing, scene)
     with waiting("measuring"):
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
-            "garment": label,
+            "garment": "+".join(setting.names),
             "fabric": list(worn_fabrics(options.fabric, stored)) or ["cotton"],
             "motion": motion,
             "motion_start_s": motion_start,
             **scene_record(scene),
-            "settle": settle,
+            "settle": setting.settle,
             "wind_m_s": options.wind,
             "gust": options.gust,
             "damping_s": options.damping,
             "interrupted_at": last if is_unfinished else None,
             "error": error,
-            **_measure(method, Simulation(trajectory, timing, scene), poses, stored),
+            **_measure(setting.method, shown, poses, stored),
         }
     with waiting("writing files"):
         track = ClothTrack(trajectory.positions, trajectory.velocities, trajectory.friction_loads)
@@ -318,67 +350,21 @@ def _simulate(
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / NAME).unlink(missing_ok=True)
-    stop.end()
-    if has_pictures and not is_unfinished and not stop.is_wanted:
-        _write_sheet(out, np.asarray(trajectory.positions), stored, (rig, poses))
     return report
 
 
-def _read_request(options: Options) -> tuple[float | None, float | None]:
-    """Return the budget [ms] and the tolerance that the options ask for."""
-    is_chosen = options.simulator is None and options.model is None and options.iterations is None
-    if options.simulator == "physics" and options.model is not None:
-        raise ConfigError(f"--simulator physics has no network; leave out --model {options.model}")
-    return parse_request(options.budget, options.tolerance, is_chosen=is_chosen)
-
-
-def _choose_method(
-    options: Options, request: tuple[float | None, float | None], num_vertices: int, choice: Choice | None
-) -> _Method:
-    """Return how to simulate a garment of this size; `choice` is that of an interrupted run."""
-    from eslr_jax.assets import load_model
-    from eslr_jax.assets.models import DEFAULT_MODEL
-    from eslr_jax.config import SimConfig
-    from eslr_jax.simulation.budget import SOLVER, choose, read_calibration
-
-    simulator, model, iterations = options.simulator, options.model, options.iterations
-    budget_ms, tolerance = request
-    if choice is None and (budget_ms is not None or tolerance is not None):
-        choice = choose(read_calibration(), num_vertices, budget_ms=budget_ms, tolerance=tolerance)
-    if choice is not None:
-        simulator = "physics" if choice.method == SOLVER else "network"
-        model = None if choice.method == SOLVER else choice.method
-        iterations = choice.iterations
-    simulator = simulator or ("physics" if iterations and model is None else "network")
-    params, architecture = None, None
-    if simulator == "network":
-        model = model or DEFAULT_MODEL
-        params, architecture = load_model(model)
-    usual = ITERATIONS if architecture is None else BEHIND_NETWORK
-    config = SimConfig(
-        model=architecture,
-        iterations=usual if iterations is None else iterations,
-        tolerance=0.0 if choice is None else choice.tolerance,
-    )
-    return _Method(simulator, model, params, config, choice, budget_ms, tolerance)
-
-
-def _run(
-    method: _Method, scene: Scene, done: Trajectory | None, num_frames: int, stop: Interruption
-) -> Simulation:
+def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simulation:
     """Compile and simulate with progress; Ctrl-C ends it after the frames in work.
 
     Args:
-        method: How to simulate.
-        scene: With the frames in which the garment settles.
+        setting: What is simulated, and how.
         done: First frames of the scene, simulated before.
-        num_frames: Of the run, whose measures are compiled while its frames are.
         stop: Takes Ctrl-C over once the first frames are done.
     """
     from eslr_jax.simulation.budget import keep_budget
     from eslr_jax.simulation.simulate import simulate as run
 
-    pace = None
+    method, scene, pace = setting.method, setting.scene, None
     if method.choice is not None and method.budget_ms is not None:
         pace = keep_budget(method.choice, method.budget_ms)
     # The first frames compile; the bar counts the time.
@@ -389,7 +375,7 @@ def _run(
             stop.begin()  # before the first frames are done there is nothing to keep
 
         began = time.perf_counter()
-        _compile_measures(scene, num_frames)
+        _compile_measures(scene, setting.actor.poses.positions.shape[0])
         waited = time.perf_counter() - began
         simulation = run(
             method.params,
@@ -418,7 +404,7 @@ def _compile_measures(scene: Scene, num_frames: int) -> None:
 
 
 def _measure(
-    method: _Method, simulation: Simulation, poses: BodyMotion, stored: GarmentFile
+    method: Method, simulation: Simulation, poses: BodyMotion, stored: GarmentFile
 ) -> dict[str, Any]:
     """Return the part of the report that is measured, and with what."""
     import jax
@@ -454,35 +440,26 @@ def _measure(
     }
 
 
-def _expected_ms(method: _Method, num_vertices: int) -> float:
-    """Return what a frame is expected to take on this machine [ms]."""
-    from eslr_jax.simulation.budget import SOLVER, expected_ms, read_calibration
-
-    if method.choice is not None:
-        return method.choice.expected_ms
-    return expected_ms(read_calibration(), num_vertices, method.model or SOLVER, method.config.iterations)
-
-
 def _say_if_any(text: str | None) -> None:
     """Print a line on stderr, if there is one."""
     if text:
         say(text)
 
 
-def _write_sheet(out: Path, positions, stored: GarmentFile, actor) -> None:
+def _write_sheet(out: Path, setting: _Setting, positions: Array) -> None:
     """Render the contact sheet, garments of an outfit in their colours; without the extra `render` say so."""
     import numpy as np
 
     from eslr_jax.io.palette import outfit_colors
     from eslr_jax.render import contact_sheet, write_png
 
-    rig, poses = actor
+    rig, poses, stored = setting.actor.rig, setting.actor.poses, setting.stored
     try:
         with progress("rendering", 8) as advance:
             sheet = contact_sheet(
                 np.asarray(poses.positions),
                 np.asarray(poses.faces),
-                positions,
+                np.asarray(positions),
                 stored.faces,
                 vertex_colors=outfit_colors(list(stored.outfit.values())),
                 rest_positions=np.asarray(poses.rest_positions),
