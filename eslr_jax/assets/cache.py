@@ -35,6 +35,7 @@ _CODE = (
     "io/mesh.py",
     "io/gltf_document.py",
     "io/garment.py",
+    "io/parsing.py",
     "io/skeleton.py",
     "numerics.py",
     "types.py",

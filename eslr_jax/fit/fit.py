@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -90,11 +89,12 @@ def fit_garment(
     posture = postures[placement.posture]
     clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
     is_turned = _turned_faces(clean, posture)
-    sewn, vertex_map, face_source = clean.positions, clean.vertex_map, clean.face_source
+    sewn, face_source, lost = clean.positions, clean.face_source, []
+    vertex_map = clean.vertex_map if mesh.rows is None else clean.vertex_map[mesh.rows]
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
     if options.edge_length is not None:
-        _check_pins(source, options)
+        lost = _lost_pins(source, options)
         sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
         vertex_map, face_source = np.arange(len(sewn)), face_source[nearest]
     validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
@@ -111,7 +111,7 @@ def fit_garment(
     parts = None if mesh.face_parts is None else mesh.face_parts[face_source]
     file_pins = np.zeros(len(rest), bool)
     if source.is_pinned is not None and options.edge_length is None:
-        held = vertex_map[source.is_pinned]
+        held = clean.vertex_map[source.is_pinned]
         file_pins[held[held >= 0]] = True
     select = functools.partial(
         select_vertices,
@@ -145,15 +145,15 @@ def fit_garment(
                 "penetration": penetration,
                 "pinned": int(is_pinned.sum()),
                 "pinned_by": pinned_by,
-                "warnings": [*placement.warnings, *falling],
+                "warnings": [*placement.warnings, *lost, *falling],
                 **transfer,
             },
         },
     )
 
 
-def _check_pins(source: GarmentSource, options: FitOptions) -> None:
-    """Warn of pins by vertices of the file, which remeshing replaces.
+def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
+    """Return a warning of pins by vertices of the file, which remeshing replaces.
 
     Raises:
         ConfigError: They are asked for by number.
@@ -164,12 +164,12 @@ def _check_pins(source: GarmentSource, options: FitOptions) -> None:
             f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
             "a region or a loop"
         )
-    if not options.pin and source.is_pinned is not None and source.is_pinned.any():
-        warnings.warn(
-            f"{source.name}: the pins of the file are lost with edge_length, which replaces its vertices; name a "
-            "part, a region or a loop",
-            stacklevel=3,
-        )
+    if options.pin or source.is_pinned is None or not source.is_pinned.any():
+        return []
+    return [
+        "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "
+        "loop"
+    ]
 
 
 def _pin(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from eslr_jax.io.parsing import parsing
 
 POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an archive, first match
 MAX_FILE_BYTES = 1 << 30  # far more than any garment has
+_COMMENT = re.compile(r"(?:^|\s)#.*")  # behind a name, which may hold a #
+_FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +32,7 @@ class MeshFile:
     corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None  # texture coordinates of each face's corners
     face_parts: Int[np.ndarray, " faces"] | None = None  # index into part_names
     part_names: tuple[str, ...] = ()  # materials, or else groups, or else objects
+    rows: Int[np.ndarray, " rows"] | None = None  # vertex of each row of the file, where rows were shared
 
 
 def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
@@ -41,7 +45,8 @@ def read_mesh_file(path: str | Path) -> MeshFile:
     """Read a mesh without repairing it.
 
     Polygons are cut into triangles. OBJ, PLY and NPZ keep their vertices and order. In STL and GLB, which store a
-    vertex more than once, vertices at bit-identical positions become one.
+    vertex more than once, vertices at bit-identical positions become one; `rows` leads from the order of a GLB to
+    them. An STL has corners and no vertices: programs number them as here, by where they first appear.
 
     Args:
         path: Path of a .obj, .ply, .stl, .glb or .npz file.
@@ -51,7 +56,7 @@ def read_mesh_file(path: str | Path) -> MeshFile:
 
     Raises:
         AssetError: The file is missing, unreadable or of an unknown kind.
-        MeshError: A PLY file has faces that are not triangles.
+        MeshError: A PLY file has faces that are not triangles, or an OBJ file concave ones that can't be cut.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -70,10 +75,15 @@ def _read_obj(path: Path) -> MeshFile:
     positions: list[list[float]] = []
     uvs: list[list[float]] = []
     polygons: list[list[tuple[int, int]]] = []  # corners as (vertex, texture coordinate or -1)
+    lines: list[int] = []  # of the polygons
     names: dict[str, list[str]] = {"usemtl": [], "g": [], "o": []}
     current = dict.fromkeys(names, "")
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        key, rest = (*line.partition("#")[0].split(maxsplit=1), "", "")[:2]
+        key, rest = (*line.split(maxsplit=1), "", "")[:2]
+        if key in current:
+            current[key] = _COMMENT.sub("", rest).strip()
+            continue
+        rest = rest.partition("#")[0]
         if key == "v":
             positions.append([float(value) for value in rest.split()[:3]])
         elif key == "vt":
@@ -83,12 +93,14 @@ def _read_obj(path: Path) -> MeshFile:
             if len(polygon) < 3:
                 raise MeshError(f"{path}, line {number}: a face of {len(polygon)} vertices; remove it")
             polygons.append(polygon)
+            lines.append(number)
             for kind, chosen in names.items():
                 chosen.append(current[kind])
-        elif key in current:
-            current[key] = rest.strip()
     points = np.array(positions, np.float64).reshape(-1, 3)
-    triangles, owner = _cut_polygons(points, polygons)
+    starts = _fan_starts(points, polygons)
+    if (folded := np.flatnonzero(starts < 0)).size:
+        raise MeshError(f"{path}, line {lines[folded[0]]}: a concave face; triangulate the mesh")
+    triangles, owner = _cut_polygons(polygons, starts.tolist())
     faces = np.array(triangles, np.int64).reshape(-1, 3, 2)
     has_uvs = len(faces) > 0 and bool(np.all((faces[..., 1] >= 0) & (faces[..., 1] < len(uvs))))
     face_parts, part_names = _parts([[chosen[k] for k in owner] for chosen in names.values()])
@@ -113,20 +125,48 @@ def _from_zero(index: int, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
+def _fan_starts(points: np.ndarray, polygons: list[list[tuple[int, int]]]) -> np.ndarray:
+    """Return for each polygon the corner from which a fan of triangles covers it; -1 if every fan folds over.
+
+    Triangles look to the side of the polygon's area vector (Newell's). Quads are cut along their shorter diagonal
+    if both will do, other polygons from their first such corner.
+    """
+    starts = np.zeros(len(polygons), np.int64)
+    sizes = np.array([len(polygon) for polygon in polygons])
+    for size in np.unique(sizes[sizes > 3]):
+        rows = np.flatnonzero(sizes == size)
+        ids = np.array([[vertex for vertex, _ in polygons[row]] for row in rows])
+        is_known = (ids.min(axis=1) >= 0) & (ids.max(axis=1) < len(points))
+        is_known[is_known] = np.isfinite(points[ids[is_known]]).all(axis=(1, 2))
+        rows, ids = rows[is_known], ids[is_known]  # the others are refused later
+        corners = points[ids] - points[ids[:, :1]]
+        area = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
+        order = np.tile(np.arange(size), (len(rows), 1))
+        if size == 4:
+            diagonals = np.linalg.norm(corners[:, :2] - corners[:, 2:], axis=2)
+            order = order[:, :2] ^ (diagonals[:, 1] < diagonals[:, 0])[:, None]
+        starts[rows] = -1
+        for start in order.T:
+            spokes = np.take_along_axis(
+                corners, ((start[:, None] + np.arange(size)) % size)[..., None], axis=1
+            )
+            spokes = spokes[:, 1:] - spokes[:, :1]
+            normals = np.cross(spokes[:, :-1], spokes[:, 1:])
+            heights = np.einsum("ptx,px->pt", normals, area)
+            is_folded = heights.min(axis=1) < _FOLDED * np.einsum("px,px->p", area, area)
+            starts[rows] = np.where((starts[rows] < 0) & ~is_folded, start, starts[rows])
+    return starts
+
+
 def _cut_polygons(
-    points: np.ndarray, polygons: list[list[tuple[int, int]]]
+    polygons: list[list[tuple[int, int]]], starts: list[int]
 ) -> tuple[list[list[tuple[int, int]]], list[int]]:
-    """Cut polygons into triangles, quads along their shorter diagonal; return also each triangle's polygon."""
+    """Cut polygons into fans of triangles around their start corners; return also each triangle's polygon."""
     triangles, owner = [], []
-    for k, polygon in enumerate(polygons):
-        if len(polygon) == 4:
-            ids = [corner[0] for corner in polygon]
-            if min(ids) >= 0 and max(ids) < len(points):
-                lengths = np.linalg.norm(points[ids[:2]] - points[ids[2:]], axis=1)
-                if lengths[1] < lengths[0]:
-                    polygon = polygon[1:] + polygon[:1]
-        for i in range(1, len(polygon) - 1):
-            triangles.append([polygon[0], polygon[i], polygon[i + 1]])
+    for k, (polygon, start) in enumerate(zip(polygons, starts, strict=True)):
+        turned = polygon[start:] + polygon[:start]
+        for i in range(1, len(turned) - 1):
+            triangles.append([turned[0], turned[i], turned[i + 1]])
             owner.append(k)
     return triangles, owner
 
@@ -212,6 +252,7 @@ def _read_glb(path: Path) -> MeshFile:
         corner_uvs=np.concatenate(known)[faces] if len(known) == len(uvs) else None,
         face_parts=face_parts,
         part_names=part_names,
+        rows=place,
     )
 
 

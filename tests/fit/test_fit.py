@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 from garment_files import TO_Z_UP, bundled, dent, scanned_tshirt, source
 
 from eslr_jax.errors import ConfigError, MeshError
@@ -236,6 +237,23 @@ def test_fitted_garment_has_the_pins_of_file_and_options(body, shirt):
     assert fitted.metadata["fit"]["pinned"] == len(expected)
 
 
+def test_vertices_of_a_glb_are_counted_as_in_the_file(tmp_path, body, shirt):
+    corners = shirt.faces.ravel()  # each corner a vertex of its own, as of flat shading
+    flat = trimesh.Trimesh(
+        shirt.rest_positions[corners], np.arange(len(corners)).reshape(-1, 3), process=False
+    )
+    flat.export(tmp_path / "shirt.glb")
+    numbers = [4, 700, len(corners) - 1]
+    options = FitOptions(arms="rest", pin=(f"vertices:{','.join(map(str, numbers))}",))
+    fitted = fit_garment(read_garment_source(tmp_path / "shirt.glb"), body, options)
+    assert fitted.vertex_map is not None
+    assert len(fitted.vertex_map) == len(corners)
+    np.testing.assert_allclose(
+        fitted.sewn_positions[fitted.vertex_map], shirt.rest_positions[corners], atol=1e-6
+    )
+    assert set(np.flatnonzero(fitted.is_pinned)) == set(fitted.vertex_map[numbers])
+
+
 @pytest.mark.parametrize(("pin", "message"), [
     ("collar", "is not understood"),
     ("vertices:a", "whole numbers"),
@@ -293,8 +311,10 @@ def test_pins_that_remeshing_replaces_are_refused_or_told(body, shirt):
     with pytest.raises(ConfigError, match="counts vertices of the file, which edge_length replaces"):
         fit_garment(shirt_source, body, FitOptions(edge_length=0.03, pin=("vertices:0,5",)))
     held = dataclasses.replace(shirt_source, is_pinned=np.arange(len(shirt.rest_positions)) < 5)
-    with pytest.warns(UserWarning, match="the pins of the file are lost"):
-        fit_garment(held, body, FitOptions(edge_length=0.03))
+    fitted = fit_garment(held, body, FitOptions(edge_length=0.03))
+    assert any(
+        "the pins of the file are lost" in text for text in fitted.fit_warnings
+    )  # kept with the garment
 
 
 def test_vertices_too_deep_to_be_moved_out_are_counted_and_told(body, shirt):

@@ -85,6 +85,15 @@ def test_polygons_of_obj_are_cut_and_those_of_ply_named(tmp_path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 3 1 0\nv 0 1 0\nf 1 2 3 4\nf 1 2 3 4 4\n")
     faces = read_mesh(path)[1]
     assert faces.tolist() == [[1, 2, 3], [1, 3, 0], [0, 1, 2], [0, 2, 3], [0, 3, 3]]  # the shorter diagonal
+    path = tmp_path / "dart.obj"
+    corners = ["0 0 0", "0.4 2 0", "0 1 0", "-0.4 2 0", "-0.2 0.9 0", "0.2 0.9 0"]  # the third bends inwards
+    path.write_text("".join(f"v {corner}\n" for corner in corners) + "f 1 2 3 4\nf 2 3 4 1\nf 6 2 3 4 5\n")
+    faces = read_mesh(path)[1]
+    assert faces.tolist()[:4] == [[0, 1, 2], [0, 2, 3], [2, 3, 0], [2, 0, 1]]
+    assert faces.tolist()[4:] == [[2, 3, 4], [2, 4, 5], [2, 5, 1]]
+    path.write_text("v 0 0 0\nv 1 1 0\nv 3 0 0\nv 0 1.2 0\nf 1 3 2 4\n# a bow tie\nf 1 2 3 4\n")
+    with pytest.raises(MeshError, match="line 7: a concave face; triangulate the mesh"):
+        read_mesh(path)
     path = tmp_path / "edge.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nf 1 2\n")
     with pytest.raises(MeshError, match="line 3: a face of 2 vertices"):
@@ -109,6 +118,17 @@ def test_obj_texture_coordinates_and_parts(tmp_path):
     assert mesh.part_names == ("silk", "wool")
     assert mesh.face_parts.tolist() == [0, 1]
     assert mesh.corner_uvs.tolist() == [[[0, 0], [1, 0], [0, 1]], [[1, 0], [0.5, 0.5], [0, 1]]]
+
+
+def test_names_in_an_obj_may_hold_the_sign_of_comments(tmp_path):
+    path = tmp_path / "scarf.obj"
+    path.write_text(
+        "v 0 0 0 # first\nv 1 0 0\nv 0 1 0#third\nv 1 1 0\n"
+        "usemtl Fabric#1\nf 1 2 3\nusemtl Fabric#2 # the hem\nf 2 4 3#last\n"
+    )
+    mesh = read_mesh_file(path)
+    assert mesh.part_names == ("Fabric#1", "Fabric#2")
+    assert mesh.faces.tolist() == [[0, 1, 2], [1, 3, 2]]
 
 
 def test_glb_parts_and_texture_coordinates(tmp_path):
