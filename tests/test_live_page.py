@@ -96,7 +96,7 @@ def test_status_tells_time_and_the_gap_of_the_frame_that_is_shown(player, monkey
     for gap, tolerance, status in told:
         shown, verdict = status.split("gap below ")[1].split(" %: ")
         assert float(shown) == pytest.approx(gap, rel=0.051), "two digits"
-        kept = f"within {tolerance:g} % of the optimum"
+        kept = f"within a gap of {tolerance:g} %"
         assert verdict == (kept if gap <= tolerance else "stopped before the tolerance")
         assert float(status.split(" ms a frame")[0].split()[-1]) > 0
     assert len(told) >= 7
@@ -335,9 +335,9 @@ def test_page_keeps_up_or_is_exact(player, page):
     page.get_by_label("keep up with real time").uncheck()
     player.until(lambda: not player.live.controls["keep_up"].value, seconds=240)
     player.wait(12)
-    assert "within 1 % of the optimum" in player.live.controls["status"].content
+    assert "within a gap of 1 %" in player.live.controls["status"].content
     enter(page, "tolerance, %", 6.5)
-    player.until(lambda: "within 6.5 % of the optimum" in player.live.controls["status"].content, seconds=240)
+    player.until(lambda: "within a gap of 6.5 %" in player.live.controls["status"].content, seconds=240)
     bound = float(player.live.controls["status"].content.split("gap below ")[1].split(" %")[0])
     assert 0 < bound <= 6.5
     enter(page, "tolerance, %", 1)

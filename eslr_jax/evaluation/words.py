@@ -48,11 +48,10 @@ def _describe_tolerance(report: dict[str, Any], words: Words) -> None:
     """Say in how many frames a tolerance was kept."""
     tolerance, share = 100 * report["tolerance"], report["within_tolerance"]
     if share == 1.0:
-        words.good.append(f"within {tolerance:g} % of the optimum on every frame")
+        words.good.append(f"within a gap of {tolerance:g} % on every frame")
     else:
         words.warnings.append(
-            f"{100 * (1 - share):.1f} % of the frames ended before they were within "
-            f"{tolerance:g} % of the optimum"
+            f"{100 * (1 - share):.1f} % of the frames ended before they were within a gap of {tolerance:g} %"
         )
 
 

@@ -35,8 +35,8 @@ class Fabric:
     """What is measured of a fabric, as one isotropic sheet."""
 
     density: float  # [kg/m^2]
-    stretch_stiffness: float  # [N/m] tension per width and strain, at the start and along the first thread
-    bending_stiffness: float  # [J] at small curvature, along the first thread; ARCSim's convention is HOOD's
+    stretch_stiffness: float  # [N/m] tension per width and strain, at the start, along the stiffer thread
+    bending_stiffness: float  # [J] at small curvature, along the warp; ARCSim's convention is HOOD's
     what: str
     source: str
 
@@ -68,7 +68,8 @@ FABRICS: dict[str, Fabric] = {
         "for dress silk; stretch as the satin's",
     ),
 }
-"""Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain."""
+"""Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain,
+of stretch along the stiffer thread, of bending along the warp."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -353,7 +353,7 @@ def _tell(live: Live, cast: Cast, report: FrameReport, tolerance: float) -> None
     else:
         live.iterations = MOST_ITERATIONS
     exact = (
-        f"within {100 * tolerance:.3g} % of the optimum"
+        f"within a gap of {100 * tolerance:.3g} %"
         if keeps_tolerance(report.gap_bound, report.residual, tolerance)
         else "stopped before the tolerance"
     )

@@ -49,7 +49,7 @@ def test_cloth_in_its_place_is_good(worn):
     assert report["skin_through_mm"] == pytest.approx(0.0, abs=1e-3)
     words = describe_report(report)
     assert words.warnings == []
-    assert "within 1 % of the optimum on every frame" in words.good
+    assert "within a gap of 1 % on every frame" in words.good
     assert "no skin shows through the cloth" in words.good
 
 
