@@ -75,7 +75,6 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
     influences = max(garment.skin_weights.shape[1] for garment in garments)
     part_names, face_parts = _parts(garments, names)
     sewn = [g.rest_positions if g.sewn_positions is None else g.sewn_positions for g in garments]
-    has_uvs = all(garment.corner_uvs is not None for garment in garments)
     return GarmentFile(
         rest_positions=np.concatenate(placed),
         faces=np.concatenate([g.faces + start for g, start in zip(garments, starts, strict=True)]),
@@ -83,7 +82,7 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         skin_indices=_stack([garment.skin_indices for garment in garments], influences),
         is_pinned=np.concatenate([garment.is_pinned for garment in garments]),
         sewn_positions=np.concatenate(sewn),
-        corner_uvs=np.concatenate([g.corner_uvs for g in garments]) if has_uvs else None,  # type: ignore[misc]
+        corner_uvs=_stack_uvs(garments),
         face_parts=face_parts,
         part_names=part_names,
         metadata={
@@ -140,6 +139,15 @@ def _heights(
 def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:
     """Return tables below each other, with columns of zeros up to a width."""
     return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
+
+
+def _stack_uvs(garments: Sequence[GarmentFile]) -> Float[np.ndarray, "faces 3 2"] | None:
+    """Return the texture coordinates of garments below each other, zeros for one without; None without any."""
+    if all(garment.corner_uvs is None for garment in garments):
+        return None
+    return np.concatenate(
+        [np.zeros((len(g.faces), 3, 2)) if g.corner_uvs is None else g.corner_uvs for g in garments]
+    )
 
 
 def _own_parts(garment: GarmentFile, name: str) -> list[str]:

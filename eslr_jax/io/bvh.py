@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.parsing import parsing
-from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets
+from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets, whole_rate
 
 _CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
 
@@ -39,7 +39,8 @@ def read_bvh(path: str | Path) -> SkeletonMotion:
         path: Path of the file.
 
     Returns:
-        The motion at its own frame rate, in its own unit and axes.
+        The motion at its own frame rate, in its own unit and axes; a frame time of 0.0333333 s is a
+            thirtieth of a second.
 
     Raises:
         AssetError: The file is missing, or is not BVH; the message names the line.
@@ -51,7 +52,7 @@ def read_bvh(path: str | Path) -> SkeletonMotion:
         values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
     if not 1e-3 <= frame_time <= 1.0:
         raise MotionError(f"{file}: a frame time of {frame_time:g} s; expected 0.001 to 1")
-    return _pose(file.stem, joints, values, 1.0 / frame_time)
+    return _pose(file.stem, joints, values, whole_rate(1.0 / frame_time))
 
 
 class _Words:

@@ -43,7 +43,8 @@ def export_trajectory(
         path: Path of the file; of a new folder for `obj` and `ply`, which are one file per frame.
         garment: The garment that was simulated. It tells the vertex order of the garment's own file, so that a
             point cache lies on that file, and its texture coordinates. A vertex that the fit dropped is laid on
-            the next one of the file, and a warning tells of it where a point cache shows it.
+            the next one of the file, and a warning tells of it where a point cache shows it. So does one of an
+            outfit, whose garments stand in a point cache one after another.
         format: Format of the file; by default what the suffix of `path` says.
         content: What to write; by default both meshes to glb and usd, and the garment to all others.
 
@@ -67,7 +68,7 @@ def export_trajectory(
         raise AssetError("this run has no body; export the garment")
     check_meshes(meshes, run.timestep)
     if chosen in ("pc2", "mdd") and content == "garment" and garment is not None:
-        _warn_of_dropped(garment)
+        _warn_of_order(garment)
     if chosen in ("usd", "usda", "usdc"):
         if path.suffix.lower() != f".{chosen}":
             raise AssetError(f"{path}: USD goes by the name of its file; name it .{chosen}")
@@ -129,8 +130,15 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
     return {"garment": cloth, "body": body}
 
 
-def _warn_of_dropped(garment: GarmentFile) -> None:
-    """Warn if a point cache has places for vertices that are not simulated."""
+def _warn_of_order(garment: GarmentFile) -> None:
+    """Warn if a point cache does not lie on a garment's file, or has places for dropped vertices."""
+    if len(garment.outfit) > 1:
+        warnings.warn(
+            f"the cache holds {', '.join(garment.outfit)} one after another, as they are simulated, not as in "
+            "their files; lay it on a mesh of eslr export --format obj",
+            stacklevel=3,
+        )
+        return
     order = np.array([], int) if garment.vertex_map is None else garment.vertex_map
     if (count := int(np.sum(order < 0))) > 0:
         warnings.warn(
@@ -141,14 +149,15 @@ def _warn_of_dropped(garment: GarmentFile) -> None:
 
 
 def _garments(cloth: AnimatedMesh, outfit: dict[str, int]) -> list[AnimatedMesh]:
-    """Return the garments of an outfit as a mesh each, in a colour each."""
+    """Return the garments of an outfit as a mesh each, in a colour each; zeros are no texture coordinates."""
+    uvs = cloth.corner_uvs
     return [
         AnimatedMesh(
             name,
             cloth.positions[:, rows],
             cloth.faces[is_own] - rows.start,
             garment_color(number),
-            corner_uvs=None if cloth.corner_uvs is None else cloth.corner_uvs[is_own],
+            corner_uvs=None if uvs is None or not uvs[is_own].any() else uvs[is_own],
             velocities=None if cloth.velocities is None else cloth.velocities[:, rows],
         )
         for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, outfit))

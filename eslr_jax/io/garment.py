@@ -283,18 +283,30 @@ def in_outfit_order(
             By default they are cut out of the outfit.
 
     Raises:
-        MeshError: A garment has no mesh, or see `in_vertex_order`.
+        MeshError: A garment has no mesh or several, or see `in_vertex_order`.
     """
     if len(sequences) == 1:
         return in_vertex_order(sequences[0], outfit)
     garments = garments or _cut_apart(outfit)
-    meshes = {_COPY.sub("", sequence.mesh): sequence for sequence in sequences}
-    if missing := [name for name in garments if name not in meshes]:
+    meshes = {name: _meshes_of(name, sequences) for name in garments}
+    if missing := [name for name, found in meshes.items() if not found]:
+        known = ", ".join(sequence.mesh for sequence in sequences)
         raise MeshError(
-            f"{sequences[0].name} is one of the meshes {', '.join(meshes)}, and none is called "
+            f"{sequences[0].name} is one of the meshes {known}, and none is called "
             f"{' or '.join(missing)}; give every mesh the name of its garment, or score a single one as FILE#NAME"
         )
-    return np.concatenate([in_vertex_order(meshes[name], worn) for name, worn in garments.items()], axis=1)
+    if doubled := [name for name, found in meshes.items() if len(found) > 1]:
+        known = ", ".join(sequence.mesh for sequence in meshes[doubled[0]])
+        raise MeshError(
+            f"{sequences[0].name}: the meshes {known} may all be {doubled[0]}; give one of them its name"
+        )
+    return np.concatenate([in_vertex_order(meshes[name][0], worn) for name, worn in garments.items()], axis=1)
+
+
+def _meshes_of(name: str, sequences: Sequence[MeshSequence]) -> list[MeshSequence]:
+    """Return the meshes of a garment's name, or else those that Blender numbered because it was taken."""
+    exact = [sequence for sequence in sequences if sequence.mesh == name]
+    return exact or [sequence for sequence in sequences if _COPY.sub("", sequence.mesh) == name]
 
 
 def _cut_apart(outfit: GarmentFile) -> dict[str, GarmentFile]:

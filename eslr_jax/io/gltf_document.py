@@ -19,12 +19,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.skeleton import MAX_FRAMES
+from eslr_jax.io.skeleton import MAX_FRAMES, whole_rate
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TRIANGLES = 4  # mode of a primitive
+MOVES = ("translation", "rotation", "scale")  # what animations change of a node
 _UNEVEN = 0.05  # of the usual step between keys, by which steps may differ from its multiples
 _MAX_BLANK = 1 << 22  # elements of an accessor that has no data behind it
 _READ_EXTENSIONS = {  # that change nothing here, or are read
@@ -249,7 +250,7 @@ class GltfDocument:
         return result
 
     def key_frames(
-        self, animation: dict[str, Any], paths: Sequence[str] = ("translation", "rotation", "scale")
+        self, animation: dict[str, Any], paths: Sequence[str] = MOVES
     ) -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
         """Return (node, path, interpolation, times [s], values) of each channel that animates these paths."""
         samplers = animation.get("samplers", [])
@@ -285,18 +286,22 @@ class GltfDocument:
     def sample_times(self, inputs: list[np.ndarray], fps: float | None = None) -> tuple[np.ndarray, float]:
         """Return evenly spaced times over all keys [s], and their rate.
 
-        The rate is by default that of the densest keys. Keys set by hand have none: they are sampled 30 times a
-        second, or up to 120 times where two are nearer.
+        The rate is by default that of the densest keys, whose times are rounded. Keys set by hand have none: they
+        are sampled 30 times a second, or up to 120 times where two are nearer.
         """
         start, end = min(times[0] for times in inputs), max(times[-1] for times in inputs)
         steps = [np.diff(times) for times in inputs if len(times) > 1]
+        measured = fps
         if fps is None:
-            usual = min((float(np.median(own)) for own in steps), default=1 / 30)
-            fps = float(np.clip(1.0 / usual, 1.0, 1000.0))
-            multiples = [own / usual for own in steps]
-            if any(np.any(np.abs(m - np.maximum(np.round(m), 1)) > _UNEVEN) for m in multiples):
-                fps = float(np.clip(1.0 / min(own.min() for own in steps), 30.0, 120.0))
-        count = np.floor((end - start) * fps + 1e-3) + 1
+            own = np.concatenate(steps) if steps else np.array([1 / 30])
+            usual = min((float(np.median(each)) for each in steps), default=1 / 30)
+            multiples = np.maximum(np.round(own / usual), 1.0)
+            if np.any(np.abs(own / usual - multiples) > _UNEVEN):
+                measured = float(np.clip(1.0 / own.min(), 30.0, 120.0))
+            else:
+                measured = float(np.clip(multiples.sum() / own.sum(), 1.0, 1000.0))
+            fps = whole_rate(measured)
+        count = np.floor((end - start) * measured + 1e-3) + 1
         if not count <= MAX_FRAMES:
             raise self.fail(f"has an animation of {end - start:.3g} s")
         return start + np.arange(int(count)) / fps, fps

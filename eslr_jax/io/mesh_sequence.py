@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.io.gltf_document import GltfDocument, sample_keys
+from eslr_jax.io.gltf_document import MOVES, GltfDocument, sample_keys
 from eslr_jax.io.mesh import POSITION_KEYS, read_mesh, shared_vertices
 from eslr_jax.io.motion import read_number
 from eslr_jax.io.npz import check_layout, read_arrays
 from eslr_jax.io.parsing import parsing
-from eslr_jax.io.skeleton import MAX_FRAMES
+from eslr_jax.io.skeleton import MAX_FRAMES, whole_rate
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
 SUFFIXES = (".obj", ".ply")
@@ -109,7 +109,7 @@ def _read_archive(path: Path, fps: float | None) -> MeshSequence:
         rate = read_number(arrays["fps"], f"{path}: fps")
     elif rate is None and "timestep" in arrays:
         step = read_number(arrays["timestep"], f"{path}: timestep")
-        rate = 1.0 / step if step > 0 else 0.0
+        rate = whole_rate(1.0 / step) if step > 0 else 0.0
     return MeshSequence(path.name, positions.astype(np.float64), faces, DEFAULT_FPS if rate is None else rate)
 
 
@@ -171,6 +171,7 @@ def _read_gltf(path: Path, name: str, fps: float | None) -> list[MeshSequence]:
                 f"{path}: no mesh{name and f' named {name!r}'} is moved by shapes; it has {known}; export the "
                 "garment with its shape keys"
             )
+        _check_one_clip(document, chosen)
         at, rate = document.sample_times([shapes[node][3] for node in chosen], fps)
         moves = [key for entry in animations for key in document.key_frames(entry)]
         moved = {
@@ -186,6 +187,25 @@ def _read_gltf(path: Path, name: str, fps: float | None) -> list[MeshSequence]:
             label = path.name if len(found) == 1 else f"{path.name}#{found[node]}"
             sequences.append(MeshSequence(label, positions, faces, rate, found[node]))
         return sequences
+
+
+def _check_one_clip(document: GltfDocument, nodes: list[int]) -> None:
+    """Raise an AssetError if several animations give a mesh, or what carries it, the same values.
+
+    Animations of other nodes, such as a character's, may be as many as they like.
+    """
+    carriers = set()
+    for node in nodes:
+        while node >= 0 and node not in carriers:
+            carriers.add(node)
+            node = document.parents[node]
+    clips = [
+        {key[:2] for key in document.key_frames(entry, (*MOVES, "weights")) if key[0] in carriers}
+        for entry in document.items("animations")
+    ]
+    clips = [keyed for keyed in clips if keyed]
+    if sum(map(len, clips)) > len(set().union(*clips)):
+        raise AssetError(f"{document.path} holds {len(clips)} clips; export one")
 
 
 def _moved_by_shapes(

@@ -15,6 +15,13 @@ from eslr_jax.errors import AssetError, MotionError
 MAX_JOINTS = 4096  # more than any character has; a damaged file may claim more
 MAX_FRAMES = 1 << 20  # nine hours at 30 frames per second
 MAX_POSES = 1 << 23  # frames times joints: half a gigabyte of matrices
+_ROUNDED = 2e-4  # share of a frame rate that rounded times lose; 29.97 is five times as far from 30
+
+
+def whole_rate(rate: float) -> float:
+    """Return a frame rate [1/s] measured from rounded times: a whole number if it misses one by little."""
+    nearest = float(np.round(rate))
+    return nearest if abs(rate - nearest) < _ROUNDED * rate else rate
 
 
 @dataclasses.dataclass(frozen=True)

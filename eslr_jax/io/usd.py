@@ -18,6 +18,7 @@ from eslr_jax.io.animated import AnimatedMesh, check_meshes, vertex_normals
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.color import srgb_to_linear
 from eslr_jax.io.palette import Color
+from eslr_jax.io.skeleton import whole_rate
 from eslr_jax.io.skin import Skin, corrections, influences, local_motion
 
 SUFFIXES = (".usd", ".usda", ".usdc")
@@ -32,8 +33,8 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
     Args:
         path: Path of the file; `.usda` is text, `.usd` and `.usdc` are binary.
         meshes: Meshes with the same number of frames.
-        timestep: Time between frames [s]. A rate within 0.1 % of a whole number is that number: 1/30 s in float32
-            is exactly 30 frames per second.
+        timestep: Time between frames [s]. A rate that rounding keeps from a whole number is that number:
+            1/30 s in float32 is exactly 30 frames per second.
 
     Raises:
         MissingExtraError: The extra is not installed.
@@ -47,8 +48,7 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
     if Path(path).suffix.lower() not in SUFFIXES:
         raise AssetError(f"can't write {path} as USD; name it one of {', '.join(SUFFIXES)}")
     check_meshes(meshes, timestep)
-    rate = 1.0 / timestep
-    rate = float(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else rate
+    rate = whole_rate(1.0 / timestep)
     with atomic_write(path) as temporary:
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)

@@ -12,6 +12,7 @@ from eslr_jax.errors import MeshError
 from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.fabric import garment_material, worn_fabrics
 from eslr_jax.fit.outfit import LAYER_GAP, combine_garments
+from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.materials import fabric_material
 
@@ -81,6 +82,19 @@ def test_a_fabric_of_one_garment_leaves_the_others_theirs():
         expected = fabric_material(fabric).lame_mu
         assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
     assert worn_fabrics(("denim",), outfit) == ("denim",)
+
+
+def test_a_textured_garment_keeps_its_warp_beside_one_without_texture():
+    inner, outer = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
+    assert combine_garments([inner, outer], ["skirt", "top"]).corner_uvs is None
+    corners = outer.rest_positions[outer.faces]
+    turned = dataclasses.replace(outer, corner_uvs=corners[:, :, [1, 0]])  # v along x
+    outfit = combine_garments([inner, turned], ["skirt", "top"])
+    garment = prepare_stored(outfit, cache=False)
+    warp = warp_directions(garment, outfit.corner_uvs)
+    own = warp_directions(prepare_stored(turned, cache=False), turned.corner_uvs)
+    np.testing.assert_allclose(warp[len(inner.faces) :], own, atol=1e-5)
+    np.testing.assert_allclose(warp[: len(inner.faces)], warp_directions(garment)[: len(inner.faces)])
 
 
 def test_a_garment_is_worn_once():

@@ -6,6 +6,7 @@ from broken import refuses
 from formats import write_bvh
 from scipy.spatial.transform import Rotation
 
+from eslr_jax.body.retarget import count_resampled
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.skeleton import Skeleton, SkeletonMotion, chain_positions
 
@@ -45,6 +46,16 @@ def test_a_small_file_by_hand(tmp_path):
     np.testing.assert_allclose(motion.positions[1], [[5, 6, 7], [-5, 6, 7]], atol=1e-12)
     turn = Rotation.from_euler("z", 90, degrees=True) * Rotation.from_euler("y", 90, degrees=True)
     np.testing.assert_allclose(motion.rotations[1, 1], turn.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "fps"), [("0.0333333", 30), ("0.008333", 120), ("0.033367", 1 / 0.033367)])
+def test_a_rounded_frame_time_loses_no_frame(tmp_path, time, fps):
+    head, _ = SMALL.split("MOTION")
+    rows = "0 0 0 0 0 0 0 0 0\n" * 300
+    (tmp_path / "long.bvh").write_text(f"{head}MOTION\nFrames: 300\nFrame Time: {time}\n{rows}")
+    motion = read_bvh(tmp_path / "long.bvh")
+    assert motion.fps == fps  # 29.97 is a rate of its own
+    assert count_resampled(300, motion.fps, round(fps)) == 300
 
 
 def test_cmu_clip_has_rigid_bones_and_a_person_of_plausible_size():

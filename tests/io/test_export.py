@@ -332,6 +332,14 @@ def test_garments_of_an_outfit_are_meshes_of_their_own_colours(tmp_path, run):
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}"))
         np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get(2)), run.positions[2] + moved, atol=1e-6)
     assert len(read_points(export_trajectory(worn, tmp_path / "a.npz", garment=stored))) == FRAMES
+    with pytest.warns(UserWarning, match="holds pants, tshirt one after another"):
+        export_trajectory(worn, tmp_path / "a.pc2", garment=stored)
+    uvs = np.zeros((len(faces), 3, 2))
+    uvs[len(run.faces) :] = 0.5  # of the shirt alone
+    textured = replace(stored, corner_uvs=uvs)
+    document = gltf.GLTF2().load(str(export_trajectory(worn, tmp_path / "b.glb", garment=textured)))
+    parts = [mesh.primitives[0].attributes.TEXCOORD_0 is not None for mesh in document.meshes]
+    assert parts == [False, True]
 
 
 def read_points(path):

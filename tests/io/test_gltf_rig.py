@@ -128,6 +128,10 @@ def test_the_simple_skin_of_the_gltf_samples():
         ([np.array([0.0, 0.5, 0.51, 2.0])], 100.0, 201),
         ([np.array([0.0, 0.5, 0.501, 2.0])], 120.0, 241),
         ([np.array([1.0])], 30.0, 1),
+        ([(np.arange(3000) / 30).astype(np.float32)], 30.0, 3000),  # rounded times
+        ([np.round(np.arange(300) / 30, 4)], 30.0, 300),
+        ([0.033333 * np.arange(300)], 30.0, 300),
+        ([(np.arange(3000) / 29.97).astype(np.float32)], 29.97, 3000),
     ],
 )
 def test_animations_are_sampled_by_their_keys(keys, fps, count):

@@ -165,6 +165,23 @@ def test_one_of_several_moving_meshes_of_a_glb_is_named(tmp_path):
         read_mesh_sequence(tmp_path / "body.glb")
 
 
+def test_several_clips_of_a_mesh_that_shapes_move_are_refused(tmp_path):
+    write_shapes(tmp_path / "a.glb", "shirt")
+    document = gltf.GLTF2().load(str(tmp_path / "a.glb"))
+    whole, nodes = document.animations[0], document.nodes
+    of_body = [channel for channel in whole.channels if nodes[channel.target.node].name != "shirt"]
+    assert 0 < len(of_body) < len(whole.channels)
+    document.animations.append(gltf.Animation(channels=of_body, samplers=whole.samplers))
+    document.save(str(tmp_path / "a.glb"))
+    assert len(read_mesh_sequence(tmp_path / "a.glb").positions) == len(
+        MOVING
+    )  # the body has two, the shirt one
+    document.animations[1] = whole
+    document.save(str(tmp_path / "a.glb"))
+    with pytest.raises(AssetError, match=r"a\.glb holds 2 clips; export one"):
+        read_mesh_sequence(tmp_path / "a.glb")
+
+
 def test_meshes_of_a_glb_are_read_together(tmp_path):
     write_shapes(tmp_path / "a.glb", "shirt", "skirt", turn=90.0)
     sequences = read_mesh_sequences(tmp_path / "a.glb")
@@ -219,10 +236,14 @@ def test_garments_worn_together_are_found_by_the_names_of_their_meshes():
     np.testing.assert_array_equal(in_outfit_order([straight, skirt], outfit), moved)
     whole = MeshSequence("a.npz", moved, outfit.faces, 30.0)
     np.testing.assert_array_equal(in_outfit_order([whole], outfit), moved)
-    with pytest.raises(MeshError, match="meshes top, skirt, and none is called trousers"):
+    with pytest.raises(MeshError, match=r"meshes top\.001, skirt, and none is called trousers"):
         in_outfit_order([top, skirt], outfit_of("trousers", "top"))
     with pytest.raises(MeshError, match="its vertices have another order"):
         in_outfit_order([top, skirt], outfit)
+    np.testing.assert_array_equal(in_outfit_order([top, skirt, straight], outfit), moved)  # the exact name
+    copies = [MeshSequence("a.glb", MOVING, FACES, 30.0, f"top.00{number}") for number in (1, 2)]
+    with pytest.raises(MeshError, match=r"the meshes top\.001, top\.002 may all be top"):
+        in_outfit_order([skirt, *copies], outfit)
 
 
 def test_quads_cut_along_the_other_diagonal_are_the_same_mesh():
