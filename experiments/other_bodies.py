@@ -98,7 +98,7 @@ def proportioned(
 def posed(mesh: RiggedMesh, arm_angle: float) -> RiggedMesh:
     """Return a body that rests with its arms lifted by an angle [degrees], as a T-pose does."""
     body = make_body(mesh)
-    poses = pose_body(body, still_motion(body, 1, arm_angle=arm_angle), arm_abduction=0.0)
+    poses = pose_body(body, still_motion(body, 1, arm_angle=arm_angle))
     transforms = np.asarray(poses.joint_transforms[0], np.float64)
     rest = mesh.skeleton.rest_positions
     places = np.einsum("jxy,jy->jx", transforms[:, :, :3], rest) + transforms[:, :, 3]
@@ -321,7 +321,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
     surface = obstacle_surface(body)  # bodies of one topology then share a program
     options = SceneOptions(has_skin=True, integrator="bdf2", ground="off")
-    still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames), arm_abduction=0.0)
+    still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames))
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
     for name, cloth in zip(garments, cloths, strict=True):
         is_real = np.asarray(cloth.vertex_mask)

@@ -20,6 +20,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import starting_capacity
@@ -111,7 +112,7 @@ def main() -> None:
         **{name: jnp.full(shirt.faces.shape[0], getattr(COTTON, name)) for name in ("lame_mu", "lame_lambda")}
     )
     scene = prepare_scene(shirt, poses)
-    still = pose_body(body, still_motion(body, frames), num_frames=frames)
+    still = pose_body(body, still_motion(body, frames, arm_angle=ARM_ABDUCTION), num_frames=frames)
     dress = partial(prepare_scene, load_garment("dress", vertices=arguments.vertices), poses)
     # Each pair is built when its turn comes; the smoke run takes the first.
     pairs: dict[str, Callable[[], Pair]] = {

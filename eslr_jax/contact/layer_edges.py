@@ -44,8 +44,9 @@ def with_edges(
     """Return pairs of vertices and faces, followed by pairs of edges that cross.
 
     Pairs of vertices and faces don't keep two edges apart. The edges around each vertex are tested against the
-    three edges of the face that it is paired with, and take the side of that pair. Pairs of edges with the least
-    height are kept, half as many as there are rows of vertices and faces, so no buffer can overflow.
+    three edges of the face that it is paired with, and take the side of that pair. There are half as many rows of
+    edges as of vertices and faces. They hold the pairs with the least height; pairs beyond them are left out, and
+    no status tells it. So larger buffers can hold more pairs of edges.
 
     Args:
         position: Vertices at t [m], shape [vertices, 3].

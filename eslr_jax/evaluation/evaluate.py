@@ -109,7 +109,7 @@ def evaluate(
             scenes.append({"garment": garment, "clip": clip, **free})
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
-        resting = prepare_scene(cloth, pose_body(body, still, arm_abduction=0.0), surface=surface)
+        resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
         drifts[garment] = _drift(params, resting, config)
     return {
         "split": None if options.clips else options.split,

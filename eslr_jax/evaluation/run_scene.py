@@ -7,6 +7,7 @@ import numpy as np
 
 from eslr_jax.assets import prepare_stored
 from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.surface import prepare_surface
@@ -48,22 +49,33 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         garment: Its garment, see `run_garment`.
         material: Its fabric.
         has_contact: Model what the cloth met; without it energies of the cloth alone are cheaper.
+
+    Raises:
+        ConfigError: The run had energies of its own, which no file holds.
     """
+    if has_contact and run.report.get("own_energies"):
+        raise ConfigError(
+            f"{run.name} was simulated with energies of its own, which its files don't hold; score its positions "
+            "in the scene that was simulated: evaluation.score.score_trajectory"
+        )
+    usual, stored = constants_for(material), run.report.get("constants", {})
+    constants = usual.replace(**{name: stored[name] for name in vars(usual) if name in stored})
     trajectory = run.trajectory
     positions, velocities = jnp.asarray(trajectory.positions), jnp.asarray(trajectory.velocities)
     body = None
     if has_contact and trajectory.body is not None and len(trajectory.body.contact_faces):
         track = trajectory.body
         surface = prepare_surface(track.rest_positions, track.contact_faces, boundary=track.contact_boundary)
-        has_skin = bool(run.report.get("skin_contacts"))
-        body = SceneBody(surface, jnp.asarray(track.positions)[:, surface.vertex_ids], has_skin=has_skin)
+        has_skin, has_tips = (bool(run.report.get(name)) for name in ("skin_contacts", "tips"))
+        places = jnp.asarray(track.positions)[:, surface.vertex_ids]
+        body = SceneBody(surface, places, has_skin=has_skin, has_tips=has_tips)
     has_layers = has_contact and bool(run.report.get("self_contact"))
     has_pieces = run.report.get("self_contact") == "pieces"
     start = initial_state(positions[0], velocities[0]).replace(frame=jnp.int32(run.report.get("settle", 0)))
     return Scene(
         garment=garment,
         material=material,
-        constants=constants_for(material),
+        constants=constants,
         initial_state=start_integrator(start, run.report.get("integrator", "euler")),
         timestep=jnp.float32(trajectory.timestep),
         body=body,

@@ -17,6 +17,7 @@ from eslr_jax.physics.preconditioner import solve_stiffness, stretched_stiffness
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.network import predict
+from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import BodyMotion, Scene
 
@@ -110,7 +111,7 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
             (guess,),
         ),
         "whole frame": (
-            lambda state: stepper(frame_problem(scene, state, inputs), state)[0],
+            lambda state: step_frame(stepper, scene, state, inputs)[0],
             (state,),
         ),
     }

@@ -78,7 +78,8 @@ def score_trajectory(
         scene = scene.replace(self_contact=PairCapacity(pairs=room))
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
-    trajectory = with_energies(trajectory, scene)
+    before = trajectory
+    trajectory = with_energies(before, scene)
     if scene.self_contact is not None:
         pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
         if pairs > room:
@@ -93,7 +94,8 @@ def score_trajectory(
     if poses is not None:
         skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
         report |= wear_report(positions, scene.garment, skinned, poses, parts=parts)
-    ends = jax.device_get(trajectory_gap(trajectory, scene, every=every))
+    # BDF2 goes on by the residuals, if they are known; here as in the energies.
+    ends = jax.device_get(trajectory_gap(before, scene, every=every))
     is_face = np.asarray(scene.garment.rest_areas) > 0
     stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))[:, is_face]
     return report | {

@@ -92,6 +92,9 @@ def scene_record(scene: Scene) -> dict[str, Any]:
         "integrator": "euler" if scene.initial_state.past is None else "bdf2",
         "substeps": scene.substeps,
         "skin_contacts": scene.body is not None and scene.body.has_skin,
+        "tips": scene.body is not None and scene.body.has_tips,
+        "constants": {name: float(value) for name, value in vars(scene.constants).items()},
+        "own_energies": len(scene.energies),
         "ground_m": None if scene.ground is None else float(scene.ground),
     }
 

@@ -131,9 +131,15 @@ def minimize(
             gradient = jax.lax.dynamic_update_slice(gradient, part, (axis * part.size,))
         return value, gradient
 
+    def is_at_rest(state: _State) -> Array:
+        # Cloth that does not move gains less than the rounding of its energy, with either sign.
+        most = jnp.maximum(jnp.abs(stop.reference - state.value), _CAUTION * state.decrement)
+        return most <= _rounding(state.value)
+
     def is_running(state: _State) -> Array:
         is_above = product(state.gradient, state.gradient) > 0
         is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
+        is_far = is_far & ~((stop.tolerance > 0) & is_at_rest(state))
         is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
         return is_going | (state.iterations < 0)
 
@@ -173,6 +179,7 @@ def minimize(
     gain = stop.reference - final.value
     share = _CAUTION * final.decrement / jnp.where(gain > 0, gain, 1.0)
     gap_bound = jnp.where(gain > 0, jnp.sqrt(share), jnp.inf)
+    gap_bound = jnp.where(is_at_rest(final), 0.0, gap_bound)
     return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations, gap_bound)
 
 
@@ -182,6 +189,11 @@ def unknown_point(position: Float[Array, "vertices 3"]) -> Point:
     As the previous point of its own position it adds nothing to the history: the step has no length.
     """
     return Point(position, jnp.full((), jnp.inf, position.dtype), jnp.zeros_like(position))
+
+
+def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
+    """Return by how much an energy may differ from itself, computed in another order [J]."""
+    return 4 * jnp.finfo(value.dtype).eps * jnp.abs(value)
 
 
 def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:
@@ -238,7 +250,7 @@ def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, sl
         The point, its value and its gradient, and whether it is another point than before.
     """
     is_first = state.iterations < 0
-    slack = 4 * jnp.finfo(state.x.dtype).eps * jnp.abs(state.value)
+    slack = _rounding(state.value)
 
     def is_wanting(carry):
         size, trials, _, value, _ = carry

@@ -112,19 +112,21 @@ def _pattern(garment: Garment) -> tuple[Int[Array, "slots vertices"], Int[Array,
     of, whose other outer corner no edge joins to it.
     """
     num_vertices, degree = garment.neighbors.shape
+    own = jnp.arange(num_vertices, dtype=garment.neighbors.dtype)[:, None]
+    columns = jnp.concatenate([own, garment.neighbors], axis=1)
     num_hinges = garment.hinges.shape[0]
-    corner, hinge = garment.hinge_incidence // num_hinges, garment.hinge_incidence % num_hinges
-    is_outer = (corner == _LEFT) | (corner == _RIGHT)
-    across = garment.hinges[hinge, jnp.where(is_outer, _LEFT + _RIGHT - corner, 0)]
-    # A vertex is an outer corner of at most as many hinges as it has faces: those come first.
-    first = jnp.argsort(~is_outer, axis=1)[:, : garment.face_incidence.shape[1]]
-    own = jnp.arange(num_vertices, dtype=across.dtype)[:, None]
-    across = jnp.take_along_axis(jnp.where(is_outer, across, own), first, axis=1)
-    places = jnp.take_along_axis(garment.hinge_incidence, first, axis=1)
-    columns = jnp.concatenate([own, garment.neighbors, across], axis=1)
+    if num_hinges:
+        corner, hinge = garment.hinge_incidence // num_hinges, garment.hinge_incidence % num_hinges
+        is_outer = (corner == _LEFT) | (corner == _RIGHT)
+        across = garment.hinges[hinge, jnp.where(is_outer, _LEFT + _RIGHT - corner, 0)]
+        # A vertex is an outer corner of at most as many hinges as it has faces: those come first.
+        first = jnp.argsort(~is_outer, axis=1)[:, : garment.face_incidence.shape[1]]
+        across = jnp.take_along_axis(jnp.where(is_outer, across, own), first, axis=1)
+        places = jnp.take_along_axis(garment.hinge_incidence, first, axis=1)
+        columns = jnp.concatenate([columns, across], axis=1)
 
     slots = []
-    for items in (garment.faces, garment.hinges):
+    for items in (garment.faces, garment.hinges) if num_hinges else (garment.faces,):
         for row, column in _couples(items.shape[1]):
             vertex = items[:, row]
             if row == column:

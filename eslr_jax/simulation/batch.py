@@ -70,7 +70,7 @@ def simulate_batch(
             "each garment, and one fabric for all or one for each"
         )
     devices = list(devices or [])
-    mesh = Mesh(np.array(devices), (SCENES,)) if len(devices) > 1 else None
+    mesh = Mesh(np.array(devices), (SCENES,)) if devices else None
     done: dict[int, Trajectory] = {}
     for group in _group_alike(garments, poses):
         scenes = prepare_scenes(
@@ -108,7 +108,7 @@ def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> li
     """Group scenes that can be stacked: like vertex counts, frame counts and bodies."""
     groups: dict[tuple, list[int]] = {}
     for i, (garment, motion) in enumerate(zip(garments, poses, strict=True)):
-        body = hash(np.asarray(motion.faces).tobytes())
+        body = hash((np.asarray(motion.faces).tobytes(), np.asarray(motion.is_obstacle).tobytes()))
         key = (choose_bucket(garment).vertices, motion.positions.shape[0], body)
         groups.setdefault(key, []).append(i)
     return list(groups.values())

@@ -88,9 +88,10 @@ def simulate(
         trajectory, timing = _in_chunks(
             jax.tree.map(jnp.asarray, params), scene, config, _Loop(pace, on_frames, is_stopping), done
         )
-        larger = None if is_stopping() else enlarge_buffers(scene, trajectory)
-        kept = good_frames(trajectory)
-        done = kept if kept.num_frames > 1 else None  # what fitted stands; rows without a pair change nothing
+        larger, kept = enlarge_buffers(scene, trajectory), good_frames(trajectory)
+        if larger is not None and is_stopping():  # what overflowed is simulated when somebody goes on
+            trajectory, larger = kept, None
+        done = kept if kept.num_frames > 1 else None  # what fitted stands
     if raises:
         raise_for_status(trajectory)
     return Simulation(trajectory, timing, scene)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
@@ -68,7 +69,7 @@ _TURNS = {"90": _yaw(90), "180": _yaw(180), "270": _yaw(270), "mirrored": np.dia
 def _build_turned(options: Mapping[str, Any]) -> Scenes:
     rig = load_body()
     garment = load_garment("tshirt", body=rig, **options)
-    poses = pose_body(rig, still_motion(rig, 61))
+    poses = pose_body(rig, still_motion(rig, 61, arm_angle=ARM_ABDUCTION))
     scene = prepare_scene(garment, poses, options=SceneOptions(start_at_rest=True))
     short = first_frames(scene, 31)
     turned = {label: CaseScene(_turned(short, matrix)) for label, matrix in _TURNS.items()}

@@ -20,6 +20,7 @@ from sheet import keep, parse_options
 
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.membrane import principal_stretches
@@ -48,7 +49,9 @@ def band_weights(rest: np.ndarray) -> np.ndarray:
 
 def make_scene(body: Body, num_frames: int) -> Scene:
     """Return the T-shirt as it is cut, on a body that stands still."""
-    scene = prepare_scene(load_garment("tshirt"), pose_body(body, still_motion(body, num_frames)))
+    scene = prepare_scene(
+        load_garment("tshirt"), pose_body(body, still_motion(body, num_frames, arm_angle=ARM_ABDUCTION))
+    )
     return scene.replace(timestep=jnp.float32(TIMESTEP))
 
 
@@ -122,7 +125,10 @@ def draw(
 ) -> plt.Figure:
     """Return the shirts, coloured by stretch, and both searches."""
     figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained")
-    faces, standing = np.asarray(scene.garment.faces), pose_body(body, still_motion(body, 2))
+    faces, standing = (
+        np.asarray(scene.garment.faces),
+        pose_body(body, still_motion(body, 2, arm_angle=ARM_ABDUCTION)),
+    )
     names = {"tight": "as it is cut", "lbfgs": "let out by gradients"}
     for axis, (name, title) in zip(axes, names.items(), strict=False):
         positions, stretch = (np.asarray(part) for part in worn[name])

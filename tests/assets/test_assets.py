@@ -104,9 +104,11 @@ def test_too_many_frames_are_refused(body):
 
 
 def test_still_body_stands_on_the_floor(body):
-    poses = pose_body(body, still_motion(body, 2), arm_abduction=0.0)
+    poses = pose_body(body, still_motion(body, 2))
     np.testing.assert_allclose(np.asarray(poses.positions)[..., 1].min(), 0.0, atol=1e-5)
     np.testing.assert_array_equal(poses.positions[0], poses.positions[1])
+    rest = np.asarray(body.rest_positions)
+    np.testing.assert_allclose(np.ptp(poses.positions[0], axis=0), np.ptp(rest, axis=0), atol=1e-5)
 
 
 def test_shaped_bodies_stay_on_the_floor(body):
@@ -114,7 +116,7 @@ def test_shaped_bodies_stay_on_the_floor(body):
         shape = np.zeros(10)
         shape[0] = value
         shaped = shape_body(body, shape)
-        poses = pose_body(shaped, still_motion(shaped, 1), arm_abduction=0.0)
+        poses = pose_body(shaped, still_motion(shaped, 1))
         np.testing.assert_allclose(np.asarray(poses.positions)[..., 1].min(), 0.0, atol=1e-5)
 
 

@@ -10,12 +10,14 @@ from draped_ball import drifting_ball, square
 from example_runs import write_run
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation import fields
 from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
+from eslr_jax.evaluation.run_scene import run_garment, run_scene
 from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.io.run import read_run
+from eslr_jax.io.run import read_run, scene_record
+from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.problem import pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
@@ -94,6 +96,17 @@ def test_repulsion_counts_where_layers_meet():
     shares = np.asarray(energy_shares("repulsion", still, problem))
     assert shares.sum() == pytest.approx(whole, rel=1e-4)
     assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole > 0
+
+
+def test_a_run_keeps_the_constants_of_its_scene(runs):
+    run = dataclasses.replace(runs[0], report=runs[0].report | {"constants": {"gravity": 1.62}, "tips": True})
+    scene = run_scene(run, *run_garment(run))
+    assert scene.constants == constants_for(scene.material).replace(gravity=1.62)
+    assert scene.body.has_tips
+    assert scene_record(scene)["constants"]["gravity"] == 1.62
+    own = dataclasses.replace(run, report=run.report | {"own_energies": 1})
+    with pytest.raises(ConfigError, match="energies of its own"):
+        run_scene(own, *run_garment(run))
 
 
 @pytest.mark.parametrize("name", ["friction-energy", "distance"])

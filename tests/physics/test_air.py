@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from draped_ball import drifting_ball, square
 from jax.tree_util import Partial
 from known_answers.strip import LENGTH, strip
 from scipy.optimize import brentq
@@ -15,6 +16,7 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.physics.air import air_flow, blowing, gusts
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air
+from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Air
 
@@ -62,6 +64,14 @@ def test_a_function_blows_where_and_when_it_is_asked():
     corners = np.asarray(scene.initial_state.position)[np.asarray(scene.garment.faces)]
     np.testing.assert_allclose(flow.wind[real], 6.0 * corners.mean(axis=1)[real], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(flow.areas.sum(), 0.05 * LENGTH, rtol=1e-5)
+
+
+def test_a_plain_function_is_a_wind():
+    scene = prepare_scene(
+        square(3, 0.1), drifting_ball(2), options=SceneOptions(air=Air(lambda points, time: 2.0 * points))
+    )
+    assert len(jax.tree.leaves(scene.air)) == 3, "its numbers"
+    np.testing.assert_array_equal(scene.air.wind(jnp.ones((1, 3)), 0.0), 2.0)
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,20 @@ def test_tolerance_and_bound_stop_the_iteration():
     assert int(left.iterations) <= 1, "stops where no step leads down"
 
 
+def test_where_nothing_is_left_but_rounding_the_bound_is_zero():
+    """Cloth that has come to rest: the inertial guess is the minimum, but for rounding with either sign."""
+
+    def function(x):
+        return 1.0 + jnp.sum((x - 0.1) ** 2)
+
+    start = jnp.full((2, 3), 0.1 + 1e-6)
+    for reference in (1.0 - 1e-7, 1.0, 1.0 + 1e-7):
+        rest = descend(function, start, jnp.ones(2), 50, tolerance=0.01, reference=reference)
+        assert float(rest.gap_bound) == 0.0
+    moving = descend(function, start + 1.0, jnp.ones(2), 1, tolerance=0.01, reference=7.0)
+    assert float(moving.gap_bound) > 0.0
+
+
 def test_the_value_never_rises_and_nonfinite_trials_are_refused():
     def function(x):
         return jnp.sum(jnp.where(x < 3.0, (x - 2.9) ** 2, jnp.nan))

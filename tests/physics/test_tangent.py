@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_garment
 from draped_ball import drifting_ball, square
 
 from eslr_jax.physics.minres import solve_symmetric
@@ -54,6 +55,19 @@ def test_the_assembled_product_is_that_of_automatic_differentiation(crumpled):
     expected = jnp.where(crumpled.is_free, crumpled.forces, crumpled.move)
     tolerance = 1e-5 * float(jnp.abs(crumpled.forces).max())
     np.testing.assert_allclose(crumpled.assembled, expected, atol=tolerance)
+
+
+def test_cloth_without_inner_edges_has_a_hessian_too():
+    triangle = make_garment(np.array([[0, 0.2, 0], [0.1, 0.2, 0], [0, 0.2, 0.1]]), np.array([[0, 1, 2]]))
+    scene = prepare_scene(triangle, drifting_ball(2), options=SceneOptions(has_body=False))
+    problem = frame_problem(
+        scene, scene.initial_state, jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    )
+    position = 1.05 * scene.initial_state.position
+    move = jnp.arange(9.0).reshape(3, 3)
+    _, expected = jax.jvp(lambda x: jax.grad(potential)(x, problem), (position,), (move,))
+    found = apply(tangent(problem, position), move.T).T
+    np.testing.assert_allclose(found, expected, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
 def test_preconditioner_inverts_the_blocks_on_the_diagonal(crumpled):

@@ -12,7 +12,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes, shared_surface
-from eslr_jax.simulation.batch import rollout_scenes, simulate_batch, stack_scenes
+from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_batch, stack_scenes
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
 
@@ -54,6 +54,12 @@ def test_another_motion_compiles_nothing_anew(batch, garments, poses):
     again = simulate_batch(None, garments, [moved] * 3, config=QUICK, material=FABRICS)
     assert rollout_scenes._cache_size() == before
     assert not np.array_equal(again[1].positions, batch[1].positions)
+
+
+def test_bodies_that_differ_in_what_is_an_obstacle_are_searched_apart(garments, poses):
+    part = poses.replace(is_obstacle=np.asarray(poses.is_obstacle) & (np.arange(len(poses.faces)) > 0))
+    motions = [poses, poses, part]
+    assert _group_alike(garments[:1] * 3, motions) == [[0, 1], [2]]
 
 
 def test_counts_must_match(garments, poses):
@@ -104,7 +110,9 @@ from eslr_jax import SimConfig, simulate_batch
 assert len(jax.devices()) == 4
 poses, garments, config = drifting_ball(4), [square()] * 5, SimConfig(iterations=5)
 spread = simulate_batch(None, garments, [poses] * 5, config=config, devices=jax.devices())
-alone = simulate_batch(None, garments[:1], [poses], config=config)[0]
+alone = simulate_batch(None, garments[:1], [poses], config=config, devices=jax.devices()[2:3])[0]
+assert alone.positions.devices() == {jax.devices()[2]}
+alone = jax.device_get(alone)
 for trajectory in spread:
     np.testing.assert_allclose(trajectory.positions, alone.positions, atol=1e-5)
 """

@@ -243,6 +243,9 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     assert Status(int(expected.status)) == Status.OK
     np.testing.assert_allclose(found.trajectory.positions, expected.positions, atol=1e-5)
     assert enlarge_buffers(found.scene, expected) is None
+    stopped = simulate(None, few, config=SOLVER, is_stopping=lambda: True)
+    assert stopped.trajectory.num_frames == 1, "whoever stops is not told of buffers that would have grown"
+    assert Status(int(stopped.trajectory.status)) == Status.OK
 
 
 def test_buffers_grow_by_shared_sizes_until_they_hold_the_fullest_frame_and_a_quarter_more(scene, whole):
