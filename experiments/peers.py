@@ -291,7 +291,7 @@ COLUMNS = {
     "frame_cpu_ms": "CPU ms",
     "gap_relative_median": "gap, median [%]",
     "gap_relative_own": "on its own rollout [%]",
-    "pooled_stretch_p99": "stretch, 99 %",
+    "pooled_stretch_p99": "stretch, 99 % of faces",
     "penetration_p999_mm": "penetration, 99.9 % [mm]",
     "intersections_body": "pairs with the body",
     "intersections_cloth": "pairs of cloth",
