@@ -187,7 +187,7 @@ class TrainConfig:
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
     # Refinement steps in the loss: all alike, only the last, or each by the share of the gap that it leaves.
     refinement_weights: Literal["equal", "last", "contraction"] = "equal"
-    max_skipped: int = 100  # non-finite updates skipped before training stops
+    max_skipped: int = 100  # non-finite updates skipped in a row before training stops
     log_every: int = 100  # steps between lines of metrics.jsonl
     checkpoint_every: int = 1000  # steps
     seed: int = 0  # of weights, clips and fabrics

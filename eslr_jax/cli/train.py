@@ -61,7 +61,7 @@ def train(
         num_processes: Number of processes; not needed with "auto".
         process_id: Number of this process, from 0; not needed with "auto".
     """
-    from eslr_jax.assets import load_model
+    from eslr_jax.assets.models import load_model, model_record
     from eslr_jax.config import from_dict, parse_override, to_dict
     from eslr_jax.models.registry import check_params
     from eslr_jax.training.checkpoint import read_run_config
@@ -90,12 +90,13 @@ def train(
     use_compile_cache()
     if coordinator is not None:  # before anything is computed, as jax.distributed demands
         _join_processes(coordinator, num_processes, process_id)
-    initial = None
+    initial, earlier = None, {}
     if start_from is not None:
         initial, _ = load_model(start_from)
+        earlier = model_record(start_from)
         check_params(chosen.model, initial)
     with _training_progress(chosen.steps, out if tensorboard and is_first_process() else None) as show:
-        state = run(chosen, out, resume=resume, initial_params=initial, on_progress=show)
+        state = run(chosen, out, resume=resume, initial_params=initial, earlier=earlier, on_progress=show)
     if not is_first_process():
         return
     folders = seed_folders(chosen, out)

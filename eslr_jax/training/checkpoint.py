@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ class Checkpoints:
             self._manager.wait_until_finished()
 
     def restore(self, example: TrainState) -> TrainState:
-        """Return the newest checkpoint that can be read, and drop damaged ones that are newer.
+        """Return the newest checkpoint that can be read, and move newer ones aside, which can't.
 
         Args:
             example: A state of the same run: its shapes and types.
@@ -77,10 +78,12 @@ class Checkpoints:
                 reasons.append(f"{step}: {one_line(error)[:_LONGEST]}")
                 continue
             for damaged in steps[: len(reasons)]:
+                aside = _move_aside(Path(self._manager.directory) / str(damaged))
                 warnings.warn(
-                    f"checkpoint {damaged} can't be read and was removed; going on from {step}", stacklevel=2
+                    f"checkpoint {damaged} can't be read and is now {aside}; going on from {step}",
+                    stacklevel=2,
                 )
-                self._manager.delete(damaged)
+            self._manager.reload()
             return jax.tree.unflatten(jax.tree.structure(example), jax.tree.leaves(plain))
         raise CheckpointError(
             f"no checkpoint can be read ({'; '.join(reasons)}); they are damaged or of another version: "
@@ -91,6 +94,12 @@ class Checkpoints:
         """Finish writing and release the folder."""
         self.wait()
         self._manager.close()
+
+
+def _move_aside(checkpoint: Path) -> Path:
+    """Give a checkpoint a name that is no step's, as another version may be able to read it; return the path."""
+    names = (checkpoint.with_name(f"{checkpoint.name}.damaged{number or ''}") for number in itertools.count())
+    return checkpoint.rename(next(path for path in names if not path.exists()))
 
 
 @contextlib.contextmanager
@@ -114,9 +123,9 @@ def has_checkpoint(folder: Path) -> bool:
     return any(path.name.isdigit() for path in (folder / _FOLDER).glob("*"))
 
 
-def write_run_config(folder: Path, config: TrainConfig) -> None:
-    """Keep a run's configuration beside its checkpoints."""
-    record = {"format": FORMAT, "train": to_dict(config)}
+def write_run_config(folder: Path, config: TrainConfig, earlier: Mapping[str, Any]) -> None:
+    """Keep a run's configuration beside its checkpoints, and the record of the weights that it started from."""
+    record = {"format": FORMAT, "train": to_dict(config), "earlier": dict(earlier)}
     with atomic_write(folder / "config.json") as temporary:
         temporary.write_text(json.dumps(record, indent=2))
 
@@ -145,3 +154,8 @@ def read_run_config(folder: Path) -> TrainConfig:
         return from_dict(TrainConfig, values)
     except ConfigError as error:
         raise CheckpointError(f"{path} is for another version: {error}") from error
+
+
+def read_earlier(folder: Path) -> dict[str, Any]:
+    """Return the training record of the weights that a run started from; empty for random ones."""
+    return json.loads((folder / "config.json").read_text()).get("earlier", {})

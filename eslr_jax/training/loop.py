@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,18 @@ from eslr_jax.errors import CapacityError, CheckpointError, ConfigError, NonFini
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
 from eslr_jax.io.weights import write_weights
 from eslr_jax.simulation.interrupt import Interruption
-from eslr_jax.training.checkpoint import Checkpoints, has_checkpoint, read_run_config, write_run_config
+from eslr_jax.training.checkpoint import (
+    Checkpoints,
+    has_checkpoint,
+    read_earlier,
+    read_run_config,
+    write_run_config,
+)
 from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
-_SHARES = ("resets", "overflows")  # metrics that are zero or one in a step
+_SHARES = ("resets", "overflows", "skipped")  # metrics that are zero or one in a step
 
 Progress = Callable[[int, int, dict[str, float]], None]
 
@@ -36,6 +42,7 @@ def train(
     *,
     resume: bool = False,
     initial_params: Any = None,
+    earlier: Mapping[str, Any] | None = None,
     datasets: tuple[TrainingData, ...] | None = None,
     on_progress: Progress = lambda done, total, metrics: None,
 ) -> TrainState:
@@ -49,6 +56,8 @@ def train(
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial_params: Weights to start from instead of random ones.
+        earlier: Training record of these weights, whose steps and core-hours the exported one counts too. A run
+            that is resumed knows it.
         datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
         on_progress: Called with steps done, steps in all, and the latest means, of the first seed.
 
@@ -58,7 +67,7 @@ def train(
     Raises:
         CheckpointError: `out` holds another run, or none to resume.
         ConfigError: Several seeds would be spread over devices.
-        NonFiniteError: Too many updates had to be skipped; the last good checkpoint is kept.
+        NonFiniteError: Too many updates in a row had to be skipped; the last good checkpoint is kept.
         CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
@@ -74,8 +83,9 @@ def train(
         state = checkpoints.restore(state)
     for folder in folders:
         _forget_after(folder / "metrics.jsonl", int(state.step))
+    earlier = read_earlier(out) if resume else dict(earlier or {})
     if is_first_process():
-        write_run_config(out, config)
+        write_run_config(out, config, earlier)
     if not resume:
         checkpoints.save(state)
         checkpoints.wait()
@@ -111,7 +121,7 @@ def train(
                     log.write(json.dumps(record) + "\n")
                     log.flush()
                 on_progress(done, config.steps, records[0])
-                _check_skipped(state, config, checkpoints, out)
+                _check_skipped(state, config, checkpoints, out, earlier)
                 if overflowed:
                     raise CapacityError(
                         f"self-contact needed more room than its buffers have by step {done}; train with "
@@ -125,7 +135,7 @@ def train(
                 break
     checkpoints.close()
     if int(state.step) >= config.steps:
-        export(state, config, [folder / "model.npz" for folder in folders])
+        export(state, config, [folder / "model.npz" for folder in folders], earlier)
     return state
 
 
@@ -147,18 +157,20 @@ def _is_stopping(stop: Interruption, done: int) -> bool:
     return stop.is_wanted
 
 
-def export(state: TrainState, config: TrainConfig, paths: list[Path]) -> None:
-    """Write the networks of a run, one a seed, as npz and JSON."""
+def export(state: TrainState, config: TrainConfig, paths: list[Path], earlier: Mapping[str, Any]) -> None:
+    """Write the networks of a run, one a seed, as npz and JSON; see `train` for `earlier`."""
     if not is_first_process():
         return
     for place, path in enumerate(paths):
         own = take_seed(state, place) if config.seeds > 1 else state
         training = {
-            "steps": int(own.step),
+            "steps": earlier.get("steps", 0) + int(own.step),
             "garments": config.garments,
             "vertices": config.vertices,
-            "core_hours": core_seconds(path.parent) / 3600 / config.seeds,  # seeds share the run
         }
+        if not earlier or "core_hours" in earlier:  # else nobody knows how long it took in all
+            hours = core_seconds(path.parent) / 3600 / config.seeds  # seeds share the run
+            training["core_hours"] = earlier.get("core_hours", 0.0) + hours
         write_weights(path, jax.device_get(own.params), config.model, training)
 
 
@@ -220,18 +232,25 @@ def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, flo
     return [{name: float(values[place]) for name, values in centers.items()} for place in range(seeds)]
 
 
-def _check_skipped(state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path) -> None:
-    """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied."""
+def _check_skipped(
+    state: TrainState, config: TrainConfig, checkpoints: Checkpoints, out: Path, earlier: Mapping[str, Any]
+) -> None:
+    """Stop a run that produces nothing but NaN; its weights are good, as such updates are not applied.
+
+    One such update now and then is none: its trajectory starts anew, and the next good update begins the count
+    again.
+    """
     skipped = int(np.max(state.skipped))
     if skipped <= config.max_skipped:
         return
     checkpoints.wait()
     weights = [folder / "last_finite.npz" for folder in seed_folders(config, out)]
-    export(state, config, weights)
-    trajectories = out / "offending_state.npz"  # of all seeds
+    export(state, config, weights, earlier)
+    states = out / "offending_state.npz"  # of all seeds
     leaves = jax.tree.leaves(jax.device_get(state.pools))
-    np.savez(trajectories, **{str(number): leaf for number, leaf in enumerate(leaves)})
+    np.savez(states, **{str(number): leaf for number, leaf in enumerate(leaves)})
     raise NonFiniteError(
-        f"{skipped} updates were not finite by step {int(state.step)}; their trajectories are in {trajectories}. "
-        f"Begin another run with a lower learning_rate; --start-from {weights[0]} keeps what was learned"
+        f"the last {skipped} updates were not finite at step {int(state.step)}; the states that they began from "
+        f"are in {states}. Begin another run with a lower learning_rate; --start-from {weights[0]} keeps what "
+        "was learned"
     )

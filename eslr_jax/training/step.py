@@ -52,7 +52,7 @@ class TrainState:
     pools: tuple[Slot, ...]  # one per resolution
     key: Array
     step: Int[Array, ""]  # of the optimiser
-    skipped: Int[Array, ""]  # updates with a non-finite loss or gradient
+    skipped: Int[Array, ""]  # updates in a row, the last one included, whose loss or gradient was not finite
 
 
 def make_schedule(config: TrainConfig) -> optax.Schedule:
@@ -157,25 +157,35 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, state.params["params"])
         trained = optax.apply_updates(state.params["params"], updates)
-        keep = partial(jax.tree.map, lambda new, old: jnp.where(is_learning, new, old))
-        params = {**state.params, "params": keep(trained, state.params["params"])}
+        seen = state.params
         for sample in range(size if samples.statistics else 0):
-            params = merge_statistics(params, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023
+            seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023
+        params = {
+            **state.params,
+            "params": _choose(is_learning, trained, state.params["params"]),
+            "statistics": _choose(is_good, seen["statistics"], state.params["statistics"]),
+        }
         pool = jax.tree.map(lambda all_, some: all_.at[indices].set(some), pool, samples.slot)
         metrics = {name: jnp.mean(values) for name, values in samples.metrics.items()}
+        metrics |= {"gradient_norm": norm, "skipped": (~is_good).astype(jnp.float32)}
         return (
             TrainState(
                 params=params,
-                optimizer=keep(optimizer, state.optimizer),
+                optimizer=_choose(is_learning, optimizer, state.optimizer),
                 pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
                 key=jax.random.key_data(key),
                 step=state.step + 1,
-                skipped=state.skipped + ~is_good,
+                skipped=jnp.where(is_good, 0, state.skipped + 1),
             ),
-            {**metrics, "gradient_norm": norm},
+            metrics,
         )
 
     return train_step
+
+
+def _choose(is_new: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """Return one of two trees."""
+    return jax.tree.map(lambda one, other: jnp.where(is_new, one, other), new, old)
 
 
 class _Entry(NamedTuple):
@@ -214,7 +224,10 @@ def _batch_gradient(
 def _sample_gradient(
     params: Any, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
 ) -> tuple[Any, _Sample]:
-    """Return one trajectory's gradient, and move it on by a frame."""
+    """Return one trajectory's gradient, and move it on by a frame.
+
+    Where loss or gradient is not finite it stays as it was, to be looked at, until it starts anew.
+    """
     index = entry.index % data.num_garments
     slot = _living_slot(entry, data, index, config)
     problem = slot_problem(slot, data, index, config)
@@ -231,12 +244,15 @@ def _sample_gradient(
     if params["statistics"]:
         statistics = _statistics(params, slot, problem, data, index, config)
     horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
-    slot, is_astray = _advance(slot, problem, report, data, horizon)
+    moved, is_astray = _advance(slot, problem, report, data, horizon)
+    overflow = moved.state.status & Status.SELF_CONTACT_OVERFLOW
+    is_good = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
+    slot = _choose(is_good, moved, slot.replace(is_done=jnp.ones((), bool)))
     metrics = {
         "loss": loss,
         "inertial_energy": report.inertial_energy,
-        "resets": is_astray.astype(jnp.float32),
-        "overflows": (slot.state.status & Status.SELF_CONTACT_OVERFLOW > 0).astype(jnp.float32),
+        "resets": (is_astray | ~is_good).astype(jnp.float32),
+        "overflows": (overflow > 0).astype(jnp.float32),
         **report.terms._asdict(),
     }
     return gradient, _Sample(slot, metrics, statistics)

@@ -30,6 +30,15 @@ def config(cheap_model):
     )
 
 
+def with_a_broken_vertex(state):
+    """Return a training's state whose living trajectories have lost a vertex."""
+    cloth = state.pools[0].state
+    place = cloth.position.copy()
+    place[:, 7] = np.nan
+    alive = np.zeros_like(state.pools[0].is_done)
+    return state.replace(pools=(state.pools[0].replace(state=cloth.replace(position=place), is_done=alive),))
+
+
 def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_starts_anew(
     config, small_data
 ):
@@ -46,21 +55,21 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_
     state, metrics = take_step(first)
     assert (metrics["resets"], state.pools[0].age[0], state.pools[0].is_done[0]) == (0.0, 1, False)
 
-    cloth = state.pools[0].state
-    place = cloth.position.copy()
-    place[0, 7] = np.nan
-    pool = state.pools[0].replace(state=cloth.replace(position=place))
-    bad, metrics = take_step(state.replace(pools=(pool,)))
+    broken = with_a_broken_vertex(state)
+    bad, metrics = take_step(broken)
     assert not np.isfinite(metrics["loss"])
-    assert (bad.skipped, bad.step) == (1, 3)
+    assert (bad.skipped, metrics["skipped"], bad.step) == (1, 1.0, 3)
     jax.tree.map(np.testing.assert_array_equal, bad.params, state.params)
     jax.tree.map(np.testing.assert_array_equal, bad.optimizer, state.optimizer)
     assert metrics["resets"] == 1.0
     assert bad.pools[0].is_done[0]
+    np.testing.assert_array_equal(bad.pools[0].state.position, broken.pools[0].state.position)
+    assert bad.pools[0].age[0] == broken.pools[0].age[0], "it stays as it was, to be looked at"
 
     after, metrics = take_step(bad)
     assert np.isfinite(metrics["loss"])
-    assert (after.skipped, after.pools[0].age[0], metrics["resets"]) == (1, 1, 0.0)
+    assert (after.skipped, metrics["skipped"]) == (0, 0.0), "one bad update is none in a row"
+    assert (after.pools[0].age[0], metrics["resets"]) == (1, 0.0)
     assert np.isfinite(after.pools[0].state.position).all()
     moved = jax.tree.map(lambda new, old: np.any(new != old), after.params["params"], bad.params["params"])
     assert np.mean(jax.tree.leaves(moved)) > 0.8
@@ -71,7 +80,9 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
 ):
     bad = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), init_model(cheap_model)["params"])
     patient = dataclasses.replace(config, max_skipped=3)
-    with pytest.raises(NonFiniteError, match=r"^4 updates were not finite by step 4; .* --start-from "):
+    with pytest.raises(
+        NonFiniteError, match=r"^the last 4 updates were not finite at step 4; .* --start-from "
+    ):
         train(patient, tmp_path, datasets=(small_data,), initial_params={"params": bad})
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [2, 4], "three updates may be skipped"
@@ -85,7 +96,9 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
         leaves = [arrays[str(place)] for place in range(len(arrays.files))]
     (pool,) = jax.tree.unflatten(jax.tree.structure(empty), leaves)
     assert pool.state.position.shape == empty[0].state.position.shape
-    assert pool.age[0] > 0, "what the network did, not where the run began"
+    assert np.isfinite(pool.state.position).all()
+    assert np.ptp(pool.state.position[0], axis=0).max() > 0.05, "cloth, not an empty slot"
+    assert pool.is_done[0]
 
 
 @pytest.mark.parametrize("wrong", ["nothing", "horizon", "stretch", "displacement", "not a number"])
@@ -168,6 +181,9 @@ def test_statistics_come_first_and_then_weights_move(small_data):
     largest = np.abs(np.diff(np.stack(frames), 2, axis=0)).max()  # [m per frame^2]
     size = np.sqrt(np.asarray(output.mean) ** 2 + np.asarray(output.squared_deviations) / float(output.count))
     assert 0.01 * largest < size.max() < 1.5 * largest
+    bad, metrics = step(jax.tree.map(jnp.array, with_a_broken_vertex(jax.device_get(state))), small_data)
+    assert not np.isfinite(metrics["loss"])
+    jax.tree.map(np.testing.assert_array_equal, bad.params, state.params)
     for name, one in start.params["statistics"].items():
         start.params["statistics"][name] = one.replace(num_updates=jnp.int32(WARMUP_UPDATES))
     moved = jax.tree.map(jnp.array, start)

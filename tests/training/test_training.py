@@ -17,6 +17,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from eslr_jax.assets import load_model, split_clips
+from eslr_jax.assets.models import model_record
 from eslr_jax.body.motion import pose_body, shape_body
 from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.contact.nearest import find_contacts
@@ -27,9 +28,9 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.problem import pushed_out_guess
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.network import refine
-from eslr_jax.training.checkpoint import Checkpoints, read_run_config, write_run_config
+from eslr_jax.training.checkpoint import Checkpoints, read_earlier, read_run_config, write_run_config
 from eslr_jax.training.data import build_training_data, load_training_data
-from eslr_jax.training.loop import train
+from eslr_jax.training.loop import export, train
 from eslr_jax.training.loss import _mean_contraction, physics_loss
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.recipe import load_recipe
@@ -60,6 +61,23 @@ def test_run_leaves_metrics_and_a_model(finished, config):
     params, model = load_model(folder / "model.npz")
     assert model == config.model
     jax.tree.map(np.testing.assert_array_equal, params["params"], state.params["params"])
+
+
+@pytest.mark.parametrize(
+    "earlier", [{"steps": 100, "core_hours": 2.0}, {"steps": 100}, {"converted_from": "hood.pth"}]
+)
+def test_the_record_counts_the_training_of_the_weights_that_a_run_started_from(
+    finished, config, tmp_path, earlier
+):
+    state, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    write_run_config(tmp_path, config, earlier)
+    own = model_record(folder / "model.npz")
+    export(state, config, [tmp_path / "model.npz"], read_earlier(tmp_path))
+    record = model_record(tmp_path / "model.npz")
+    assert record["steps"] == own["steps"] + earlier.get("steps", 0)
+    expected = own["core_hours"] + earlier["core_hours"] if "core_hours" in earlier else None
+    assert record.get("core_hours") == pytest.approx(expected), "unknown where a stage's is unknown"
 
 
 def test_weights_move_as_far_as_adam_takes_them(finished, config):
@@ -143,14 +161,35 @@ def test_a_checkpoint_that_cannot_be_written_says_what_to_do(finished, tmp_path,
         checkpoints.save(state)
 
 
+def damage(checkpoint):
+    """Cut every file of a checkpoint in half."""
+    for path in checkpoint.rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_a_damaged_checkpoint_is_kept_under_another_name_and_its_step_written_again(finished, tmp_path):
+    state, folder = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    for name in ("6.damaged", "6.damaged1"):  # as a run whose last step is damaged twice
+        damage(tmp_path / "checkpoints" / "6")
+        checkpoints = Checkpoints(tmp_path)
+        with pytest.warns(UserWarning, match="checkpoint 6 can't be read"):
+            assert checkpoints.restore(state).step == 4
+        assert any((tmp_path / "checkpoints" / name).rglob("*"))
+        checkpoints.save(state)
+        checkpoints.close()
+        assert Checkpoints(tmp_path).restore(state).step == 6
+
+
 @pytest.mark.slow
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(finished, config, small_data, tmp_path):
     _, folder = finished
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    for path in (tmp_path / "checkpoints" / "6").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.warns(UserWarning, match="checkpoint 6 can't be read and was removed; going on from 4"):
+    damage(tmp_path / "checkpoints" / "6")
+    with pytest.warns(
+        UserWarning, match=r"checkpoint 6 can't be read and is now .*6\.damaged; going on from 4"
+    ):
         state = train(config, tmp_path, datasets=(small_data,), resume=True)
     whole, _ = finished
     for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(whole), strict=True):
@@ -171,7 +210,7 @@ def test_a_finished_run_is_extended_but_not_cut(finished, config, small_data, tm
 
 
 def test_a_folder_without_a_checkpoint_starts_anew(config, small_data, tmp_path):
-    write_run_config(tmp_path, config)
+    write_run_config(tmp_path, config, {})
     (tmp_path / "metrics.jsonl").write_text('{"step": 2, "core_seconds": 1e6}\n')  # of a run that was deleted
     with pytest.raises(CheckpointError, match="no checkpoint to resume from; start without --resume"):
         train(config, tmp_path, datasets=(small_data,), resume=True)
