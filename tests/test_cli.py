@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,7 +141,53 @@ def test_a_page_is_opened_where_a_person_sits(tmp_path):
 def test_assets_lists_every_kind():
     result = eslr("assets", "--json", "--verify")
     kinds = {asset["kind"] for asset in json.loads(result.stdout)}
-    assert {"body", "garment", "motion"} <= kinds
+    assert {"body", "garment", "motion", "fabric"} <= kinds
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"body": "anny"}, "only --export takes a body; leave out --body"),
+        ({"kind": "fabric", "verify": True}, "fabrics have no files; leave out --verify"),
+        ({"export": Path("a.obj"), "kind": "body", "json_": True}, "lists nothing; leave out --kind, --json"),
+        ({"export": Path("a.obj"), "verify": True}, "lists nothing; leave out --verify"),
+    ],
+)
+def test_options_of_assets_that_would_do_nothing_are_refused(options, words):
+    from eslr_jax.cli.assets import assets
+
+    with pytest.raises(ConfigError, match=words):
+        assets(**options)
+
+
+def test_a_missing_file_is_told_with_the_damaged_ones(monkeypatch):
+    from eslr_jax.assets import catalog
+    from eslr_jax.cli.assets import assets
+
+    lost = dataclasses.replace(catalog.list_assets()[0], file="lost.npz")
+    monkeypatch.setattr(catalog, "list_assets", lambda: (lost,))
+    with pytest.raises(AssetError, match=r"damaged or missing: lost\.npz"):
+        assets(verify=True)
+
+
+def test_info_takes_the_networks_that_simulate_takes(tmp_path, capsys, monkeypatch):
+    from eslr_jax.assets.catalog import find_asset
+    from eslr_jax.cli.assets import info
+
+    info(model="eslr-small:4", json_=True)
+    assert json.loads(capsys.readouterr().out)["config"]["refinement_steps"] == 4
+    bundled = find_asset("model", "eslr-small")
+    (tmp_path / "mine").write_bytes(bundled.read_bytes())
+    (tmp_path / "mine.json").write_bytes(bundled.with_suffix(".json").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    info(model="mine", json_=True)
+    assert json.loads(capsys.readouterr().out)["model"] == "mine"
+    with pytest.raises(
+        AssetError, match=r"did you mean eslr-small\? .* of architectures there are .*eslr-15"
+    ):
+        info(model="eslr-smal")
+    with pytest.raises(ConfigError, match="only a --scene takes these; leave out --motion, --self-contact"):
+        info(motion="turn", self_contact=True)
 
 
 @pytest.mark.parametrize(
@@ -277,10 +324,21 @@ def test_no_iterations_are_those_of_a_network_alone():
     for given, expected in (
         ({"iterations": 0}, ("network", 0)),
         ({"iterations": 7}, ("physics", 7)),
-        ({"iterations": 0, "simulator": "physics"}, ("physics", 0)),
     ):
         method = choose_method(dataclasses.replace(options, **given), (None, None), 1000, None)
         assert (method.simulator, method.config.iterations) == expected
+    with pytest.raises(ConfigError, match="--iterations 0 needs a network; name --model, or give 1 or more"):
+        choose_method(
+            dataclasses.replace(options, iterations=0, simulator="physics"), (None, None), 1000, None
+        )
+
+
+def test_a_home_folder_is_expanded_before_anything_is_read(tmp_path, monkeypatch):
+    from eslr_jax.cli.simulate import simulate
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with pytest.raises(AssetError, match=f"{tmp_path}/run holds no interrupted simulation"):
+        simulate(out=Path("~/run"), resume=True)
 
 
 def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, capsys):

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path, split_name, unknown_suffix
+from eslr_jax.assets.names import is_path, unknown_suffix
 from eslr_jax.body.motion import shape_body
 from eslr_jax.body.rig import make_body
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.validate import validate_body
 from eslr_jax.io.body import read_body
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, read_gltf_body
+from eslr_jax.io.parsing import split_name
 from eslr_jax.io.smpl import is_smpl_model, read_smpl_body
 from eslr_jax.types import Body
 
@@ -49,7 +50,7 @@ def _read_body(text: str, units: str | None) -> Body:
     if not is_path(text):
         return _closed(read_body(find_asset("body", text)), text)
     if suffix in GLTF_SUFFIXES:
-        return make_body(read_gltf_body(file, meshes), units=units)
+        return make_body(read_gltf_body(file, list(filter(None, meshes.split(",")))), units=units)
     if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
         return make_body(read_smpl_body(file), units=units)
     if suffix == ".npz":

@@ -71,8 +71,9 @@ def find_asset(kind: str, name: str) -> Path:
 
 
 def is_intact(asset: Asset) -> bool:
-    """Check a bundled file against its checksum."""
-    return hashlib.sha256((data_folder() / asset.file).read_bytes()).hexdigest() == asset.sha256
+    """Tell whether a bundled file is there and has its checksum."""
+    path = data_folder() / asset.file
+    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == asset.sha256
 
 
 def split_clips(split: str) -> tuple[str, ...]:

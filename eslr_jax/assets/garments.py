@@ -27,6 +27,7 @@ from eslr_jax.io.garment import (
     GarmentSource,
     garment_arrays,
     garment_from_arrays,
+    garment_path,
     is_garment_file,
     read_garment_npz,
     read_garment_source,
@@ -103,7 +104,7 @@ def load_garment_file(
         )
         stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
         return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
-    path = Path(str(name).partition("#")[0]) if ".pkl#" in str(name).lower() else Path(name)
+    path = garment_path(name)
     if path.is_file() and is_garment_file(path):
         stored = read_garment_npz(path)
         if body is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from eslr_jax.assets.bodies import load_body
 from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path, split_name, unknown_suffix
+from eslr_jax.assets.names import is_path, unknown_suffix
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_motion, skeleton_motion
@@ -24,6 +24,7 @@ from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_motion
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import read_arrays
+from eslr_jax.io.parsing import split_name
 from eslr_jax.io.skeleton import Skeleton, SkeletonMotion
 from eslr_jax.io.smpl import read_amass, read_smpl_pickle
 from eslr_jax.types import Body
@@ -57,7 +58,7 @@ def load_motion(
         MissingExtraError: The file needs an extra that is not installed.
     """
     text = str(name)
-    file, _, clip = text.partition("#")
+    file, clip = split_name(text)
     is_bvh = Path(file).suffix.lower() == ".bvh"
     if up != "auto" and not is_bvh:
         raise MotionError(
@@ -109,7 +110,7 @@ def motion_skeleton(name: str) -> Skeleton:
         raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
     if _is_archived(name):
         return skeleton_motion(_bundled_motion(name), load_body()).skeleton
-    file, _, clip = name.partition("#")
+    file, clip = split_name(name)
     return read_skeleton_motion(file, clip).skeleton
 
 
@@ -136,7 +137,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
 
 def _is_archived(text: str) -> bool:
     """Tell a clip of the bundled format, by its name or in a user's archive, from a motion with its skeleton."""
-    file = text.partition("#")[0]
+    file, _ = split_name(text)
     return not is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file))
 
 
@@ -156,7 +157,7 @@ def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
 def _bundled_motion(text: str) -> Motion:
     """Load a clip by name, or from an archive in the bundled format."""
     if is_path(text):
-        file, _, clip = text.partition("#")
+        file, clip = split_name(text)
         if not Path(file).exists():
             raise AssetError(f"motion file {file} doesn't exist; check the path")
         clips = _motion_archive(Path(file), Path(file).stat().st_mtime)

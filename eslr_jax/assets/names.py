@@ -1,4 +1,4 @@
-"""Names of assets: a bundled name or a path, and which part of a file is meant."""
+"""Names of assets: a bundled name or a path."""
 
 from __future__ import annotations
 
@@ -14,12 +14,6 @@ def is_path(name: str) -> bool:
     A folder is none, such as the one of a run that has the name of its garment.
     """
     return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).is_file()
-
-
-def split_name(text: str) -> tuple[str, list[str]]:
-    """Split `FILE#NAME,NAME` into the file and the names."""
-    file, _, names = text.partition("#")
-    return file, [name for name in names.split(",") if name]
 
 
 def unknown_suffix(content: str, file: str | Path, known: Iterable[str]) -> AssetError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -16,6 +16,7 @@ from eslr_jax.cli.console import app, use_compile_cache, waiting
 from eslr_jax.errors import AssetError, ConfigError
 
 _ARCHITECTURE = "eslr-15"  # the paper's
+_MOTION = "cmu_016_32"  # of a scene
 
 
 @app.command
@@ -23,7 +24,7 @@ def assets(
     kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
     verify: bool = False,
     export: Path | None = None,
-    body: str = "anny",
+    body: str | None = None,
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
     """List the bundled bodies, garments, motions, networks and fabrics.
@@ -33,25 +34,35 @@ def assets(
         verify: Compare every file with its checksum.
         export: Write the rest body to this OBJ file instead, to model a garment on: in metres, the feet at height
             0. The bundled body has Y up and faces Z; another stands as its file has it.
-        body: Body to export: name of a bundled one, a body file, or a moving mesh, whose first frame is taken.
+        body: Body to export, anny by default: name of a bundled one, a body file, or a moving mesh, whose first
+            frame is taken.
         json_: Print as JSON.
     """
     from eslr_jax.assets.catalog import is_intact, list_assets
 
     if export is not None:
-        _export_body(export, body)
+        _refuse_given("--export writes a body and lists nothing", {
+            "--kind": kind != "all", "--verify": verify, "--json": json_,
+        })  # fmt: skip
+        _export_body(export, body or "anny")
         return
+    _refuse_given("only --export takes a body", {"--body": body is not None})
     if kind == "fabric":
+        _refuse_given("fabrics have no files", {"--verify": verify})
         _list_fabrics(json_)
         return
     chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
     if verify:
         damaged = [asset.file for asset in chosen if not is_intact(asset)]
         if damaged:
-            raise AssetError(f"damaged: {', '.join(sorted(set(damaged)))}; install the package again")
+            raise AssetError(
+                f"damaged or missing: {', '.join(sorted(set(damaged)))}; install the package again"
+            )
     frames = _simulated_frames([asset.name for asset in chosen if asset.kind == "motion"])
     if json_:
         rows = [{**dataclasses.asdict(asset), "frames": frames.get(asset.name)} for asset in chosen]
+        if kind == "all":
+            rows += [{"kind": "fabric", "name": name, **fabric} for name, fabric in _fabrics().items()]
         print(json.dumps(rows, indent=2))
         return
     table = Table("kind", "name", "what", "simulated as", "licence", box=None)
@@ -60,6 +71,27 @@ def assets(
         length = "" if count is None else f"{count} frames, {(count - 1) / FPS:.1f} s"
         table.add_row(asset.kind, asset.name, asset.description, length, asset.licence)
     Console().print(table, markup=False)
+    if kind == "all":
+        _list_fabrics(as_json=False)
+
+
+def _refuse_given(reason: str, options: dict[str, bool]) -> None:
+    """Raise a ConfigError if an option is given that would do nothing.
+
+    Args:
+        reason: Why it would do nothing.
+        options: Whether each of them is given.
+    """
+    if given := [option for option, is_given in options.items() if is_given]:
+        raise ConfigError(f"{reason}; leave out {', '.join(given)}")
+
+
+def _fabrics() -> dict[str, dict[str, Any]]:
+    """Return all fabrics by name, as values of JSON."""
+    from eslr_jax.physics.materials import FABRICS, WOVEN, describe_cotton
+
+    everything = {"cotton": describe_cotton(), **FABRICS, **WOVEN}
+    return {name: dataclasses.asdict(fabric) for name, fabric in everything.items()}
 
 
 def _simulated_frames(names: list[str]) -> dict[str, int]:
@@ -94,13 +126,11 @@ def _list_fabrics(as_json: bool) -> None:
     """Print the table of fabrics."""
     from eslr_jax.physics.materials import FABRICS, WOVEN, describe_cotton
 
-    rows = {"cotton": describe_cotton(), **FABRICS}
     if as_json:
-        everything = {**rows, **WOVEN}
-        print(json.dumps({name: dataclasses.asdict(fabric) for name, fabric in everything.items()}, indent=2))
+        print(json.dumps(_fabrics(), indent=2))
         return
     table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
-    for name, fabric in rows.items():
+    for name, fabric in {"cotton": describe_cotton(), **FABRICS}.items():
         numbers = (
             f"{fabric.density:.3f}",
             f"{fabric.stretch_stiffness:.0f}",
@@ -124,7 +154,7 @@ def _list_fabrics(as_json: bool) -> None:
 def info(
     model: str = _ARCHITECTURE,
     scene: str | None = None,
-    motion: str = "cmu_016_32",
+    motion: str = _MOTION,
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
     simulator: Literal["network", "physics"] = "physics",
     self_contact: bool = False,
@@ -133,7 +163,7 @@ def info(
     """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs.
 
     Args:
-        model: Name of an architecture, or of a bundled network, or an exported file.
+        model: Name of an architecture, or of a bundled network, or an exported file, as for `eslr simulate`.
         scene: A garment, by name or file, on the bundled body.
         motion: Motion of the scene.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
@@ -148,18 +178,25 @@ def info(
             )
         _show_scene(scene, motion, vertices, simulator, self_contact, json_)
         return
-    from eslr_jax.assets import asset_names, load_model
+    _refuse_given("only a --scene takes these", {
+        "--motion": motion != _MOTION, "--vertices": vertices != "1k", "--simulator": simulator != "physics",
+        "--self-contact": self_contact,
+    })  # fmt: skip
+    from eslr_jax.assets import load_model
+    from eslr_jax.assets.names import is_path
     from eslr_jax.config import to_dict
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
 
     if model in MODELS:
         config = MODELS[model]
         params = init_model(config)
-    elif model in asset_names("model") or Path(model).suffix:
-        params, config = load_model(model)
     else:
-        known = ", ".join([*MODELS, *asset_names("model")])
-        raise AssetError(f"no model named {model!r}: there are {known}; a path to a file works too")
+        try:
+            params, config = load_model(model)
+        except AssetError as error:
+            if is_path(model):
+                raise
+            raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
     values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
     if json_:
         print(json.dumps(values, indent=2))

@@ -44,7 +44,11 @@ def read_request(options: Options) -> tuple[float | None, float | None]:
 def choose_method(
     options: Options, request: tuple[float | None, float | None], num_vertices: int, choice: Choice | None
 ) -> Method:
-    """Return how to simulate a garment of this size; `choice` is that of an interrupted run."""
+    """Return how to simulate a garment of this size; `choice` is that of an interrupted run.
+
+    Raises:
+        ConfigError: The solver alone is asked for, with no iterations.
+    """
     from eslr_jax.assets import load_model
     from eslr_jax.assets.models import DEFAULT_MODEL
     from eslr_jax.config import SimConfig
@@ -63,6 +67,8 @@ def choose_method(
     if simulator == "network":
         model = model or DEFAULT_MODEL
         params, architecture = load_model(model)
+    elif iterations == 0:
+        raise ConfigError("--iterations 0 needs a network; name --model, or give 1 or more")
     usual = ITERATIONS if architecture is None else BEHIND_NETWORK
     config = SimConfig(
         model=architecture,

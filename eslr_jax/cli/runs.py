@@ -192,6 +192,7 @@ def export(
     from eslr_jax.io.trajectory import read_trajectory
     from eslr_jax.io.unfinished import NAME
 
+    out = out.expanduser()
     file = run / "trajectory.npz" if run.is_dir() else run
     own = (file, *map(file.with_name, ("garment.npz", "report.json", NAME)))
     if out.resolve() in [path.resolve() for path in own]:

@@ -138,6 +138,7 @@ def simulate(
     from eslr_jax.simulation.interrupt import Interruption
 
     options = Options(**{field.name: given[field.name] for field in dataclasses.fields(Options)})
+    out = out.expanduser()
     words = "stopping when these frames are written; Ctrl-C again stops at once and loses them"
     with Interruption(lambda: say(words)) as stop:
         report = _simulate(options, out, stop, is_resumed=resume, has_pictures=pictures)
@@ -183,7 +184,7 @@ def _simulate(
         if interrupted is not None:
             check_same_scene(interrupted.done, setting.scene, out)
             setting = setting._replace(scene=setting.scene.replace(self_contact=interrupted.capacity))
-    out = ensure_output_dir(out)
+    ensure_output_dir(out)
     _announce(options, setting)
     done = None if interrupted is None else interrupted.done
     simulation = _run(setting, done, stop)

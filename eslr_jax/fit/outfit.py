@@ -14,6 +14,7 @@ from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
 from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.parsing import split_name
 
 LAYER_GAP = 5e-3  # [m] left between two layers at rest: two millimetres over the thickness of repulsion
 _REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
@@ -36,7 +37,7 @@ def wear_together(garments: Sequence[GarmentFile], files: Sequence[str]) -> Garm
 
 def garment_names(files: Sequence[str]) -> list[str]:
     """Return what garments are called in an outfit, see `wear_together`."""
-    return [file.partition("#")[2] or Path(file).stem for file in files]
+    return [split_name(file)[1] or Path(file).stem for file in files]
 
 
 def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> GarmentFile:

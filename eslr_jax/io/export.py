@@ -19,6 +19,7 @@ from eslr_jax.io.gltf import write_animated_glb
 from eslr_jax.io.mesh_sequence import frame_name, obj_text
 from eslr_jax.io.npz import write_arrays
 from eslr_jax.io.palette import SKIN_COLOR, garment_color
+from eslr_jax.io.parsing import split_name
 from eslr_jax.io.point_cache import write_mdd, write_pc2
 from eslr_jax.io.trajectory import TrajectoryFile
 from eslr_jax.io.usd import write_usd
@@ -55,7 +56,7 @@ def export_trajectory(
         AssetError: The format is unknown, the run has no body, or the file can't be written.
         MissingExtraError: USD is not installed.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     chosen = format or _format_of(path)
     content = content or ("both" if chosen in _SCENES and run.body is not None else "garment")
     if content == "both" and chosen not in _SCENES:
@@ -113,7 +114,7 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
                 kept = np.flatnonzero(order >= 0)
                 following = np.searchsorted(kept, np.arange(len(order)))
                 places, faces = order[kept[np.minimum(following, len(kept) - 1)]], first[faces]
-    name = Path(str(run.metadata.get("garment") or "garment").partition("#")[0]).stem or "garment"
+    name = Path(split_name(str(run.metadata.get("garment") or "garment"))[0]).stem or "garment"
     cloth = AnimatedMesh(
         name, run.positions[:, places], faces, corner_uvs=uvs, velocities=run.velocities[:, places]
     )
@@ -188,7 +189,7 @@ def write_sequence(folder: str | Path, mesh: AnimatedMesh, kind: Literal["obj", 
     Raises:
         AssetError: The folder holds files already, or it can't be written.
     """
-    target = Path(folder)
+    target = Path(folder).expanduser()
     if target.is_file() or (target.is_dir() and any(target.iterdir())):
         raise AssetError(f"{target} exists already; name a new folder for the sequence")
     ensure_output_dir(target.parent)

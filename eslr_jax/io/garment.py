@@ -16,6 +16,7 @@ from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.mesh import MeshFile, read_mesh_file
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
+from eslr_jax.io.parsing import split_name
 from eslr_jax.io.pickle import read_pickle
 
 _SAME_EDGES = (
@@ -97,6 +98,12 @@ def is_garment_file(path: str | Path) -> bool:
     return Path(path).suffix.lower() == ".npz" and "skin_weights" in read_arrays(path, content="garment")
 
 
+def garment_path(text: str | Path) -> Path:
+    """Return the file of a garment; only that of a pickle is followed by the name of one of its garments."""
+    file, _ = split_name(text)
+    return Path(file if Path(file).suffix.lower() == ".pkl" else text)
+
+
 def read_garment_source(text: str | Path) -> GarmentSource:
     """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
 
@@ -110,10 +117,9 @@ def read_garment_source(text: str | Path) -> GarmentSource:
         AssetError: The file is missing, damaged or of an unknown kind.
         MeshError: It has faces that can't be triangulated.
     """
-    file, _, name = str(text).partition("#")
-    if Path(file).suffix.lower() == ".pkl":
-        return _read_hood(file, name)
-    path = Path(text)
+    path = garment_path(text)
+    if path.suffix.lower() == ".pkl":
+        return _read_hood(str(path), split_name(text)[1])
     return GarmentSource(read_mesh_file(path), path.stem, is_metric=path.suffix.lower() == ".glb")
 
 

@@ -13,7 +13,7 @@ from eslr_jax.io.gltf_document import MOVES, GltfDocument, sample_keys
 from eslr_jax.io.mesh import POSITION_KEYS, read_mesh, shared_vertices
 from eslr_jax.io.motion import read_number
 from eslr_jax.io.npz import check_layout, read_arrays
-from eslr_jax.io.parsing import parsing
+from eslr_jax.io.parsing import parsing, split_name
 from eslr_jax.io.skeleton import MAX_FRAMES, whole_rate
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
@@ -75,7 +75,7 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         known = ", ".join(sequence.mesh for sequence in sequences)
         raise AssetError(
             f"{path}: {len(sequences)} meshes are moved by shapes, not one; it has {known}; name one, as in "
-            f"{Path(path).name.partition('#')[0]}#NAME"
+            f"{Path(split_name(path)[0]).name}#NAME"
         )
     return sequences[0]
 
@@ -85,7 +85,7 @@ def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[M
 
     Arguments and errors are those of `read_mesh_sequence`.
     """
-    file, _, mesh = str(path).partition("#")
+    file, mesh = split_name(path)
     if Path(file).suffix.lower() in GLTF_SUFFIXES:
         return _read_gltf(Path(file), mesh, fps)
     path = Path(path)

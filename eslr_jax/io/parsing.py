@@ -54,6 +54,14 @@ def parsing(
         ) from error
 
 
+def split_name(text: str | Path) -> tuple[str, str]:
+    """Split `FILE#NAME` into the file and the name, "" if there is none; a folder may have a # in its name."""
+    text = str(text)
+    start = max(text.rfind("/"), text.rfind("\\")) + 1
+    file, _, name = text[start:].partition("#")
+    return text[:start] + file, name
+
+
 def one_line(error: BaseException) -> str:
     """Return the first line of an error's text, cut short, or the error's type if it has no text."""
     lines = str(error).splitlines()

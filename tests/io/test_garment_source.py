@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from garment_bytes import FACES, POSITIONS, whole_file
 
+from eslr_jax.assets import load_motion
 from eslr_jax.errors import AssetError
+from eslr_jax.fit.outfit import garment_names
 from eslr_jax.io.garment import is_garment_file, read_garment_source
+from eslr_jax.io.mesh_sequence import read_mesh_sequence
+from eslr_jax.io.parsing import split_name
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +44,24 @@ def test_hood_garments_by_name_with_their_pins(hood):
         read_garment_source(hood)
     with pytest.raises(AssetError, match="has no garment 'coat'; it has tshirt, dress"):
         read_garment_source(f"{hood}#coat")
+
+
+def test_a_folder_may_have_the_sign_of_names_in_its_own(hood, tmp_path):
+    assert split_name("proj#2/dir/a.glb#walk") == ("proj#2/dir/a.glb", "walk")
+    assert split_name("proj#2/a.bvh") == ("proj#2/a.bvh", "")
+    folder = tmp_path / "proj#2"
+    folder.mkdir()
+    (folder / "garments_dict.pkl").write_bytes(hood.read_bytes())
+    assert read_garment_source(f"{folder}/garments_dict.pkl#dress").name == "dress"
+    np.savez(folder / "a.npz", positions=np.tile(POSITIONS, (3, 1, 1)), faces=FACES)
+    assert len(read_mesh_sequence(folder / "a.npz").positions) == 3
+    (folder / "a.glb").write_bytes(whole_file("glb", tmp_path))
+    with pytest.raises(AssetError, match="no mesh is moved by shapes"):  # found, and read
+        read_mesh_sequence(folder / "a.glb")
+    (folder / "a.bvh").write_text("HIERARCHY")
+    with pytest.raises(AssetError, match="the file ends here"):
+        load_motion(folder / "a.bvh")
+    assert garment_names([f"{folder}/a.obj", f"{folder}/garments_dict.pkl#dress"]) == ["a", "dress"]
 
 
 def test_formats_that_prescribe_metres_are_known(tmp_path):
