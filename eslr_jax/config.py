@@ -13,6 +13,18 @@ from eslr_jax.errors import ConfigError
 Criterion = Literal["postcvpr", "cvpr", "metric"]
 """Readings of HOOD's losses, see `physics.hood`."""
 
+COARSE_SETS = ("coarse0", "coarse1", "coarse2")
+"""Edge sets of a garment's coarse levels, finest first (HOOD)."""
+
+STAGES = (
+    ("coarse0", "mesh"),
+    ("coarse0", "coarse1"),
+    ("coarse1",),
+    ("coarse0", "coarse1"),
+    ("coarse0", "mesh"),
+)
+"""Edge sets of a hierarchical network's stages, in the order in which vertices read their sums (HOOD)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
@@ -93,15 +105,21 @@ class ModelConfig:
             raise ValueError(
                 'edge_latents = false needs features = "gradient", which tell a vertex its force'
             )
-        if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % 5):
+        if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % len(STAGES)):
             raise ValueError(
-                "hierarchical = true needs smoothing_steps = 0, and message_passing_steps a multiple of 5"
+                "hierarchical = true needs smoothing_steps = 0, and message_passing_steps a multiple of "
+                f"{len(STAGES)}"
             )
         if self.hierarchical and not (self.update_body and self.edge_latents):
             raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
         if self.update_body and not self.edge_latents:
             raise ValueError(
                 "update_body = true needs edge_latents = true: without messages no body row is read"
+            )
+        if self.output == "acceleration" and self.output_scale != ModelConfig.output_scale:
+            raise ValueError(
+                'output_scale needs output "correction", "descent" or "subspace": '
+                f"statistics scale an acceleration; leave it at {ModelConfig.output_scale}"
             )
         features = "hood" if self.output == "acceleration" else "gradient"  # without a guess, or of one
         if self.features != features:
@@ -211,7 +229,13 @@ class TrainConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("learning_rate", "clip_norm", "reset_stretch", "reset_displacement"):
+        for name in (
+            "learning_rate",
+            "clip_norm",
+            "reset_stretch",
+            "reset_displacement",
+            "collision_stiffness",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.iterations < 0 or (self.iterations and self.energy_set == "hood"):
@@ -224,7 +248,15 @@ class TrainConfig:
             raise ValueError(f'refinement_weights = "{self.refinement_weights}" needs iterations = 0')
         if self.refinement_weights == "contraction" and self.model.refinement_steps == 1:
             raise ValueError('refinement_weights = "contraction" needs a model with refinement_steps > 1')
-        for name in ("noise", "girth", "shape_range"):
+        for name in ("warmup", "final_learning_rate"):
+            if self.schedule == "hood" and getattr(self, name) != getattr(TrainConfig, name):
+                raise ValueError(f'{name} needs schedule = "cosine": HOOD\'s rate has no warm-up and no end')
+        is_hood = self.energy_set == "hood" and self.model.output == "acceleration"  # which sees no gradient
+        if is_hood and self.collision_stiffness != TrainConfig.collision_stiffness:
+            raise ValueError(
+                'collision_stiffness needs energy_set = "consistent": HOOD has a ramp of its own'
+            )
+        for name in ("noise", "girth", "shape_range", "warmup", "final_learning_rate"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("material_probability", "still_probability"):

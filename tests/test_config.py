@@ -41,6 +41,7 @@ def test_nested_unknown_key_names_its_table():
         ({"features": "magic"}, "not one of"),
         ({"refinement_steps": 3}, "refinement_steps > 1 needs"),
         ({"output_scale": -1.0}, "must be positive"),
+        ({"output_scale": 0.5}, 'output_scale needs output "correction"'),
         (
             {"update_body": True, "edge_latents": False, "features": "gradient", "output": "correction"},
             "update_body = true needs edge_latents = true",
@@ -89,6 +90,12 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('model = "mgn-5"\nenergy_set = "hood"\nself_contact = true', 'needs energy_set = "consistent"'),
         ('model = "smooth-small"\niterations = 9\nrefinement_weights = "last"', "needs iterations = 0"),
         ('model = "mgn-5"\nrefinement_weights = "contraction"', "refinement_steps > 1"),
+        ('model = "mgn-5"\nschedule = "hood"\nwarmup = 5', 'warmup needs schedule = "cosine"'),
+        ('model = "mgn-5"\nschedule = "hood"\nfinal_learning_rate = 0.0', "final_learning_rate needs"),
+        ('model = "mgn-5"\nenergy_set = "hood"\ncollision_stiffness = 1e7', "collision_stiffness needs"),
+        ('model = "mgn-5"\nwarmup = -1', "warmup must not be negative"),
+        ('model = "mgn-5"\nfinal_learning_rate = -1e-5', "final_learning_rate must not be negative"),
+        ('model = "mgn-5"\ncollision_stiffness = 0', "collision_stiffness must be positive"),
     ],
 )
 def test_broken_recipes_are_refused(tmp_path, text, message):
@@ -96,6 +103,10 @@ def test_broken_recipes_are_refused(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_recipe(path)
+
+
+def test_a_gradient_sees_the_collision_stiffness_beside_any_set_of_energies():
+    TrainConfig(model=MODELS["eslr-small"], energy_set="hood", collision_stiffness=1e7)
 
 
 def test_shipped_recipes_load():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -45,13 +46,17 @@ def control_garment(control: Control, garment: Garment) -> Garment:
 
     Args:
         control: "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same
-            spread, equal for equal garments.
+            spread, equal for equal garments however they are padded.
         garment: The garment.
     """
     embedding = garment.geodesic_embedding
     if control == "no_embedding":
         return garment.replace(geodesic_embedding=jnp.zeros_like(embedding))
     if control == "random_embedding":
-        noise = jax.random.normal(jax.random.key(0), embedding.shape)
-        return garment.replace(geodesic_embedding=noise * jnp.std(embedding, axis=0, keepdims=True))
+        is_real = garment.vertex_mask[:, None]
+        # One key a vertex, so that padding does not change what is drawn.
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.arange(len(embedding)))
+        noise = jax.vmap(lambda key: jax.random.normal(key, embedding.shape[1:]))(keys)
+        spread = jnp.std(embedding, axis=0, keepdims=True, where=is_real)
+        return garment.replace(geodesic_embedding=jnp.where(is_real, noise * spread, 0.0))
     return garment

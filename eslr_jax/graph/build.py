@@ -22,14 +22,12 @@ import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import COARSE_SETS, ModelConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
-
-COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 
 Rows = dict[str, Float[Array, "_ _"]]
 
@@ -127,8 +125,8 @@ def build_frame_graph(
         senders=senders,
         receivers=receivers,
         globals=topology,
-        n_node={name: jnp.array([rows.shape[0]]) for name, rows in nodes.items()},
-        n_edge={name: jnp.array([rows.shape[0]]) for name, rows in edges.items()},
+        n_node=None,
+        n_edge=None,
     )
 
 

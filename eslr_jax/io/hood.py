@@ -15,22 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
 from eslr_jax.errors import CheckpointError
 from eslr_jax.io.torch_archive import read_torch
 from eslr_jax.types import MIN_DEVIATION, Normalizer
 
 Tensors = Mapping[str, np.ndarray]
 
-# Edge sets of the five stages, in the order in which a stage's vertex perceptron reads their sums.
-STAGES = (
-    ("coarse_edge0", "mesh_edge"),
-    ("coarse_edge0", "coarse_edge1"),
-    ("coarse_edge1",),
-    ("coarse_edge0", "coarse_edge1"),
-    ("coarse_edge0", "mesh_edge"),
-)
-NUM_COARSE = 3  # coarse levels
 _NORMALIZERS = {"garment": "node", "mesh": "mesh_edge", "world": "world_edge", "output": "output"}
 _CORE = "_learned_model."
 
@@ -80,9 +71,9 @@ def _convert(tensors: Tensors) -> tuple[dict[str, Any], ModelConfig]:
         is_cvpr = f"{_CORE}processor_steps1.0.node_processor_dict.node.0.layers.0.weight" in tensors
         steps = 0
         trained["level_embedding"] = _tensor(tensors, "vertexlevel_embedding.weight")
-        for level in range(NUM_COARSE):
-            encoder = "edgeset_encoders.coarse" + ("" if is_cvpr else str(level))
-            trained[f"coarse_encoders_coarse{level}"] = _mlp(tensors, encoder)
+        for kind in COARSE_SETS:
+            encoder = "edgeset_encoders." + ("coarse" if is_cvpr else kind)
+            trained[f"coarse_encoders_{kind}"] = _mlp(tensors, encoder)
         for stage, sets in enumerate(STAGES):
             place = f"processor_steps{stage + 1}" if is_cvpr else f"levels.{stage}"
             count = _count(tensors, place)
@@ -117,9 +108,9 @@ def _flat_step(tensors: Tensors, name: str, size: int) -> dict[str, Any]:
 
 def _stage_step(tensors: Tensors, name: str, sets: tuple[str, ...]) -> dict[str, Any]:
     """Return a step of a hierarchical network on some edge sets."""
+    theirs = {"mesh": "mesh_edge"} | {kind: kind.replace("coarse", "coarse_edge") for kind in COARSE_SETS}
     edges = {
-        f"edge_mlps_{kind.replace('_edge', '')}": _mlp(tensors, f"{name}.edge_processor_dict.{kind}")
-        for kind in sets
+        f"edge_mlps_{kind}": _mlp(tensors, f"{name}.edge_processor_dict.{theirs[kind]}") for kind in sets
     }
     return {
         **edges,

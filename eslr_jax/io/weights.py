@@ -38,10 +38,11 @@ def write_weights(
         AssetError: A file can't be written.
     """
     path = Path(path)
-    write_arrays(path, dict(_flatten(params)), is_compressed=True)
     record = {"format": FORMAT, "model": to_dict(config), "training": training}
     with atomic_write(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(record, indent=2))
+    # Last, since it is by the archive that a network is taken for written.
+    write_arrays(path, dict(_flatten(params)), is_compressed=True)
 
 
 def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[str, Any]]:

@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
 from eslr_jax.graph import features
-from eslr_jax.graph.build import COARSE_SETS, Rows, feature_sizes, join_features
+from eslr_jax.graph.build import Rows, feature_sizes, join_features
 from eslr_jax.graph.operators import (
     MeshTables,
     coarse_tables,
@@ -42,13 +42,6 @@ from eslr_jax.models.lsdmp import WorldLatents, make_mlp
 from eslr_jax.models.mlp import MLP
 from eslr_jax.models.network import VELOCITY_COLUMNS, EncodeProcessDecode, Statistics
 
-STAGES = (
-    ("coarse0", "mesh"),
-    ("coarse0", "coarse1"),
-    ("coarse1",),
-    ("coarse0", "coarse1"),
-    ("coarse0", "mesh"),
-)
 NUM_LEVELS = len(COARSE_SETS) + 1  # of a vertex; 0 is on the mesh alone
 
 

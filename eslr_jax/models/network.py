@@ -1,7 +1,8 @@
 """Encode, process, decode: ESLR, and with fewer parts MeshGraphNet.
 
 The encoders' latents go through a stack of LSDMP layers and, beside it, through a stack of GSA blocks; the
-decoder reads both. Without smoothing and attention this is MeshGraphNet as in HOOD's baselines.
+decoder reads both. Without smoothing and attention, and with `ModelConfig.update_body`, this is MeshGraphNet as
+in HOOD's baselines; without `update_body` body rows keep their encoding.
 
 Source: paper, section on the simulation pipeline.
 """

@@ -17,10 +17,10 @@ import jraph
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import COARSE_SETS, ModelConfig
 from eslr_jax.errors import CheckpointError
 from eslr_jax.graph import features, normalizer
-from eslr_jax.graph.build import COARSE_SETS, Rows, Topology, feature_sizes
+from eslr_jax.graph.build import Rows, Topology, feature_sizes
 from eslr_jax.models.attention import orthogonal_projection
 from eslr_jax.models.branches import Places
 from eslr_jax.models.hood import NUM_LEVELS, HierarchicalNetwork

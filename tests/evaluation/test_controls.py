@@ -15,6 +15,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import stepped_potentials, trajectory_gap
+from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
@@ -82,6 +83,17 @@ def test_random_coordinates_keep_their_spread(scene):
     drawn = control_garment("random_embedding", scene.garment).geodesic_embedding
     np.testing.assert_allclose(jnp.std(drawn, axis=0), jnp.std(given, axis=0), rtol=0.5)
     assert not np.allclose(drawn, given)
+
+
+def test_random_coordinates_are_those_of_the_garment_in_any_bucket():
+    given = square(6)
+    padded = pad_garment(given, choose_bucket(given))
+    count = len(given.vertex_mask)
+    assert len(padded.vertex_mask) > count
+    drawn = control_garment("random_embedding", given).geodesic_embedding
+    again = control_garment("random_embedding", padded).geodesic_embedding
+    np.testing.assert_allclose(again[:count], drawn, rtol=1e-5)
+    np.testing.assert_array_equal(again[count:], 0)
 
 
 @pytest.mark.slow

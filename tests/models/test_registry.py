@@ -15,6 +15,7 @@ from reference_models import make_scene, quick_jit
 from eslr_jax.config import ModelConfig, from_dict, to_dict
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.graph.build import build_graph
+from eslr_jax.io import weights
 from eslr_jax.io.weights import read_weights, write_weights
 from eslr_jax.models.registry import (
     MODELS,
@@ -134,6 +135,18 @@ def assert_round_trip(folder, config, params):
     check_params(config, loaded)
     jax.tree.map(np.testing.assert_array_equal, loaded, params)
     return loaded
+
+
+def test_a_network_is_not_there_before_its_description(tmp_path, monkeypatch):
+    """Killed in between, an archive alone would be taken for a trained network."""
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(weights, "write_arrays", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_weights(tmp_path / "model.npz", new(SMALL), SMALL, {})
+    assert [path.name for path in tmp_path.iterdir()] == ["model.json"]
 
 
 def shrink(config):

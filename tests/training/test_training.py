@@ -416,7 +416,7 @@ def test_the_criterion_changes_the_loss(cheap_model, small_data):
 
 def test_hoods_curriculum_counts_trajectories(config):
     """Steps of HOOD's run by which its iterations, and so its horizon and its collision ramp, are known."""
-    hood = dataclasses.replace(config, schedule="hood", horizon=5, horizon_growth=5000)
+    hood = TrainConfig(model=config.model, schedule="hood", horizon=5, horizon_growth=5000)
     table = {0: (1, 0), 4_999: (1, 4_999), 5_000: (2, 5_000), 15_000: (3, 10_000), 29_999: (3, 14_999)}
     table |= {50_000: (5, 20_000), 200_000: (5, 50_000), 450_000: (5, 100_000)}
     for step, expected in table.items():
