@@ -30,10 +30,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float, Int
+from supervised import fit
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
@@ -50,7 +50,6 @@ from eslr_jax.types import Garment, Material
 SYSTEMS = ("pbns", "snug", "snug-m")
 WINDOW = 4  # frames; the first only tells where the others' contacts are searched
 _BATCH = 16  # windows
-_RATE = 1e-3  # GAPS and PBNS
 _UNIT = 0.1  # [J], of the loss
 _OFFSET = 0.01  # [m], of a displacement per unit of output
 _INPUTS = ("mean", "deviation", "joints")  # of a network, beside its weights
@@ -183,28 +182,30 @@ def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwo
     module = Displacements(system, garment.rest_positions.shape[0])
     width = seen.shape[1] + (4 if system == "snug-m" else 0)
     params = module.init(jax.random.key(seed), jnp.zeros((1, WINDOW, width)), jnp.zeros((4, 1, 256)))
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(_RATE, steps))
-    )
-    moments, losses = optimizer.init(params), []
     # Last frames of windows that lie within a clip.
     ends = np.flatnonzero(np.asarray(data.frames_left)[: 1 - WINDOW] >= WINDOW - 1) + WINDOW - 1
-    frames = jax.random.choice(jax.random.key(seed + 1), jnp.asarray(ends), (steps, _BATCH))
-    step = jax.jit(partial(_train_step, module=module, optimizer=optimizer))
-    began = time.process_time()
-    for k in range(steps):
-        params, moments, loss = step(params, moments, network, data, frames[k], jax.random.key(seed + 2 + k))
-        losses.append(float(loss))
-        if k % 50 == 0:
-            print(
-                f"{system} {name} step {k} loss {np.mean(losses[-50:]):.3f} {time.process_time() - began:.0f} s",
-                flush=True,
-            )
+    draw = np.random.default_rng(seed)
+    params, losses = fit(
+        partial(_loss_and_gradient, module),
+        params,
+        lambda _: (network, data, draw.choice(ends, _BATCH)),
+        steps,
+        seed,
+    )
     return network.replace(params=params), losses
 
 
-def _train_step(params, moments, network, data: TrainingData, frames, key, *, module, optimizer):
-    """Return weights, moments and loss after one step on a batch of windows."""
+def _loss_and_gradient(
+    module: Displacements,
+    params: Any,
+    batch: tuple[PosedNetwork, TrainingData, Int[Array, " windows"]],
+    key: Array,
+) -> tuple[Float[Array, ""], Any]:
+    """Return the loss of a batch of windows, given by their last frames, and its gradient.
+
+    An energy's slope is taken frame by frame, and pulled back through all positions at once.
+    """
+    network, data, frames = batch
     garment = data.garment(jnp.int32(0))
     keys = jax.random.split(key, _BATCH + 1)
     hidden = 0.1 * jax.random.normal(keys[0], (4, _BATCH, 256))  # GAPS
@@ -249,8 +250,7 @@ def _train_step(params, moments, network, data: TrainingData, frames, key, *, mo
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[2:])), samples)
     losses, slopes = jax.lax.map(slope_of, flat)
     cotangent = jnp.zeros_like(positions).at[:, 1:].set(slopes.reshape(after.shape) / len(losses))
-    updates, moments = optimizer.update(pull_back(cotangent)[0], moments, params)
-    return optax.apply_updates(params, updates), moments, jnp.mean(losses)
+    return jnp.mean(losses), pull_back(cotangent)[0]
 
 
 def write_network(network: PosedNetwork, path: Path, training: dict[str, Any]) -> None:

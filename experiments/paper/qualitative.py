@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rollouts import OPTIMUM, arguments, read_system, scenes_of, write
+from rollouts import OPTIMUM, arguments, not_finite, read_system, scenes_of, write
 from worn import Setting, Worn
 
 from eslr_jax.assets import load_body, load_splits
@@ -24,6 +24,7 @@ from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
@@ -96,12 +97,16 @@ def main() -> None:
     setting = Setting(tuple(garments), (clip,), chosen.frames, chosen.vertices)
     body = load_body()
     results: dict[tuple[str, str], tuple[Any, Worn, np.ndarray]] = {}
+    broken = dict.fromkeys(models, 0.0)
     for name in models:
         system = read_system(name)
         for worn, params in scenes_of(system, setting):
-            positions = rollout_scene(params, worn.scene, system.config).positions
-            energies = face_energies(positions, worn.scene)
-            results[name, worn.garment] = np.asarray(positions), worn, np.asarray(energies)
+            trajectory = rollout_scene(params, worn.scene, system.config)
+            if name == OPTIMUM:
+                raise_for_status(trajectory)
+            broken[name] += not_finite(trajectory) / len(garments)
+            energies = face_energies(trajectory.positions, worn.scene)
+            results[name, worn.garment] = np.asarray(trajectory.positions), worn, np.asarray(energies)
             print(name, worn.garment, flush=True)
 
     view = {"camera": _CAMERA, "size": _SIZE, "rest_positions": np.asarray(body.rest_positions), "rig": body}
@@ -140,6 +145,7 @@ def main() -> None:
     draw_distribution(joined, chosen.out / "stretch_energy_distribution.png")
     rows = {
         name: {
+            "not_finite": broken[name],  # share of rollouts, see `rollouts.not_finite`
             "mean_j_m2": float(values.mean()),
             **{f"p{100 * share:g}_j_m2": float(np.quantile(values, share)) for share in _SHARES},
         }

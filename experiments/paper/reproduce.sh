@@ -20,6 +20,7 @@ train() { # name, recipe, changes
   else
     eslr train --config "$recipe" --out "$folder" "${@/#/--set=}" ${STEPS:+--set=steps=$STEPS}
   fi
+  [[ -f $folder/model.npz ]] || exit 1 # after Ctrl-C it ends without an error
 }
 
 one_garment() { # script, system, arguments

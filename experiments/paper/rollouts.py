@@ -20,6 +20,7 @@ from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
 
 from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.errors import Status
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
 from eslr_jax.evaluation.evaluate import distance_mm
@@ -32,6 +33,7 @@ from eslr_jax.physics.hood import HoodParameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
@@ -164,11 +166,16 @@ def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Any]]:
 
 
 def find_references(setting: Setting) -> list[Reference]:
-    """Return the near-optimal rollout of every scene, and the optima from its states."""
+    """Return the near-optimal rollout of every scene, and the optima from its states.
+
+    Raises:
+        EslrError: One of them went wrong; see `raise_for_status`.
+    """
     system = read_system(OPTIMUM)
     found = []
     for worn, params in scenes_of(system, setting):
         trajectory = rollout_scene(params, worn.scene, system.config)
+        raise_for_status(trajectory)
         gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
         found.append(Reference(trajectory, gap))
         print(worn.garment, OPTIMUM, flush=True)
@@ -181,7 +188,8 @@ def measure_system(
     """Return the measures of a system on every garment, and on "all" of them.
 
     Energies and distances are means over frames, clips and garments; gaps are medians over frames: from the
-    states of the near-optimal rollout ("gap"), and from those of the system's own ("own_gap").
+    states of the near-optimal rollout ("gap"), and from those of the system's own ("own_gap"). "not_finite"
+    is the share of rollouts with a prediction that was not finite.
     """
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
@@ -191,6 +199,7 @@ def measure_system(
         trajectory = rollout_scene(params, scene, system.config)
         row = measure(trajectory, scene, worn.root_height())
         row["distance_mm"] = distance_mm(trajectory, reference, scene)
+        row["not_finite"] = not_finite(trajectory)
         left = stepped_potentials(params, reference, scene, system.config, every) - gap.optimum
         own = trajectory_gap(trajectory, scene, every=every)
         own_left = own.reached - own.optimum
@@ -206,7 +215,17 @@ def measure_system(
         means = {column: float(np.mean([row[column] for row in found])) for column in found[0]}
         rows[garment] = {**means, **dict(zip(_GAPS, medians.tolist(), strict=True))}
     print(name, {column: round(value, 4) for column, value in rows["all"].items()}, flush=True)
+    if share := rows["all"]["not_finite"]:
+        print(f"{name}: a frame was not finite in {share:.0%} of the rollouts; the guess may stand in for it")
     return rows
+
+
+def not_finite(trajectory: Trajectory) -> float:
+    """Return one where something was not finite at some frame, else zero.
+
+    A network that corrects the solver's guess falls back to it there, and the positions do not show it.
+    """
+    return float(Status.NON_FINITE in Status(int(trajectory.status)))
 
 
 def _gap_every(setting: Setting) -> int:

@@ -301,7 +301,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
 
     parts = {name: network.params[name] for name in ("encoder", "decoder")}
     parts, shape_losses = fit(
-        lambda params, batch, key: shape_loss(params, network, batch, rest, key),
+        jax.value_and_grad(lambda params, batch, key: shape_loss(params, network, batch, rest, key)),
         parts,
         lambda _: flat[draw.integers(len(flat), size=_SHAPES)],
         steps[0],
@@ -321,7 +321,7 @@ def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, di
         return features[chosen], offsets[chosen], latents[chosen]
 
     regressor, motion_losses = fit(
-        lambda params, batch, _: motion_loss(params, network, *batch),
+        jax.value_and_grad(lambda params, batch, _: motion_loss(params, network, *batch)),
         network.params["regressor"],
         sequences,
         steps[1],

@@ -102,7 +102,9 @@ def test_the_error_falls_on_a_frame_that_is_seen_again_and_again(space, moved):
     network = mat.Network(params, *scales[0], *scales[1], space)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes types
         _, losses = mat.fit(
-            lambda params, _, key: mat.loss(network.replace(params=params), seen, change, key),
+            jax.value_and_grad(
+                lambda params, _, key: mat.loss(network.replace(params=params), seen, change, key)
+            ),
             params,
             lambda _: None,
             60,

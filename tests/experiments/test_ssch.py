@@ -39,7 +39,7 @@ def test_a_motion_is_learnt_and_kept(tshirt, motion, tmp_path):
     latents = jnp.zeros((1, 12, 25))
     with jax.numpy_dtype_promotion("standard"):  # optax mixes types
         regressor, losses = ssch.fit(
-            lambda params, batch, _: ssch.motion_loss(params, network, *batch),
+            jax.value_and_grad(lambda params, batch, _: ssch.motion_loss(params, network, *batch)),
             network.params["regressor"],
             lambda _: (features, offsets, latents),
             200,

@@ -1,13 +1,19 @@
 """Tables of the paper that grow row by row."""
 
 import json
+import os
+import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from paper import rollouts
 from paper.rollouts import Setting, read_system
 from paper.tables import DEEP, check_costs, check_networks, plan_trainings, rows_of_setting, table_setting
 
 from eslr_jax.assets.catalog import asset_names
+from eslr_jax.errors import NonFiniteError, Status
 from eslr_jax.training.recipe import load_recipe
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
@@ -113,3 +119,50 @@ def test_rows_of_architectures_are_trained_by_their_recipe(tmp_path):
     ]
     assert [recipe.model.latent_size for recipe in recipes] == [64, 64, 128]
     assert recipes[0].model.output == "correction"
+
+
+@pytest.fixture
+def broken_rollouts(monkeypatch):
+    """Let every other rollout meet a number that is not finite; nothing is simulated."""
+    worn = SimpleNamespace(garment="tshirt", scene=None, root_height=lambda: 1.0)
+    states = [Status.NON_FINITE, Status.OK]
+    gap = SimpleNamespace(reached=np.ones(2), optimum=np.zeros(2), initial_gap=np.ones(2))
+
+    class Row(SimpleNamespace):
+        def __iter__(self):
+            return iter((self.garment, self.scene, None))
+
+    rows = [(Row(**vars(worn)), None) for _ in states]
+    found = iter(SimpleNamespace(status=int(bits), first_bad_frame=3, pair_demand=None) for bits in states)
+    monkeypatch.setattr(rollouts, "scenes_of", lambda *_: rows)
+    monkeypatch.setattr(rollouts, "rollout_scene", lambda *_: next(found))
+    monkeypatch.setattr(rollouts, "trajectory_gap", lambda *_, **__: gap)
+    monkeypatch.setattr(rollouts, "stepped_potentials", lambda *_: np.ones(2))
+    monkeypatch.setattr(rollouts, "distance_mm", lambda *_: 0.0)
+    monkeypatch.setattr(rollouts, "measure", lambda *_: {"total": 1.0})
+    return [rollouts.Reference(None, gap)] * len(states)
+
+
+def test_a_row_says_in_how_many_rollouts_a_network_was_not_finite(broken_rollouts, capsys):
+    rows = rollouts.measure_system("guess", SETTING, broken_rollouts)
+    assert rows["all"]["not_finite"] == rows["tshirt"]["not_finite"] == 0.5
+    assert "not finite in 50% of the rollouts" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("broken_rollouts")
+def test_a_reference_that_is_not_finite_is_refused():
+    with pytest.raises(NonFiniteError, match="frame 3"):
+        rollouts.find_references(SETTING)
+
+
+def test_the_papers_script_stops_where_a_training_was_stopped(tmp_path):
+    """`eslr train` ends without an error after Ctrl-C."""
+    for name in ("eslr", "python"):
+        program = tmp_path / name
+        program.write_text(f'#!/bin/sh\necho {name} >> "{tmp_path}/calls"\n')
+        program.chmod(0o755)
+    script = Path(rollouts.__file__).with_name("reproduce.sh")
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    ended = subprocess.run(["bash", script, "small", tmp_path / "out"], env=path, check=False)
+    assert ended.returncode == 1
+    assert (tmp_path / "calls").read_text().split() == ["eslr"]
