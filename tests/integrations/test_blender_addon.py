@@ -10,6 +10,7 @@ import tomllib
 import zipfile
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from formats import write_walker
 
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.topology import vertex_normals
+from eslr_jax.io.mesh import read_mesh_file
 
 ROOT = Path(__file__).parents[2]
 ADDON = ROOT / "integrations" / "blender"
@@ -92,15 +94,20 @@ class _Modifiers(list):
         self.insert(end, self.pop(start))
 
 
+def without_blender(monkeypatch):
+    """Return `exchange`; what is tested of it needs nothing of `bpy`."""
+    monkeypatch.setitem(sys.modules, "bpy", ModuleType("bpy"))
+    monkeypatch.delitem(sys.modules, "exchange", raising=False)
+    return importlib.import_module("exchange")
+
+
 @pytest.mark.parametrize(("first", "fps", "report"), [
     (0, 24, {}), (1, 24, {"motion_start_s": 0.0}), (1, 24, {"motion_start_s": 1 / 24}),
     (5, 60, {"motion_start_s": 0.5}),
 ])  # fmt: skip
 def test_the_cache_begins_where_the_simulation_does(tmp_path, monkeypatch, first, fps, report):
     """Blender shows sample `frame_scale * frame - frame_start` (`MOD_meshcache.cc`)."""
-    monkeypatch.setitem(sys.modules, "bpy", ModuleType("bpy"))  # what is tested needs none of it
-    monkeypatch.delitem(sys.modules, "exchange", raising=False)
-    exchange = importlib.import_module("exchange")
+    exchange = without_blender(monkeypatch)
     (tmp_path / "report.json").write_text(json.dumps(report))
     start = exchange.read_start(tmp_path / "report.json")
     garment = SimpleNamespace(matrix_world=np.eye(4), modifiers=_Modifiers())
@@ -109,6 +116,89 @@ def test_the_cache_begins_where_the_simulation_does(tmp_path, monkeypatch, first
     frame = first + fps * report.get("motion_start_s", 0.0)  # that the first sample belongs to
     assert cache.frame_scale * frame - cache.frame_start == pytest.approx(0.0)
     assert cache.frame_scale * (frame + fps) - cache.frame_start == pytest.approx(30.0)
+
+
+def test_a_cache_that_can_t_be_written_leaves_the_last_one(tmp_path, monkeypatch):
+    exchange = without_blender(monkeypatch)
+    garment = SimpleNamespace(matrix_world=np.eye(4), modifiers=_Modifiers())
+    scene = SimpleNamespace(frame_start=0, render=SimpleNamespace(fps=24, fps_base=1.0))
+    exchange.lay_cache(garment, np.zeros((3, 4, 3)), tmp_path / "a.pc2", scene, start=0.0)
+    before = (tmp_path / "a.pc2").read_bytes()
+
+    def fill(path, data):
+        path.open("wb").close()  # as a full disk does
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(OSError, match="no space left"):
+        exchange.lay_cache(garment, np.ones((3, 4, 3)), tmp_path / "a.pc2", scene, start=0.0)
+    assert (tmp_path / "a.pc2").read_bytes() == before
+
+
+class _Values(list):
+    """A collection of Blender that gives its values at once."""
+
+    def foreach_get(self, name, target):
+        target[:] = np.ravel(self)
+
+
+@pytest.mark.parametrize("has_uvs", [True, False])
+def test_a_garment_goes_to_the_simulator_with_its_texture(tmp_path, monkeypatch, has_uvs):
+    exchange = without_blender(monkeypatch)
+    uvs = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0], [1, 0.5], [0, 0.25]])
+    faces = [SimpleNamespace(vertices=[0, 1, 2, 3], loop_indices=range(4))]
+    faces.append(SimpleNamespace(vertices=[2, 1, 4], loop_indices=range(4, 7)))
+    layer = SimpleNamespace(data=_Values(uvs)) if has_uvs else None
+    mesh = SimpleNamespace(
+        vertices=_Values([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [2, 0, 0]]),
+        polygons=faces,
+        loops=range(7),
+        uv_layers=SimpleNamespace(active=layer),
+    )
+    garment = SimpleNamespace(name="shirt", data=mesh, matrix_world=np.eye(4))
+    scene = SimpleNamespace(frame_start=0, frame_end=3, frame_current=1, frame_set=lambda frame: None)
+    exchange.export_garment(tmp_path / "garment.obj", garment, scene)
+    read = read_mesh_file(tmp_path / "garment.obj")
+    assert read.faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 1, 4]]
+    if not has_uvs:
+        assert read.corner_uvs is None
+        return
+    np.testing.assert_allclose(read.corner_uvs, uvs[[[0, 1, 2], [0, 2, 3], [4, 5, 6]]])
+
+
+def test_a_garment_that_an_undo_made_anew_takes_the_simulation(tmp_path, monkeypatch):
+    """Blender's objects don't outlive an undo; their names do."""
+    kinds = ("AddonPreferences", "Object", "Operator", "Panel", "PropertyGroup")
+    bpy = MagicMock(types=SimpleNamespace(**{kind: type(kind, (), {}) for kind in kinds}))
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    for name in ("eslr_garments", "eslr_garments.exchange"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    addon = importlib.import_module("eslr_garments")
+    laid, said = [], []
+    monkeypatch.setattr(addon.exchange, "read_motion", lambda path, garment: [garment])
+    monkeypatch.setattr(addon.exchange, "read_start", lambda path: 0.0)
+    monkeypatch.setattr(addon.exchange, "lay_cache", lambda garment, *rest, **options: laid.append(garment))
+    operator, garment = addon.ESLR_OT_simulate(), SimpleNamespace(name="shirt")
+    context = MagicMock()
+    context.scene.eslr = SimpleNamespace(garment=garment, body=None)
+    operator.report = lambda kind, text: said.append(text)
+    monkeypatch.setattr(operator, "_cache_path", lambda settings: tmp_path / "a.pc2", raising=False)
+    monkeypatch.setattr(addon.exchange, "export_body", lambda *rest: None)
+    monkeypatch.setattr(addon.exchange, "export_garment", lambda *rest: None)
+    monkeypatch.setattr(addon, "simulation_steps", lambda *rest: [])
+    for objects, result in (({"shirt": "anew"}, "FINISHED"), ({}, "CANCELLED")):
+        bpy.data.objects = objects
+        assert operator._begin(context)
+        operator._is_placed = True
+        operator._job = SimpleNamespace(
+            poll=lambda: True, text="", num_done=1, warnings=[], cancel=lambda: None
+        )
+        assert operator._go_on(context) == {result}
+    assert laid == ["anew"]
+    assert said == [
+        "shirt follows 1 simulated frames",
+        "shirt is gone or has another name; simulate it again",
+    ]
 
 
 @pytest.mark.slow

@@ -131,7 +131,7 @@ class ESLR_OT_simulate(bpy.types.Operator):
         """Write what the simulator reads; return whether it can start."""
         settings = context.scene.eslr
         self._timer, self._folder = None, Path(tempfile.mkdtemp(prefix="eslr_"))
-        self._garment, self._frame = settings.garment, context.scene.frame_current
+        self._name = settings.garment.name  # an undo meanwhile makes another object of it
         python = context.preferences.addons[__package__].preferences.python
         try:
             exchange.export_body(self._folder / "body.glb", settings.body, context)
@@ -157,12 +157,13 @@ class ESLR_OT_simulate(bpy.types.Operator):
                 self._is_placed = True
             if not is_done:
                 return None
-            positions = exchange.read_motion(self._folder / "motion.npz", self._garment)
+            garment = bpy.data.objects.get(self._name)
+            if garment is None:
+                raise ExchangeError(f"{self._name} is gone or has another name; simulate it again")
+            positions = exchange.read_motion(self._folder / "motion.npz", garment)
             start = exchange.read_start(self._folder / "run" / "report.json")
-            exchange.lay_cache(
-                self._garment, positions, self._cache_path(settings), context.scene, start=start
-            )
-        except (ExchangeError, JobError, OSError) as error:
+            exchange.lay_cache(garment, positions, self._cache_path(settings), context.scene, start=start)
+        except (ExchangeError, JobError, OSError, ReferenceError) as error:
             self._job.cancel()
             self._end(context)
             self.report({"ERROR"}, str(error))
@@ -170,7 +171,7 @@ class ESLR_OT_simulate(bpy.types.Operator):
         self._end(context)
         for text in self._job.warnings:
             self.report({"WARNING"}, text)
-        self.report({"INFO"}, f"{self._garment.name} follows {len(positions)} simulated frames")
+        self.report({"INFO"}, f"{self._name} follows {len(positions)} simulated frames")
         return {"FINISHED"}
 
     def _cache_path(self, settings) -> Path:
@@ -181,7 +182,7 @@ class ESLR_OT_simulate(bpy.types.Operator):
                 {"WARNING"}, "this file is not saved: its cache is temporary, and lost with the next start"
             )
             folder = str(Path(bpy.app.tempdir) / folder.removeprefix("//"))
-        return Path(bpy.path.abspath(folder)) / f"{bpy.path.clean_name(self._garment.name)}.pc2"
+        return Path(bpy.path.abspath(folder)) / f"{bpy.path.clean_name(self._name)}.pc2"
 
     def _end(self, context) -> None:
         """Take away what only the run needed."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def export_body(path: Path, body: bpy.types.Object, context: bpy.types.Context) 
 
 
 def export_garment(path: Path, garment: bpy.types.Object, scene: bpy.types.Scene) -> None:
-    """Write a garment's own mesh, without modifiers, where it is in the world.
+    """Write a garment's own mesh and its active texture coordinates, without modifiers, where it is in the world.
 
     Raises:
         ExchangeError: It has no faces, or moves as a whole.
@@ -100,7 +101,15 @@ def export_garment(path: Path, garment: bpy.types.Object, scene: bpy.types.Scene
     mesh.vertices.foreach_get("co", points.reshape(-1))
     matrix = np.array(garment.matrix_world)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in to_y_up(points @ matrix[:3, :3].T + matrix[:3, 3])]
-    lines += ["f " + " ".join(str(vertex + 1) for vertex in face.vertices) for face in mesh.polygons]
+    layer = mesh.uv_layers.active
+    if layer is not None and len(layer.data) == len(mesh.loops):
+        uvs = np.empty((len(mesh.loops), 2), np.float32)
+        layer.data.foreach_get("uv", uvs.reshape(-1))
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in uvs]
+        corners = [zip(face.vertices, face.loop_indices, strict=True) for face in mesh.polygons]
+        lines += ["f " + " ".join(f"{vertex + 1}/{loop + 1}" for vertex, loop in face) for face in corners]
+    else:
+        lines += ["f " + " ".join(str(vertex + 1) for vertex in face.vertices) for face in mesh.polygons]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -160,7 +169,9 @@ def lay_cache(
     path.parent.mkdir(parents=True, exist_ok=True)
     # Magic, version, points, first frame, frames per sample, samples.
     header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, local.shape[1], 0.0, 1.0, local.shape[0])
-    path.write_bytes(header + local.tobytes())
+    new = path.with_name(f".{path.name}")
+    new.write_bytes(header + local.tobytes())
+    os.replace(new, path)  # the last cache stays if the disk is full
     for modifier in garment.modifiers:
         if modifier.type in _HINDERING and modifier.name != MODIFIER:
             modifier.show_viewport = modifier.show_render = False
