@@ -63,7 +63,7 @@ def write_run(
         AssetError: A file can't be written.
     """
     rig, poses, stored = actor
-    ensure_output_dir(folder)
+    folder = ensure_output_dir(folder)
     file = TrajectoryFile(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
