@@ -180,7 +180,7 @@ def test_a_garment_that_an_undo_made_anew_takes_the_simulation(tmp_path, monkeyp
     monkeypatch.setattr(addon.exchange, "lay_cache", lambda garment, *rest, **options: laid.append(garment))
     operator, garment = addon.ESLR_OT_simulate(), SimpleNamespace(name="shirt")
     context = MagicMock()
-    context.scene.eslr = SimpleNamespace(garment=garment, body=None)
+    context.scene.eslr.garment = garment
     operator.report = lambda kind, text: said.append(text)
     monkeypatch.setattr(operator, "_cache_path", lambda settings: tmp_path / "a.pc2", raising=False)
     monkeypatch.setattr(addon.exchange, "export_body", lambda *rest: None)
