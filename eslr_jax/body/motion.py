@@ -74,7 +74,9 @@ def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: f
         rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=_front(body))
     root = np.asarray(body.joint_rest_positions)[0].copy()
     root[1] -= float(np.asarray(body.rest_positions)[:, 1].min())  # soles on the floor
-    return Motion("still", rotations, np.tile(root, (num_frames, 1)), fps, body.joint_names, arm_abduction=0.0)
+    return Motion(
+        "still", rotations, np.tile(root, (num_frames, 1)), fps, body.joint_names, arm_abduction=0.0
+    )
 
 
 def pose_body(

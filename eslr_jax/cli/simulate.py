@@ -346,7 +346,9 @@ def _write(options: Options, out: Path, setting: _Setting, simulation: Simulatio
             **_measure(setting.method, shown, poses, stored),
         }
     with waiting("writing files"):
-        track = ClothTrack(trajectory.positions, trajectory.velocities, trajectory.friction_loads)
+        track = ClothTrack(
+            trajectory.positions, trajectory.velocities, trajectory.friction_loads, trajectory.residuals
+        )
         write_run(out, track, scene, (rig, poses, stored), report=report)
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:

@@ -91,10 +91,12 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
 
 
 def run_trajectory(run: Run, scene: Scene) -> Trajectory:
-    """Return the trajectory of a run in its scene, without energies and residuals, which no file holds."""
+    """Return the trajectory of a run in its scene, without energies, which no file holds."""
     track = run.trajectory
-    loads = track.friction_loads  # None: a run of an older version, or somebody else's
-    return foreign_trajectory(track.positions, scene, velocities=track.velocities, friction_loads=loads)
+    # Friction loads and residuals are None in a run of an older version, or somebody else's.
+    loads, residuals = track.friction_loads, track.residuals
+    own = foreign_trajectory(track.positions, scene, velocities=track.velocities, friction_loads=loads)
+    return own if residuals is None else own.replace(residuals=jnp.asarray(residuals))
 
 
 def run_poses(run: Run, scene: Scene) -> BodyMotion | None:

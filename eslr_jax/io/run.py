@@ -40,6 +40,7 @@ class ClothTrack(NamedTuple):
     positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
     friction_loads: Float[Array, "frames vertices"]  # [N]
+    residuals: Float[Array, " frames"] | None = None  # force norm over weight that each frame ended with
 
 
 def write_run(
@@ -72,6 +73,7 @@ def write_run(
         timestep=float(poses.timestep),
         body=_body_track(scene, rig, poses),
         friction_loads=np.asarray(track.friction_loads),
+        residuals=None if track.residuals is None else np.asarray(track.residuals),
         ground=None if scene.ground is None else float(scene.ground),
         material=jax.tree.map(_stored_number, scene.material),
     )

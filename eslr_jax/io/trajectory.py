@@ -3,7 +3,7 @@
 Layout, in SI units, Y up, float32: `format`, `metadata` (JSON text), `timestep`, `positions`, `velocities`
 [frames, vertices, 3] and `faces` [faces, 3]. Optional parts, whole or absent:
 
-- `friction_loads` [frames, vertices];
+- `friction_loads` [frames, vertices], and `residuals` [frames];
 - `ground`, the height of a level ground;
 - the fabric: `material_density`, `material_lame_mu`, ..., each a scalar or one value per element;
 - the body: `body_positions` [frames, body_vertices, 3], `body_faces`, `body_rest_positions`, `contact_faces` and
@@ -51,6 +51,7 @@ _LAYOUT = {
     "velocities": ("f", "frames vertices 3"),
     "faces": ("iu", "faces 3", "vertices"),
     "friction_loads": ("f", "frames vertices"),
+    "residuals": ("f", "frames"),
     "ground": ("f", ""),
     "body_positions": ("f", "frames body_vertices 3"),
     "body_faces": ("iu", "body_faces 3", "body_vertices"),
@@ -98,6 +99,7 @@ class TrajectoryFile:
     friction_loads: np.ndarray | None = None  # [frames, vertices], normal force that friction acts with [N]
     material: Material | None = None  # NumPy leaves
     ground: float | None = None  # height of a level ground [m]
+    residuals: np.ndarray | None = None  # [frames], force norm over weight that each frame ended with
 
     @property
     def num_frames(self) -> int:
@@ -129,8 +131,9 @@ def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
         "velocities": trajectory.velocities,
         "faces": trajectory.faces,
     }
-    if trajectory.friction_loads is not None:
-        arrays["friction_loads"] = trajectory.friction_loads
+    for name in ("friction_loads", "residuals"):
+        if (values := getattr(trajectory, name)) is not None:
+            arrays[name] = values
     if trajectory.ground is not None:
         arrays["ground"] = np.float64(trajectory.ground)
     body = trajectory.body
@@ -204,6 +207,7 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         arrays.get("friction_loads"),
         material,
         float(arrays["ground"]) if "ground" in arrays else None,
+        arrays.get("residuals"),
     )
 
 

@@ -11,6 +11,7 @@ import pytest
 from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import AssetError
+from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
 from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
@@ -212,7 +213,8 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
     poses = pose_body(rig, still_motion(rig, 3))
     scene = prepare_scene(prepare_stored(garment), poses)
     moved = np.repeat(np.asarray(scene.initial_state.position)[None], 3, axis=0)
-    track = ClothTrack(moved, np.zeros_like(moved), np.zeros(moved.shape[:2]))
+    residuals = np.arange(len(moved), dtype=np.float32)
+    track = ClothTrack(moved, np.zeros_like(moved), np.zeros(moved.shape[:2]), residuals)
     write_run(tmp_path, track, scene, (rig, poses, garment), report={"total": 1.0})
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["animation.glb", "garment.npz", "report.json", "trajectory.npz"]
@@ -233,3 +235,5 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
     kept = read_run(tmp_path)
     assert kept.report == {"total": 1.0}
     np.testing.assert_allclose(kept.trajectory.positions, moved, atol=1e-5)
+    again = run_trajectory(kept, run_scene(kept, *run_garment(kept)))
+    np.testing.assert_array_equal(again.residuals, residuals)
