@@ -21,6 +21,7 @@ from eslr_jax.types import (
     BodyMotion,
     Garment,
     Material,
+    PairCapacity,
     Scene,
     SceneBody,
     Trajectory,
@@ -71,6 +72,9 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         body = SceneBody(surface, places, has_skin=has_skin, has_tips=has_tips)
     has_layers = has_contact and bool(run.report.get("self_contact"))
     has_pieces = run.report.get("self_contact") == "pieces"
+    capacity = default_capacity(positions.shape[1])  # of runs of an older version
+    if pairs := run.report.get("self_contact_pairs"):
+        capacity = PairCapacity(pairs=pairs)
     start = initial_state(positions[0], velocities[0]).replace(frame=jnp.int32(run.report.get("settle", 0)))
     return Scene(
         garment=garment,
@@ -81,7 +85,7 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         body=body,
         pin_targets=positions if bool(np.any(garment.is_pinned)) else None,
         num_frames=trajectory.num_frames,
-        self_contact=default_capacity(positions.shape[1]) if has_layers else None,
+        self_contact=capacity if has_layers else None,
         pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and has_pieces else None,
         ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
         air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),

@@ -9,8 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from eslr_jax.contact.self_contact import default_capacity
-from eslr_jax.errors import CapacityError, ConfigError, MissingExtraError, MotionError, NonFiniteError
+from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFiniteError
 from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
 from eslr_jax.evaluation.metrics import face_stretches
@@ -22,7 +21,7 @@ from eslr_jax.scene.build import skin_garment
 from eslr_jax.types import BodyMotion, PairCapacity, Scene, Trajectory
 
 EVERY = 4  # frames between those whose gap and intersections are measured, as in `eslr evaluate`
-_ROWS = 256  # of self-contact, to whose multiple buffers are rounded: few sizes are compiled
+_ROWS = 256  # of self-contact, to whose multiple larger buffers are rounded: few sizes are compiled
 _LEAST_FRAMES = (
     3  # the gap is measured from the second simulated frame on: the first one's velocity is guessed
 )
@@ -69,26 +68,18 @@ def score_trajectory(
         ConfigError: `every` is less than one.
         MotionError: There are fewer than three frames, or another number of frames or vertices than in the scene.
         NonFiniteError: A position is NaN or infinite.
-        CapacityError: More cloth touches cloth than there is room for.
     """
     positions = np.asarray(trajectory.positions if isinstance(trajectory, Trajectory) else trajectory)
     _check(positions, scene, every)
-    if scene.self_contact is not None:  # the buffers that `simulate` begins with may be too small
-        room = max(scene.self_contact.pairs, default_capacity(positions.shape[1]).pairs)
-        scene = scene.replace(self_contact=PairCapacity(pairs=room))
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
     before = trajectory
     trajectory = with_energies(before, scene)
-    if scene.self_contact is not None:
-        pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
-        if pairs > room:
-            raise CapacityError(
-                f"{pairs} pairs of cloth touch, and the scene has room for {room}; give one with more in "
-                "self_contact"
-            )
-        # What is left is solved often, and every row costs in every iteration.
-        scene = scene.replace(self_contact=PairCapacity(pairs=_ROWS * -(-max(pairs, 1) // _ROWS)))
+    if scene.self_contact is not None:  # the buffers that `simulate` begins with may be too small
+        pairs = int(np.max(np.asarray(trajectory.pair_demand)))
+        if pairs > scene.self_contact.pairs:
+            scene = scene.replace(self_contact=PairCapacity(pairs=_ROWS * -(-pairs // _ROWS)))
+            trajectory = with_energies(before, scene)
     report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:

@@ -91,6 +91,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     """Return the part of a report that describes its scene, from which `evaluation.run_scene` rebuilds it."""
     return {
         "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
+        "self_contact_pairs": None if scene.self_contact is None else scene.self_contact.pairs,
         "integrator": "euler" if scene.initial_state.past is None else "bdf2",
         "substeps": scene.substeps,
         "skin_contacts": scene.body is not None and scene.body.has_skin,
