@@ -16,7 +16,6 @@ from eslr_jax.cli.console import app, use_compile_cache, waiting
 from eslr_jax.errors import AssetError, ConfigError
 
 _ARCHITECTURE = "eslr-15"  # the paper's
-_MOTION = "cmu_016_32"  # of a scene
 
 
 @app.command
@@ -152,9 +151,9 @@ def _list_fabrics(as_json: bool) -> None:
 
 @app.command
 def info(
-    model: str = _ARCHITECTURE,
+    model: str | None = None,
     scene: str | None = None,
-    motion: str = _MOTION,
+    motion: str | None = None,
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
     simulator: Literal["network", "physics"] = "physics",
     self_contact: bool = False,
@@ -163,23 +162,24 @@ def info(
     """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs.
 
     Args:
-        model: Name of an architecture, or of a bundled network, or an exported file, as for `eslr simulate`.
+        model: Name of an architecture, or of a bundled network, or an exported file, as for `eslr simulate`; by
+            default the paper's, eslr-15.
         scene: A garment, by name or file, on the bundled body.
-        motion: Motion of the scene.
+        motion: Motion of the scene, by default cmu_016_32.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
         simulator: Simulator of the scene; the network is the default one.
         self_contact: Keep all layers of cloth apart, also where they don't seem to meet.
         json_: Print as JSON.
     """
     if scene is not None:
-        if model != _ARCHITECTURE:
+        if model is not None:
             raise ConfigError(
                 "--model shows an architecture, --scene a scene with the default network: give one"
             )
         _show_scene(scene, motion, vertices, simulator, self_contact, json_)
         return
     _refuse_given("only a --scene takes these", {
-        "--motion": motion != _MOTION, "--vertices": vertices != "1k", "--simulator": simulator != "physics",
+        "--motion": motion is not None, "--vertices": vertices != "1k", "--simulator": simulator != "physics",
         "--self-contact": self_contact,
     })  # fmt: skip
     from eslr_jax.assets import load_model
@@ -187,6 +187,7 @@ def info(
     from eslr_jax.config import to_dict
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
 
+    model = model or _ARCHITECTURE
     if model in MODELS:
         config = MODELS[model]
         params = init_model(config)
@@ -208,7 +209,7 @@ def info(
 
 def _show_scene(
     garment: str,
-    motion: str,
+    motion: str | None,
     vertices: Literal["1k", "4k", "10k", "50k", "200k"],
     simulator: Literal["network", "physics"],
     self_contact: bool,
@@ -218,6 +219,7 @@ def _show_scene(
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
     from eslr_jax.assets.garments import check_resolution
     from eslr_jax.assets.models import DEFAULT_MODEL
+    from eslr_jax.assets.motions import DEFAULT_MOTION
     from eslr_jax.body.motion import pose_body
     from eslr_jax.cli.method import BEHIND_NETWORK, ITERATIONS
     from eslr_jax.config import SimConfig
@@ -233,7 +235,7 @@ def _show_scene(
     )
     with waiting("measuring"):
         rig = load_body()
-        poses = pose_body(rig, load_motion(motion))
+        poses = pose_body(rig, load_motion(motion or DEFAULT_MOTION))
         scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses, options=options)
         parts = describe_scene(scene, poses, config)
         costs = time_parts(params, scene, config)
