@@ -83,7 +83,10 @@ def models() -> list[dict]:
     entries = []
     for file in sorted((DATA / "models").glob("*.npz"), key=lambda file: file.stem):
         training = json.loads(file.with_suffix(".json").read_text())["training"]
-        description = f"{training['steps']} steps at {' and '.join(training['vertices'])}"
+        where = f"at {' and '.join(training['vertices'])}"
+        if "stages" in training:
+            where = f"({'; '.join(stage.partition(':')[0] for stage in training['stages'])})"
+        description = f"{training['steps']} steps {where}"
         entries.append(entry("model", file.stem, file, "model", description))
     return entries
 

@@ -116,11 +116,6 @@ class ModelConfig:
             raise ValueError(
                 "update_body = true needs edge_latents = true: without messages no body row is read"
             )
-        if self.output == "acceleration" and self.output_scale != ModelConfig.output_scale:
-            raise ValueError(
-                'output_scale needs output "correction", "descent" or "subspace": '
-                f"statistics scale an acceleration; leave it at {ModelConfig.output_scale}"
-            )
         features = "hood" if self.output == "acceleration" else "gradient"  # without a guess, or of one
         if self.features != features:
             raise ValueError(f'output = "{self.output}" needs features = "{features}"')
@@ -251,6 +246,11 @@ class TrainConfig:
         for name in ("warmup", "final_learning_rate"):
             if self.schedule == "hood" and getattr(self, name) != getattr(TrainConfig, name):
                 raise ValueError(f'{name} needs schedule = "cosine": HOOD\'s rate has no warm-up and no end')
+        if self.model.output == "acceleration" and self.model.output_scale != ModelConfig.output_scale:
+            raise ValueError(
+                'model.output_scale needs output "correction", "descent" or "subspace": '
+                f"statistics scale an acceleration; leave it at {ModelConfig.output_scale}"
+            )
         is_hood = self.energy_set == "hood" and self.model.output == "acceleration"  # which sees no gradient
         if is_hood and self.collision_stiffness != TrainConfig.collision_stiffness:
             raise ValueError(

@@ -41,7 +41,6 @@ def test_nested_unknown_key_names_its_table():
         ({"features": "magic"}, "not one of"),
         ({"refinement_steps": 3}, "refinement_steps > 1 needs"),
         ({"output_scale": -1.0}, "must be positive"),
-        ({"output_scale": 0.5}, 'output_scale needs output "correction"'),
         (
             {"update_body": True, "edge_latents": False, "features": "gradient", "output": "correction"},
             "update_body = true needs edge_latents = true",
@@ -91,6 +90,10 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('model = "smooth-small"\niterations = 9\nrefinement_weights = "last"', "needs iterations = 0"),
         ('model = "mgn-5"\nrefinement_weights = "contraction"', "refinement_steps > 1"),
         ('model = "mgn-5"\nschedule = "hood"\nwarmup = 5', 'warmup needs schedule = "cosine"'),
+        (
+            'steps = 2\nmodel = { base = "mgn-5", output_scale = 0.5 }',
+            'output_scale needs output "correction"',
+        ),
         ('model = "mgn-5"\nschedule = "hood"\nfinal_learning_rate = 0.0', "final_learning_rate needs"),
         ('model = "mgn-5"\nenergy_set = "hood"\ncollision_stiffness = 1e7', "collision_stiffness needs"),
         ('model = "mgn-5"\nwarmup = -1', "warmup must not be negative"),

@@ -8,8 +8,9 @@ import pytest
 import trimesh
 from chromium import CHROMIUM, launch
 
+from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
 from eslr_jax.io.run import read_run
-from eslr_jax.physics.materials import fabric_material
+from eslr_jax.physics.materials import constants_for, fabric_material
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
@@ -154,13 +155,20 @@ def newest_run(live):
 
 
 def test_a_recording_is_a_run(player):
+    player.live.controls["fabric"].value = "denim"  # its contacts are stiffer than those of cotton, the first
+    player.wait(3)
     player.live.controls["record"].value = True
     player.wait(6)
     player.live.controls["record"].value = False
     player.wait(3)
+    player.live.controls["fabric"].value = "cotton"
     run = newest_run(player.live)
     assert 6 <= run.trajectory.num_frames <= 8
     assert run.report["motion"] == "turn"
+    scene = run_scene(run, *run_garment(run))
+    stiffness = constants_for(fabric_material("denim")).collision_stiffness
+    assert float(scene.constants.collision_stiffness) == pytest.approx(float(stiffness), rel=1e-5)
+    assert run_trajectory(run, scene).residuals[-1] > 0, "a score steps each frame as the page did"
     assert trimesh.load(player.live.out / "1" / "animation.glb").geometry
 
 

@@ -28,7 +28,7 @@ from eslr_jax.geometry.repair import (
 )
 from eslr_jax.geometry.topology import face_areas, face_cross_products, vertex_components
 from eslr_jax.geometry.validate import check_arrays, validate_mesh
-from eslr_jax.io.garment import GarmentFile, GarmentSource
+from eslr_jax.io.garment import GarmentFile, GarmentSource, first_rows
 from eslr_jax.types import Body
 
 _MAX_COORDINATE = 1e6  # beyond it no unit makes a garment
@@ -90,7 +90,9 @@ def fit_garment(
     clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
     is_turned = _turned_faces(clean, posture)
     sewn, face_source, lost = clean.positions, clean.face_source, []
-    vertex_map = clean.vertex_map if mesh.rows is None else clean.vertex_map[mesh.rows]
+    vertex_map, joined_rows = clean.vertex_map, None
+    if mesh.rows is not None and options.edge_length is None:
+        vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
     if options.edge_length is not None:
@@ -136,6 +138,7 @@ def fit_garment(
         face_parts=parts,
         part_names=mesh.part_names,
         vertex_map=vertex_map,
+        joined_rows=joined_rows,
         metadata={
             "name": name,
             **wearer_entry(body),

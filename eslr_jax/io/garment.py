@@ -35,6 +35,7 @@ _LAYOUT = {
     "part_names": ("U", "parts"),
     "face_parts": ("iu", "faces", "parts"),
     "vertex_map": ("iu", "source_vertices"),
+    "joined_rows": ("iu", "joined_vertices", "source_vertices"),
 }
 
 
@@ -53,6 +54,8 @@ class GarmentFile:
     face_parts: Int[np.ndarray, " faces"] | None = None
     part_names: tuple[str, ...] = ()
     vertex_map: Int[np.ndarray, " source_vertices"] | None = None  # vertex of each source vertex, or -1
+    # Source vertices that are left where those at one place are joined, as readers of GLB do
+    joined_rows: Int[np.ndarray, " joined_vertices"] | None = None
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # fabrics, how it was fitted, ...
 
     @property
@@ -197,6 +200,7 @@ def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> Garm
         face_parts=arrays.get("face_parts"),
         part_names=tuple(str(name) for name in arrays.get("part_names", ())),
         vertex_map=arrays.get("vertex_map"),
+        joined_rows=arrays.get("joined_rows"),
         metadata=metadata if isinstance(metadata, dict) else {},
     )
 
@@ -228,6 +232,8 @@ def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
         arrays["part_names"] = np.array(garment.part_names)
     if garment.vertex_map is not None:
         arrays["vertex_map"] = garment.vertex_map.astype(np.int32)
+    if garment.joined_rows is not None:
+        arrays["joined_rows"] = garment.joined_rows.astype(np.int32)
     if garment.metadata:
         arrays["metadata"] = np.array(json.dumps(garment.metadata))
     return arrays
@@ -259,6 +265,8 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     if garment.vertex_map is not None and garment.vertex_map.max(initial=-1) < count:
         order = np.asarray(garment.vertex_map, np.int64)
         orders += [order, np.array(list(dict.fromkeys(order[order >= 0])))]
+        if garment.joined_rows is not None:
+            orders.append(order[garment.joined_rows])
     fitting = [order for order in orders if len(order) == num_rows]
     if not fitting:
         known = " or ".join(dict.fromkeys(str(len(order)) for order in orders))

@@ -21,6 +21,7 @@ POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an ar
 MAX_FILE_BYTES = 1 << 30  # far more than any garment has
 _COMMENT = re.compile(r"(?:^|\s)#.*")  # behind a name, which may hold a #
 _FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
+_SLIVER = 1e-4  # share of the squared sum of its edges' squares below which a polygon has no area
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,9 @@ class MeshFile:
     face_parts: Int[np.ndarray, " faces"] | None = None  # index into part_names
     part_names: tuple[str, ...] = ()  # materials, or else groups, or else objects
     rows: Int[np.ndarray, " rows"] | None = None  # vertex of each row of the file, where rows were shared
+    cuts: Int[np.ndarray, " polygons"] | None = (
+        None  # corner of each polygon from which it was cut into triangles
+    )
 
 
 def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
@@ -41,7 +45,7 @@ def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np
     return mesh.positions, mesh.faces
 
 
-def read_mesh_file(path: str | Path) -> MeshFile:
+def read_mesh_file(path: str | Path, *, like: MeshFile | None = None) -> MeshFile:
     """Read a mesh without repairing it.
 
     Polygons are cut into triangles. OBJ, PLY and NPZ keep their vertices and order. In STL and GLB, which store a
@@ -50,13 +54,14 @@ def read_mesh_file(path: str | Path) -> MeshFile:
 
     Args:
         path: Path of a .obj, .ply, .stl, .glb or .npz file.
+        like: The same mesh in another shape, whose polygons are cut alike.
 
     Returns:
         The mesh.
 
     Raises:
         AssetError: The file is missing, unreadable or of an unknown kind.
-        MeshError: A PLY file has faces that are not triangles, or an OBJ file concave ones that can't be cut.
+        MeshError: A PLY file has faces that are not triangles, or an OBJ file some that can't be cut.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -64,13 +69,17 @@ def read_mesh_file(path: str | Path) -> MeshFile:
         known = ", ".join(_READERS)
         raise AssetError(f"mesh file {path} has the unknown suffix {suffix!r}; convert it to one of {known}")
     with parsing(path, "mesh", max_bytes=MAX_FILE_BYTES):
-        mesh = _READERS[suffix](path)
+        mesh = (
+            _read_obj(path, None if like is None else like.cuts)
+            if suffix == ".obj"
+            else _READERS[suffix](path)
+        )
         return dataclasses.replace(
             mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
         )
 
 
-def _read_obj(path: Path) -> MeshFile:
+def _read_obj(path: Path, cuts: np.ndarray | None = None) -> MeshFile:
     """Read vertices, faces, texture coordinates and part names of an OBJ file, without normals."""
     positions: list[list[float]] = []
     uvs: list[list[float]] = []
@@ -97,9 +106,12 @@ def _read_obj(path: Path) -> MeshFile:
             for kind, chosen in names.items():
                 chosen.append(current[kind])
     points = np.array(positions, np.float64).reshape(-1, 3)
-    starts = _fan_starts(points, polygons)
+    starts = cuts if cuts is not None and len(cuts) == len(polygons) else _fan_starts(points, polygons)
     if (folded := np.flatnonzero(starts < 0)).size:
-        raise MeshError(f"{path}, line {lines[folded[0]]}: a concave face; triangulate the mesh")
+        raise MeshError(
+            f"{path}, line {lines[folded[0]]}: a face that crosses itself, or is too concave to be cut; "
+            "triangulate the mesh"
+        )
     triangles, owner = _cut_polygons(polygons, starts.tolist())
     faces = np.array(triangles, np.int64).reshape(-1, 3, 2)
     has_uvs = len(faces) > 0 and bool(np.all((faces[..., 1] >= 0) & (faces[..., 1] < len(uvs))))
@@ -110,6 +122,7 @@ def _read_obj(path: Path) -> MeshFile:
         corner_uvs=np.array(uvs, np.float64)[faces[..., 1]] if has_uvs else None,
         face_parts=face_parts,
         part_names=part_names,
+        cuts=starts,
     )
 
 
@@ -129,7 +142,8 @@ def _fan_starts(points: np.ndarray, polygons: list[list[tuple[int, int]]]) -> np
     """Return for each polygon the corner from which a fan of triangles covers it; -1 if every fan folds over.
 
     Triangles look to the side of the polygon's area vector (Newell's). Quads are cut along their shorter diagonal
-    if both will do, other polygons from their first such corner.
+    if both will do, other polygons from their first such corner. So is a polygon with next to no area, in which
+    rounding decides where triangles look.
     """
     starts = np.zeros(len(polygons), np.int64)
     sizes = np.array([len(polygon) for polygon in polygons])
@@ -145,7 +159,9 @@ def _fan_starts(points: np.ndarray, polygons: list[list[tuple[int, int]]]) -> np
         if size == 4:
             diagonals = np.linalg.norm(corners[:, :2] - corners[:, 2:], axis=2)
             order = order[:, :2] ^ (diagonals[:, 1] < diagonals[:, 0])[:, None]
-        starts[rows] = -1
+        edges = np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=(1, 2))
+        is_flat = np.square(area).sum(axis=1) < _SLIVER * np.square(edges)
+        starts[rows] = np.where(is_flat, order[:, 0], -1)
         for start in order.T:
             spokes = np.take_along_axis(
                 corners, ((start[:, None] + np.arange(size)) % size)[..., None], axis=1

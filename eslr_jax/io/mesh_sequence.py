@@ -10,7 +10,7 @@ import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.gltf_document import MOVES, GltfDocument, sample_keys
-from eslr_jax.io.mesh import POSITION_KEYS, read_mesh, shared_vertices
+from eslr_jax.io.mesh import POSITION_KEYS, read_mesh_file, shared_vertices
 from eslr_jax.io.motion import read_number
 from eslr_jax.io.npz import check_layout, read_arrays
 from eslr_jax.io.parsing import parsing, split_name
@@ -136,11 +136,12 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
         raise AssetError(f"folder {folder} holds both {' and '.join(SUFFIXES)} files; keep one kind")
     if len(files) > MAX_FRAMES:
         raise AssetError(f"folder {folder} holds {len(files)} files; {MAX_FRAMES} at most are read")
-    frames, faces = [], np.empty((0, 3), np.int64)
+    frames, faces, first = [], np.empty((0, 3), np.int64), None
     for file in files:
-        points, triangles = read_mesh(file)
-        if not frames:
-            faces = triangles
+        mesh = read_mesh_file(file, like=first)
+        points, triangles = mesh.positions, mesh.faces
+        if first is None:
+            first, faces = mesh, triangles
         elif points.shape != frames[0].shape or not np.array_equal(triangles, faces):
             raise MeshError(
                 f"{file} has {len(points)} vertices and {len(triangles)} faces that differ from those of "

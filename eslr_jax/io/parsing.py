@@ -55,8 +55,14 @@ def parsing(
 
 
 def split_name(text: str | Path) -> tuple[str, str]:
-    """Split `FILE#NAME` into the file and the name, "" if there is none; a folder may have a # in its name."""
+    """Split `FILE#NAME` into the file and the name, "" if there is none.
+
+    A folder may have a # in its name. So may a file that exists, and then the name may have a slash.
+    """
     text = str(text)
+    for place in (place for place, letter in enumerate(text) if letter == "#"):
+        if Path(text[:place]).is_file():
+            return text[:place], text[place + 1 :]
     start = max(text.rfind("/"), text.rfind("\\")) + 1
     file, _, name = text[start:].partition("#")
     return text[:start] + file, name

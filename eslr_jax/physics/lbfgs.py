@@ -134,7 +134,7 @@ def minimize(
     def is_at_rest(state: _State) -> Array:
         # Cloth that does not move gains less than the rounding of its energy, with either sign.
         most = jnp.maximum(jnp.abs(stop.reference - state.value), _CAUTION * state.decrement)
-        return most <= _rounding(state.value)
+        return jnp.isfinite(state.value) & (most <= _rounding(state.value))
 
     def is_running(state: _State) -> Array:
         is_above = product(state.gradient, state.gradient) > 0

@@ -136,7 +136,9 @@ def plan_scene(
         ground=ground_height(poses) if has_ground else None,
         air=None if options.air is None else validate_air(options.air),
         damping=None if options.damping is None else validate_damping(options.damping),
-        energies=tuple(Partial(energy) for energy in options.energies),
+        energies=tuple(
+            energy if isinstance(energy, Partial) else Partial(energy) for energy in options.energies
+        ),
     )
 
 
@@ -185,12 +187,12 @@ def prepare_scenes(
     """Return scenes that can be stacked: padded to one bucket, over one part of the body.
 
     All scenes model what one of them needs: pins, self-contact and a ground. All search the body faces near any
-    of the garments at rest, whatever the motion. So other motions of the same garments run the same compiled
-    rollout.
+    of the garments at rest on the first body, whatever the motion. So other motions of the same garments run the
+    same compiled rollout.
 
     Args:
         garments: Unpadded garments of like sizes.
-        poses: As many motions of bodies with the same faces and of the same length.
+        poses: As many motions of bodies with the same faces and rest pose, and of the same length.
         materials: As many fabrics, isotropic and the same all over a garment.
         constants: Physical constants of all; by default those for each fabric.
         options: What to leave out or add.

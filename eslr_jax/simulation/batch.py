@@ -108,7 +108,9 @@ def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> li
     """Group scenes that can be stacked: like vertex counts, frame counts and bodies."""
     groups: dict[tuple, list[int]] = {}
     for i, (garment, motion) in enumerate(zip(garments, poses, strict=True)):
-        body = hash((np.asarray(motion.faces).tobytes(), np.asarray(motion.is_obstacle).tobytes()))
+        # The faces that are searched are those near the garments on the first body at rest.
+        shape = (motion.faces, motion.is_obstacle, motion.rest_positions)
+        body = hash(tuple(np.asarray(part).tobytes() for part in shape))
         key = (choose_bucket(garment).vertices, motion.positions.shape[0], body)
         groups.setdefault(key, []).append(i)
     return list(groups.values())

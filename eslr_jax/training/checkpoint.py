@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+from jax.experimental.multihost_utils import sync_global_devices
 
 from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.errors import CheckpointError, ConfigError
@@ -77,12 +78,14 @@ class Checkpoints:
             ) as error:  # orbax, its storage and JAX each have classes of their own for bad bytes
                 reasons.append(f"{step}: {one_line(error)[:_LONGEST]}")
                 continue
-            for damaged in steps[: len(reasons)]:
+            for damaged in steps[: len(reasons)] if jax.process_index() == 0 else []:
                 aside = _move_aside(Path(self._manager.directory) / str(damaged))
                 warnings.warn(
                     f"checkpoint {damaged} can't be read and is now {aside}; going on from {step}",
                     stacklevel=2,
                 )
+            if reasons and jax.process_count() > 1:
+                sync_global_devices("damaged checkpoints moved")
             self._manager.reload()
             return jax.tree.unflatten(jax.tree.structure(example), jax.tree.leaves(plain))
         raise CheckpointError(

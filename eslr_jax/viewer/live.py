@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import ClothTrack, scene_record, write_run
+from eslr_jax.physics.materials import constants_for
 from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
@@ -70,6 +71,15 @@ class Cast:
     drawn_body: list[tuple[Piece, Any]]
 
 
+class Recorded(NamedTuple):
+    """A frame of a recording; NumPy arrays."""
+
+    frame: int  # of the body's motion
+    state: ClothState
+    residual: np.ndarray  # see `Trajectory`
+    is_held: bool  # a hand pulled at the cloth
+
+
 @dataclasses.dataclass
 class Live:
     """A page and the simulation behind it; one thread steps it, and the controls are read every frame."""
@@ -87,7 +97,7 @@ class Live:
     times: list[float] = dataclasses.field(default_factory=list)  # of the last frames [s]
     is_compiled: bool = False
     held: int | None = None  # vertex in the hand
-    recorded: list[tuple[int, ClothState]] = dataclasses.field(default_factory=list)
+    recorded: list[Recorded] = dataclasses.field(default_factory=list)
     setting: tuple[Material, tuple[float, float, float]] | None = None  # fabric, wind [m/s] of the recording
     asked: threading.Event = dataclasses.field(default_factory=threading.Event)  # for one step
 
@@ -214,7 +224,8 @@ def one_frame(live: Live, choice: Choice) -> bool:
         return False
     live.state, live.step = step.state, live.step + 1
     if live.controls["record"].value:
-        live.recorded.append((frames[1], jax.tree.map(np.asarray, step.state)))
+        state, residual = jax.tree.map(np.asarray, (step.state, step.report.residual))
+        live.recorded.append(Recorded(frames[1], state, residual, is_held="hand" in live.controls))
         live.setting = setting
     _show(live, cast, frames[1])
     if live.is_compiled:
@@ -399,11 +410,10 @@ def _save(live: Live) -> None:
     assert live.cast is not None
     assert live.setting is not None
     cast, (fabric, wind) = live.cast, live.setting
-    frames = np.array([frame for frame, _ in live.recorded])
-    states = [state for _, state in live.recorded]
-    live.recorded = []
-    if len(frames) < 2:
+    recorded, live.recorded = live.recorded, []
+    if len(recorded) < 2:
         return
+    frames = np.array([one.frame for one in recorded])
     folders = (live.out / str(number) for number in itertools.count(1))
     folder = next(folder for folder in folders if not folder.exists())
     live.controls["status"].content = f"writing {len(frames)} frames to {folder}"
@@ -412,11 +422,14 @@ def _save(live: Live) -> None:
     )
     track = ClothTrack(
         *(
-            np.stack([getattr(state, name) for state in states])
+            np.stack([getattr(one.state, name) for one in recorded])
             for name in ("position", "velocity", "friction_load")
-        )
+        ),
+        residuals=np.stack([one.residual for one in recorded]),
     )
-    scene = cast.stage.scene.replace(material=fabric)
+    scene = cast.stage.scene.replace(material=fabric, constants=constants_for(fabric))
+    if not any(one.is_held for one in recorded):
+        scene = scene.replace(energies=())  # the hand's
     report = {
         "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rollouts import OPTIMUM, arguments, not_finite, read_system, scenes_of, write
-from worn import Setting, Worn
+from rollouts import OPTIMUM, arguments, read_system, scenes_of, write
+from worn import Setting, Worn, check_optimum, not_finite
 
 from eslr_jax.assets import load_body, load_splits
 from eslr_jax.io.atomic import atomic_write
@@ -24,7 +24,6 @@ from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
@@ -103,7 +102,7 @@ def main() -> None:
         for worn, params in scenes_of(system, setting):
             trajectory = rollout_scene(params, worn.scene, system.config)
             if name == OPTIMUM:
-                raise_for_status(trajectory)
+                check_optimum(trajectory, worn.garment)
             broken[name] += not_finite(trajectory) / len(garments)
             energies = face_energies(trajectory.positions, worn.scene)
             results[name, worn.garment] = np.asarray(trajectory.positions), worn, np.asarray(energies)
@@ -145,7 +144,7 @@ def main() -> None:
     draw_distribution(joined, chosen.out / "stretch_energy_distribution.png")
     rows = {
         name: {
-            "not_finite": broken[name],  # share of rollouts, see `rollouts.not_finite`
+            "not_finite": broken[name],  # share of rollouts, see `worn.not_finite`
             "mean_j_m2": float(values.mean()),
             **{f"p{100 * share:g}_j_m2": float(np.quantile(values, share)) for share in _SHARES},
         }

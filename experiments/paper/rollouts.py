@@ -16,11 +16,10 @@ import posed
 import ssch
 from hood_metrics import hood_metrics
 from mat_space import prepare_space
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
+from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, wear
 
 from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.errors import Status
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
 from eslr_jax.evaluation.evaluate import distance_mm
@@ -33,7 +32,6 @@ from eslr_jax.physics.hood import HoodParameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
@@ -169,13 +167,13 @@ def find_references(setting: Setting) -> list[Reference]:
     """Return the near-optimal rollout of every scene, and the optima from its states.
 
     Raises:
-        EslrError: One of them went wrong; see `raise_for_status`.
+        NonFiniteError: One of them is not finite.
     """
     system = read_system(OPTIMUM)
     found = []
     for worn, params in scenes_of(system, setting):
         trajectory = rollout_scene(params, worn.scene, system.config)
-        raise_for_status(trajectory)
+        check_optimum(trajectory, worn.garment)
         gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
         found.append(Reference(trajectory, gap))
         print(worn.garment, OPTIMUM, flush=True)
@@ -218,14 +216,6 @@ def measure_system(
     if share := rows["all"]["not_finite"]:
         print(f"{name}: a frame was not finite in {share:.0%} of the rollouts; the guess may stand in for it")
     return rows
-
-
-def not_finite(trajectory: Trajectory) -> float:
-    """Return one where something was not finite at some frame, else zero.
-
-    A network that corrects the solver's guess falls back to it there, and the positions do not show it.
-    """
-    return float(Status.NON_FINITE in Status(int(trajectory.status)))
 
 
 def _gap_every(setting: Setting) -> int:

@@ -11,13 +11,12 @@ import jax
 import numpy as np
 import optax
 from jaxtyping import Array, Float
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, wear
+from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 from eslr_jax.assets import split_clips
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.io.npz import read_arrays, write_arrays
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import raise_for_status
 
 _FRAMES = 100  # of a clip, as in the tables
 _RATE = 1e-3  # of Adam (PBNS, GAPS, MAT), falling to zero along a cosine
@@ -41,7 +40,7 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
 
     Raises:
         ValueError: The folder holds rollouts of other clips or lengths.
-        EslrError: A rollout went wrong; see `raise_for_status`.
+        NonFiniteError: A rollout is not finite.
     """
     clips, frames = tuple(split_clips("train")), _FRAMES
     if is_smoke:
@@ -55,7 +54,7 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
         found = []
         for row in worn:
             trajectory = rollout_scene(None, row.scene, config)
-            raise_for_status(trajectory)
+            check_optimum(trajectory, row.garment)
             found.append(np.asarray(trajectory.positions))
             print(f"truth {len(found)} of {len(clips)} {time.process_time() - began:.0f} s", flush=True)
         hours = (time.process_time() - began) / 3600

@@ -9,9 +9,10 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import back_and_forth, pose_body
+from eslr_jax.errors import NonFiniteError, Status
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scenes
-from eslr_jax.types import BodyMotion, Scene
+from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.05 % of the initial gap
 
@@ -36,6 +37,27 @@ class Worn(NamedTuple):
         """Return the height of the root joint in the first frame [m]."""
         rest = np.append(np.asarray(load_body().joint_rest_positions[0]), 1.0)
         return float((self.poses.joint_transforms[0, 0] @ rest)[1])
+
+
+def not_finite(trajectory: Trajectory) -> float:
+    """Return one where something was not finite at some frame, else zero.
+
+    A network that corrects the solver's guess falls back to it there, and the positions do not show it.
+    """
+    return float(Status.NON_FINITE in Status(int(trajectory.status)))
+
+
+def check_optimum(trajectory: Trajectory, garment: str) -> None:
+    """Check a rollout that others are compared with.
+
+    Raises:
+        NonFiniteError: Something was not finite; names garment and frame.
+    """
+    if not_finite(trajectory):
+        frame = int(trajectory.first_bad_frame)
+        raise NonFiniteError(
+            f"{garment}: the optimum's rollout is not finite in frame {frame}; nothing compares"
+        )
 
 
 @functools.lru_cache(maxsize=1)

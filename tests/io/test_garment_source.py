@@ -49,6 +49,8 @@ def test_hood_garments_by_name_with_their_pins(hood):
 def test_a_folder_may_have_the_sign_of_names_in_its_own(hood, tmp_path):
     assert split_name("proj#2/dir/a.glb#walk") == ("proj#2/dir/a.glb", "walk")
     assert split_name("proj#2/a.bvh") == ("proj#2/a.bvh", "")
+    (tmp_path / "a.glb").touch()
+    assert split_name(f"{tmp_path}/a.glb#/World/shirt") == (f"{tmp_path}/a.glb", "/World/shirt")
     folder = tmp_path / "proj#2"
     folder.mkdir()
     (folder / "garments_dict.pkl").write_bytes(hood.read_bytes())

@@ -92,8 +92,12 @@ def test_polygons_of_obj_are_cut_and_those_of_ply_named(tmp_path):
     assert faces.tolist()[:4] == [[0, 1, 2], [0, 2, 3], [2, 3, 0], [2, 0, 1]]
     assert faces.tolist()[4:] == [[2, 3, 4], [2, 4, 5], [2, 5, 1]]
     path.write_text("v 0 0 0\nv 1 1 0\nv 3 0 0\nv 0 1.2 0\nf 1 3 2 4\n# a bow tie\nf 1 2 3 4\n")
-    with pytest.raises(MeshError, match="line 7: a concave face; triangulate the mesh"):
+    with pytest.raises(
+        MeshError, match=r"line 7: a face that crosses itself, or is too concave .*; triangulate the mesh"
+    ):
         read_mesh(path)
+    path.write_text("v 0 0 0\nv 1 1e-4 0\nv 3 0 0\nv 2 1e-4 0\nf 1 2 3 4\n")  # rounding made it cross itself
+    assert read_mesh(path)[1].tolist() == [[1, 2, 3], [1, 3, 0]]
     path = tmp_path / "edge.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nf 1 2\n")
     with pytest.raises(MeshError, match="line 3: a face of 2 vertices"):

@@ -1,5 +1,7 @@
 """Bodies that are meshes in motion: read from archives and folders, carried by patches that move rigidly."""
 
+import dataclasses
+
 import numpy as np
 import pygltflib as gltf
 import pytest
@@ -13,6 +15,7 @@ from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.animated import AnimatedMesh
 from eslr_jax.io.garment import GarmentFile, in_outfit_order, in_vertex_order
 from eslr_jax.io.gltf import TOLERANCE, write_animated_glb
+from eslr_jax.io.mesh import read_mesh
 from eslr_jax.io.mesh_sequence import (
     MeshSequence,
     is_mesh_sequence,
@@ -113,6 +116,16 @@ def test_broken_archives_are_named_in_one_line(tmp_path, kind):
     refuses(read_mesh_sequence, path, word)
 
 
+def test_polygons_are_cut_alike_in_all_frames(tmp_path):
+    """The shorter diagonal of the second frame is the other one."""
+    for number, slant in enumerate((0.3, -0.3)):
+        corners = [(0, 0, 0), (1, 0, 0), (1 + slant, 1, 0), (slant, 1, 0)]
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3 4\n"
+        (tmp_path / f"{number}.obj").write_text(text)
+    alone = [read_mesh(tmp_path / f"{number}.obj")[1].tolist() for number in range(2)]
+    assert read_mesh_sequence(tmp_path).faces.tolist() == alone[0] != alone[1]
+
+
 def test_broken_folders_are_named_in_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
     refuses(read_mesh_sequence, tmp_path / "empty", "holds no")
@@ -208,6 +221,11 @@ def test_positions_come_in_the_order_of_the_garment_whichever_of_its_files_they_
     np.testing.assert_array_equal(in_vertex_order(source, garment_of(order)), MOVING)
     joined = MeshSequence("joined", in_file[:, :-4], back[FACES], 30.0)
     np.testing.assert_array_equal(in_vertex_order(joined, garment_of(order)), MOVING)
+    # A GLB's reader joins the three, and keeps the loose one.
+    kept = np.delete(np.arange(len(order)), np.arange(len(order) - 4, len(order) - 1))
+    glb = MeshSequence("glb", in_file[:, kept], back[FACES], 30.0)
+    fitted = dataclasses.replace(garment_of(order), joined_rows=kept)
+    np.testing.assert_array_equal(in_vertex_order(glb, fitted), MOVING)
 
 
 def outfit_of(low, high):

@@ -72,6 +72,8 @@ def test_a_plain_function_is_a_wind():
     )
     assert len(jax.tree.leaves(scene.air)) == 3, "its numbers"
     np.testing.assert_array_equal(scene.air.wind(jnp.ones((1, 3)), 0.0), 2.0)
+    gusty = validate_air(blowing((3.0, 0.0, 0.0), 0.3))
+    assert len(jax.tree.leaves(gusty)) > 3, "mean, strength and phases of gusts are traced"
 
 
 @pytest.mark.parametrize(

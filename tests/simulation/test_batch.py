@@ -60,6 +60,8 @@ def test_bodies_that_differ_in_what_is_an_obstacle_are_searched_apart(garments, 
     part = poses.replace(is_obstacle=np.asarray(poses.is_obstacle) & (np.arange(len(poses.faces)) > 0))
     motions = [poses, poses, part]
     assert _group_alike(garments[:1] * 3, motions) == [[0, 1], [2]]
+    taller = poses.replace(rest_positions=1.5 * np.asarray(poses.rest_positions))
+    assert _group_alike(garments[:1] * 3, [poses, taller, poses]) == [[0, 2], [1]]
 
 
 def test_counts_must_match(garments, poses):
