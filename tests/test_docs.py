@@ -81,15 +81,36 @@ def test_documented_options_exist():
     options = {
         (page.name, words[1], word) for page, words in EVERY for word in words if word.startswith("--")
     }
-    missing = [entry for entry in options if not re.search(rf"{entry[2]}\b", texts[entry[1]])]
+    missing = [
+        (page, command, word)
+        for page, command, word in options
+        if not re.search(rf"{re.escape(word)}(?![\w-])", texts[command])
+    ]
     assert not missing
+
+
+def anchors(page):
+    """Return the anchors of a page's headings, as mkdocs makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)  # where # begins a comment
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.M)
+    words = [re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in headings]
+    return {re.sub(r"[\s-]+", "-", heading) for heading in words}
 
 
 def test_links_between_pages_lead_somewhere():
     pages = [*PAGES, *sorted((ROOT / "experiments").glob("*.md"))]
-    links = [(page, link) for page in pages for link in re.findall(r"\]\((?!http)([^)#]+)", page.read_text())]
+    links = [
+        (page, link, anchor)
+        for page in pages
+        for link, anchor in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", page.read_text())
+    ]
     assert len(links) > len(pages)
-    assert [(page, link) for page, link in links if not (page.parent / link).exists()] == []
+    assert [(page, link) for page, link, _ in links if not (page.parent / link).exists()] == []
+    anchored = [
+        (page, page.parent / link if link else page, anchor) for page, link, anchor in links if anchor
+    ]
+    assert anchored
+    assert [entry for entry in anchored if entry[2] not in anchors(entry[1])] == []
 
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs" / "guides").glob("*.md")), ids=name)

@@ -45,7 +45,9 @@ def imports(tree: ast.AST):
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno} imports from a relative place, where nobody looks"
+            assert node.module
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
@@ -65,6 +67,12 @@ def own_imports(module: str) -> set[str]:
     modules = {name if name in TREES else name.rpartition(".")[0] for name in names}
     # `from eslr_jax.body import lbs` takes nothing of the package itself.
     return {name for name in modules if name and not any(other.startswith(name + ".") for other in modules)}
+
+
+@pytest.mark.parametrize("name", sorted(KERNELS | HOST_FILES))
+def test_listed_name_is_of_a_module(name):
+    """A kernel that is renamed does not escape."""
+    assert any(is_in(module, {name}) for module in MODULES)
 
 
 @every_module

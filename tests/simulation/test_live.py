@@ -21,8 +21,19 @@ STILL = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def stage():
-    return set_stage(square(5, 0.2, is_pinned=np.array([0])), drifting_ball(4), COTTON)
+def opening():
+    """A stage, and how many programs were begun while it was set and while it was played for the first time."""
+    begun = [_compile.cache_info().misses]
+    stage = set_stage(square(5, 0.2, is_pinned=np.array([0])), drifting_ball(4), COTTON)
+    begun.append(_compile.cache_info().misses)
+    played(stage, 5)  # forth and back
+    begun.append(_compile.cache_info().misses)
+    return stage, np.diff(begun).tolist()
+
+
+@pytest.fixture
+def stage(opening):
+    return opening[0]
 
 
 def played(stage, count, tolerance=0.01):
@@ -39,6 +50,10 @@ def test_a_motion_is_played_forth_and_back():
     assert frames == [(0, 1), (1, 2), (2, 3), (3, 2), (2, 1), (1, 0), (0, 1), (1, 2)]
     after_two = [there_and_back(step, 5, 2) for step in range(7)]
     assert after_two == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 3), (3, 2), (2, 3)]
+
+
+def test_the_step_that_is_compiled_early_is_the_one_that_runs(opening):
+    assert opening[1] == [1, 0]
 
 
 def test_the_body_carries_pins_forth_and_back(stage):

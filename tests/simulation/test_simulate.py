@@ -180,15 +180,17 @@ def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
 
 
 @pytest.mark.parametrize("is_paced", [False, True])
-def test_a_program_that_is_compiled_early_is_the_one_that_runs(scene, is_paced):
-    simulate(None, scene, config=SOLVER, pace=(lambda count, ms: count) if is_paced else None)
-    programs = _compile.cache_info().misses
-    prepare_scene(
+def test_a_program_that_is_compiled_early_is_the_one_that_runs(is_paced):
+    config = SimConfig(iterations=14 if is_paced else 13)  # of no other test, whose programs are kept
+    before = _compile.cache_info().misses
+    scene = prepare_scene(
         square(),
         drifting_ball(14),
-        on_shapes=lambda shapes: begin_compiling(None, shapes, SOLVER, is_paced=is_paced),
+        on_shapes=lambda shapes: begin_compiling(None, shapes, config, is_paced=is_paced),
     )
-    assert _compile.cache_info().misses == programs
+    assert _compile.cache_info().misses == before + 1
+    simulate(None, scene, config=config, pace=(lambda count, ms: count) if is_paced else None)
+    assert _compile.cache_info().misses == before + 1, "another program runs"
 
 
 def test_a_pace_sets_the_iterations_of_the_next_chunk(scene):
