@@ -2,7 +2,10 @@
 
 import threading
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from chromium import CHROMIUM, launch
@@ -83,10 +86,14 @@ def test_controls_change_the_scene(view, runs):
     end = threading.Event()
     player = threading.Thread(target=play, args=(view,), kwargs={"until": end})
     player.start()
-    time.sleep(0.5)
+    seen, deadline = set(), time.monotonic() + 60
+    while len(seen) < 6 and time.monotonic() < deadline:
+        seen.add(view.controls["frame"].value)
+        time.sleep(0.005)
     end.set()
     player.join(timeout=10)
     assert not player.is_alive()
+    assert seen == set(range(6))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -184,3 +191,35 @@ def test_page_in_headless_chromium(view, tmp_path):
         exported = np.asarray(Image.open(saved.value.path()).convert("RGB"))
         assert exported.shape == (960, 1280, 3)
         assert len(np.unique(exported.reshape(-1, 3), axis=0)) > 100  # not one colour
+
+
+def test_play_gives_a_frame_the_iterations_that_it_has_time_for():
+    from eslr_jax.viewer.live import Live, _tell
+
+    controls = {"keep_up": SimpleNamespace(value=True), "status": SimpleNamespace(content="")}
+    live = Live(None, controls, "anny", Path("live"))
+    cast = SimpleNamespace(poses=SimpleNamespace(timestep=1 / 30))
+    report = SimpleNamespace(iterations=20, gap_bound=jnp.float32(0.02), residual=jnp.float32(0.1))
+
+    def told(seconds):
+        """Return the iterations of forty frames, given the time that one takes with so many [s]."""
+        counts = []
+        for _ in range(40):
+            live.times = [seconds(live.iterations)]
+            _tell(live, cast, report, 0.01)
+            counts.append(live.iterations)
+        return counts
+
+    slow = told(lambda count: 1.0)
+    assert slow[0] < 100
+    assert slow[-1] == 15
+    assert "at 0.03 of real time" in controls["status"].content
+    quick = told(lambda count: 1e-3)
+    assert quick == sorted(quick)
+    assert 15 < quick[0] < 20
+    assert quick[-1] == 100
+    assert "in real time" in controls["status"].content
+    fitting = told(lambda count: 0.6e-3 * count)[-12:]  # a timestep has room for 55
+    assert 45 < np.mean(fitting) < 55
+    controls["keep_up"].value = False
+    assert told(lambda count: 1.0) == [100] * 40
