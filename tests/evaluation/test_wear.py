@@ -144,6 +144,21 @@ def test_cloth_that_slides_or_falls_is_told(worn):
     assert "the garment fell off: in frame 1 it is below the feet" in describe_report(report).warnings
 
 
+def test_cloth_that_leaves_skin_is_told(worn):
+    report = report_of(worn, worn[4])
+    text = "the garment left skin that it covered: 30 % of it"
+    assert text in describe_report(report | {"coverage": 0.7}).warnings
+    words = describe_report(report | {"coverage": 0.8})
+    assert words.warnings == []
+    assert "the garment stays where it was put on" in words.good
+
+
+def test_frames_that_ended_early_are_told(worn):
+    report = report_of(worn, worn[4]) | {"tolerance": 0.01, "within_tolerance": 0.9}
+    text = "10.0 % of the frames ended before they were within a gap of 1 %"
+    assert describe_report(report).warnings == [text]
+
+
 def test_skin_beside_a_fold_does_not_show_through_it():
     # A strip bent like a hairpin, seen from the side: the bend lies at x = 0, and looks towards +x.
     profile = np.array([[-0.1, 0.0], [0.0, 0.0], [-0.1, 0.005]])
