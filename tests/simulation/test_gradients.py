@@ -18,7 +18,7 @@ from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.rest_shape import with_rest_positions
-from eslr_jax.physics.solve import solve_hessian
+from eslr_jax.physics.solve import Start, solve, solve_hessian
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout, rollout_scene
@@ -258,6 +258,26 @@ def test_the_linear_system_reports_what_it_did():
     assert not bool(found.is_indefinite)
     crushed = minimum * jnp.array([[0.3, 1.0, 0.3]])  # membrane under compression has negative curvature
     assert bool(jax.jit(solve_hessian)(problem, crushed, force).is_indefinite)
+
+
+@pytest.mark.parametrize("is_stalled", [False, True])
+def test_a_gradient_is_refused_where_the_linear_system_stalls(is_stalled, monkeypatch):
+    if is_stalled:
+        monkeypatch.setattr("eslr_jax.physics.solve._LINEAR_STOP", {"float64": (1e-12, 2)})
+    options = SceneOptions(has_body=False, start_at_rest=True)
+    sheet = square(3, 0.24, is_pinned=np.array([0, 2]))
+    scene = wide(prepare_scene(sheet, drifting_ball(2), options=options))
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    start = Start(scene.initial_state.position, jnp.zeros(()))
+
+    @jax.jit
+    def height(density):
+        moved = scene.replace(material=scene.material.replace(density=density))
+        problem = frame_problem(moved, moved.initial_state, inputs)
+        return solve(problem, start, iterations=100).position[:, 1].mean()
+
+    gradient = float(jax.grad(height)(0.2))
+    assert np.isnan(gradient) if is_stalled else np.isfinite(gradient)
 
 
 @pytest.mark.slow
