@@ -16,12 +16,15 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Int
 
-from eslr_jax.config import COARSE_SETS
 from eslr_jax.geometry.padding import round_up
 from eslr_jax.geometry.topology import directed_edges
 from eslr_jax.types import CoarseEdges, Garment
 
-CAPACITIES = (0.42, 0.26, 0.14)  # of the mesh edges; enough for every bundled garment
+CAPACITIES = (
+    0.42,
+    0.26,
+    0.14,
+)  # of the mesh edges, for HOOD's three levels; enough for every bundled garment
 
 Graph = list[set[int]]  # neighbours of every vertex
 
@@ -57,7 +60,7 @@ def coarsen(pairs: Int[np.ndarray, "edges 2"], num_vertices: int) -> list[Int[np
         graph[b].add(a)
     centers = _centers(graph)
     levels = []
-    for _ in COARSE_SETS:
+    for _ in CAPACITIES:
         graph = _coarsen_once(graph, centers)
         edges = sorted((a, b) for a, around in enumerate(graph) for b in around if a < b)
         levels.append(np.array(edges, np.int64).reshape(-1, 2))

@@ -98,7 +98,7 @@ def test_an_odd_unit_is_told_and_can_be_given(tmp_path, fit_report, body):
 def test_a_garment_modelled_on_the_exported_body_fits_exactly(tmp_path, eslr, body):
     result = eslr("assets", "--export", tmp_path / "body.obj")
     assert result.returncode == 0, result.stderr
-    assert "1.84 m tall, metres, Y up, facing Z, feet at the origin" in result.stdout
+    assert "1.84 m tall, in metres, its feet at height 0" in result.stdout
     mannequin = trimesh.load(tmp_path / "body.obj", process=False)
     assert mannequin.vertices[:, 1].min() == pytest.approx(0.0, abs=1e-6)
     grown = mannequin.vertices + 0.012 * mannequin.vertex_normals
