@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+
+def as_partial(function: Callable) -> Partial:
+    """Return a function as a pytree; what a Partial binds stays traced."""
+    return function if isinstance(function, Partial) else Partial(function)
 
 
 def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> Float[Array, ...]:

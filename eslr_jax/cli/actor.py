@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from eslr_jax.cli.options import Options
+from eslr_jax.cli.options import Options, refuse_given
 from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,17 +58,15 @@ def load_actor(options: Options) -> Actor:
     body = options.body
     if is_moving_mesh(body):
         given = {
-            "--motion": options.motion,
-            "--start": options.start,
-            "--loop": options.loop,
-            "--joint-map": options.joint_map,
-            "--arm-abduction": options.arm_abduction,
-            "--motion-up": None if options.motion_up == "auto" else options.motion_up,
-            "--betas": options.betas or None,
+            "--motion": options.motion is not None,
+            "--start": options.start is not None,
+            "--loop": options.loop is not None,
+            "--joint-map": options.joint_map is not None,
+            "--arm-abduction": options.arm_abduction is not None,
+            "--motion-up": options.motion_up != "auto",
+            "--betas": bool(options.betas),
         }
-        for option, value in given.items():
-            if value is not None:
-                raise ConfigError(f"{body} is a mesh in motion and follows no other; leave out {option}")
+        refuse_given(f"{body} is a mesh in motion and follows no other", given)
         sequence = read_mesh_sequence(body, fps=options.body_fps)
         return Actor(*pose_sequence(sequence, num_frames=options.frames, units=options.body_units), body, 0.0)
     if options.body_fps is not None:

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from eslr_jax.cli.actor import FPS
 from eslr_jax.cli.console import app, use_compile_cache, waiting
+from eslr_jax.cli.options import refuse_given
 from eslr_jax.errors import AssetError, ConfigError
 
 _ARCHITECTURE = "eslr-15"  # the paper's
@@ -40,14 +41,14 @@ def assets(
     from eslr_jax.assets.catalog import is_intact, list_assets
 
     if export is not None:
-        _refuse_given("--export writes a body and lists nothing", {
+        refuse_given("--export writes a body and lists nothing", {
             "--kind": kind != "all", "--verify": verify, "--json": json_,
         })  # fmt: skip
         _export_body(export, body or "anny")
         return
-    _refuse_given("only --export takes a body", {"--body": body is not None})
+    refuse_given("only --export takes a body", {"--body": body is not None})
     if kind == "fabric":
-        _refuse_given("fabrics have no files", {"--verify": verify})
+        refuse_given("fabrics have no files", {"--verify": verify})
         _list_fabrics(json_)
         return
     chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
@@ -72,17 +73,6 @@ def assets(
     Console().print(table, markup=False)
     if kind == "all":
         _list_fabrics(as_json=False)
-
-
-def _refuse_given(reason: str, options: dict[str, bool]) -> None:
-    """Raise a ConfigError if an option is given that would do nothing.
-
-    Args:
-        reason: Why it would do nothing.
-        options: Whether each of them is given.
-    """
-    if given := [option for option, is_given in options.items() if is_given]:
-        raise ConfigError(f"{reason}; leave out {', '.join(given)}")
 
 
 def _fabrics() -> dict[str, dict[str, Any]]:
@@ -178,7 +168,7 @@ def info(
             )
         _show_scene(scene, motion, vertices, simulator, self_contact, json_)
         return
-    _refuse_given("only a --scene takes these", {
+    refuse_given("only a --scene takes these", {
         "--motion": motion is not None, "--vertices": vertices != "1k", "--simulator": simulator != "physics",
         "--self-contact": self_contact,
     })  # fmt: skip

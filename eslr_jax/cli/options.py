@@ -50,6 +50,17 @@ class Options:
     damping: float | None = None
 
 
+def refuse_given(reason: str, options: dict[str, bool]) -> None:
+    """Raise a ConfigError if an option is given that would do nothing.
+
+    Args:
+        reason: Why it would do nothing.
+        options: Whether each of them is given.
+    """
+    if given := [option for option, is_given in options.items() if is_given]:
+        raise ConfigError(f"{reason}; leave out {', '.join(given)}")
+
+
 def wanted_self_contact(options: Options) -> bool | None:
     """Return whether self-contact is asked for, or None where the scene decides.
 

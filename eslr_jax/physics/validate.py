@@ -104,10 +104,9 @@ def validate_air(air: Air) -> Air:
     for name, accepted in AIR_RANGES.items():
         _check_range(f"air {name}", getattr(air, name), accepted)
     if callable(air.wind):
-        from jax.tree_util import Partial
+        from eslr_jax.numerics import as_partial
 
-        # A plain function is no pytree; what a Partial binds stays traced.
-        return air if isinstance(air.wind, Partial) else air.replace(wind=Partial(air.wind))
+        return air.replace(wind=as_partial(air.wind))
     if _check_range("wind", air.wind, WIND_RANGE).shape != (3,):
         raise ConfigError(f"wind = {air.wind!r} is no velocity; give three numbers in m/s, such as 3, 0, 0")
     return air.replace(wind=np.asarray(air.wind, np.float32))

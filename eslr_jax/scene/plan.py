@@ -9,7 +9,6 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
@@ -21,6 +20,7 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
+from eslr_jax.numerics import as_partial
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air, validate_damping, validate_substeps
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
@@ -136,9 +136,7 @@ def plan_scene(
         ground=ground_height(poses) if has_ground else None,
         air=None if options.air is None else validate_air(options.air),
         damping=None if options.damping is None else validate_damping(options.damping),
-        energies=tuple(
-            energy if isinstance(energy, Partial) else Partial(energy) for energy in options.energies
-        ),
+        energies=tuple(map(as_partial, options.energies)),
     )
 
 

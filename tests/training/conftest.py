@@ -32,3 +32,13 @@ def cheap_model():
     from eslr_jax.models.registry import MODELS
 
     return dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size=8)
+
+
+@pytest.fixture(scope="session")
+def config(cheap_model):
+    """Six steps."""
+    from eslr_jax.config import TrainConfig
+
+    return TrainConfig(
+        model=cheap_model, steps=6, warmup=2, slots_per_garment=2, log_every=2, checkpoint_every=2
+    )
