@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
 
 from eslr_jax.errors import ConfigError
 
@@ -171,6 +171,9 @@ class TrainConfig:
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
+    playback_speeds: tuple[float, ...] = (
+        1.0,
+    )  # each clip is there once at each of these multiples of its speed
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
     # With energy_set "hood": which of the three variants of HOOD's losses, see physics.hood. "metric" has the
@@ -264,6 +267,8 @@ class TrainConfig:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
+        if not self.playback_speeds or not all(0 < speed < float("inf") for speed in self.playback_speeds):
+            raise ValueError(f"playback_speeds must be positive multiples, got {self.playback_speeds}")
 
 
 Config = TypeVar("Config")
@@ -281,13 +286,14 @@ def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> 
         ConfigError: A field is unknown (the closest name is suggested) or has the wrong type.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = get_type_hints(cls)
     resolved: dict[str, Any] = {}
     for key, value in values.items():
         if key not in fields:
             close = difflib.get_close_matches(key, fields, n=1)
             hint = f"; did you mean {where}{close[0]}?" if close else f"; known: {', '.join(fields)}"
             raise ConfigError(f"unknown option {where}{key}{hint}")
-        resolved[key] = _convert(cls, fields[key], value, f"{where}{key}")
+        resolved[key] = _convert(hints[key], value, f"{where}{key}")
     try:
         return cls(**resolved)
     except TypeError as error:
@@ -296,25 +302,22 @@ def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> 
         raise ConfigError(str(error)) from error
 
 
-def _convert(cls: type, field: dataclasses.Field, value: Any, name: str) -> Any:
-    """Check `value` against the field's annotation and convert nested tables, lists and whole floats."""
-    import typing
-
-    hint = typing.get_type_hints(cls)[field.name]
-    options = typing.get_args(hint) if typing.get_origin(hint) is not None else ()
-    if typing.get_origin(hint) is Literal:
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    """Check `value` against a field's annotation and convert nested tables, lists and whole floats."""
+    options = get_args(hint) if get_origin(hint) is not None else ()
+    if get_origin(hint) is Literal:
         if value not in options:
             raise ConfigError(f"{name} = {value!r} is not one of {', '.join(map(repr, options))}")
         return value
-    candidates = options if options and typing.get_origin(hint) is not tuple else (hint,)
+    candidates = options if options and get_origin(hint) is not tuple else (hint,)
     for candidate in candidates:
-        origin = typing.get_origin(candidate) or candidate
+        origin = get_origin(candidate) or candidate
         if dataclasses.is_dataclass(candidate) and isinstance(value, dict):
             return from_dict(candidate, value, where=f"{name}.")  # type: ignore[arg-type]
         if origin is float and isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
         if origin is tuple and isinstance(value, list | tuple):
-            return tuple(value)
+            return tuple(_convert(get_args(candidate)[0], entry, name) for entry in value)
         if origin is int and isinstance(value, bool):
             continue
         if isinstance(origin, type) and isinstance(value, origin):
