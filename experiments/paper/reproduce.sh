@@ -4,7 +4,7 @@
 #   experiments/paper/reproduce.sh [full|small|tshirt] [OUT]
 #
 # full: the paper's sizes at 4k vertices, by HOOD's recipe; needs a GPU with the extra `cuda`, and days.
-# small: five layers at 1k vertices, two seeds, and sixteen layers; some eleven hours of one CPU core.
+# small: five layers at 1k vertices, two seeds, and sixteen layers; some fourteen hours of one CPU core.
 # tshirt: the systems that are made for one garment, PBNS to MAT; less than an hour of one CPU core.
 # Run it again to go on where it stopped. STEPS=2 shortens every training, to see that all works.
 set -euo pipefail

@@ -6,7 +6,8 @@
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
 seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
 Mixamo character, here it is every third clip of DeepMimic, a backflip, a roll and getting up among them.
-model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks.
+model_cost (V): parameters, layers, latency and memory on the T-shirt, from 4k on also of the full-size networks;
+and the Total of Table I where that was measured at the same size.
 
 A row is LABEL=NAME,NAME: networks that differ by their seed, whose mean and spread it shows. A name is that of a
 bundled network or an exported file, see `rollouts.read_system`. Every row says what the network leaves of the
@@ -17,7 +18,7 @@ same network untrained.
 --train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
 paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
 A table is never written over one of another setting, nor a row that names its networks over one of others: give
-another --out or label.
+another --out or label. A row that a table has is kept, and not measured again.
 """
 
 from __future__ import annotations
@@ -57,9 +58,11 @@ from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 
 WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
-# Trained alike, applied once a frame (configs/paper/1k.toml); the rest have recipes of their own.
+# Applied once a frame. First configs/paper/1k.toml, then as many steps again at half its learning rate; hood-5 and
+# mgn-16 have a fifth of the steps. The other networks have recipes of their own.
 DEEP = (
     f"mgn-5=mgn-5-correction,{WEIGHTS / 'mgn-5_60k_s1.npz'}",
+    f"mgn-16, 12,000 steps={WEIGHTS / 'mgn-16_12k.npz'}",
     "hood-5=hood-5-correction",
     "gsa-5=gsa-5-correction",
     "lsdmp-5=lsdmp-5-correction",
@@ -67,7 +70,10 @@ DEEP = (
 )
 CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
 RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
-BUNDLED = (f"eslr-small={DEFAULT_MODEL}", f"{START_MODEL}+20={START_MODEL}+20")
+BUNDLED = (
+    f"eslr-small={DEFAULT_MODEL}",
+    *(f"{START_MODEL}+{iterations}={START_MODEL}+{iterations}" for iterations in (5, 20)),
+)
 SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
 TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")
@@ -122,7 +128,8 @@ def main() -> None:
             run_training(training, ("steps=2",) if chosen.smoke else ())
     for name in chosen.tables:
         if name == "model_cost":
-            write(cost_table(rows, chosen.vertices, chosen.smoke), cost_file(chosen))
+            costs = cost_table(rows, chosen.vertices, chosen.smoke)
+            write(with_totals(costs, chosen.out / f"{TABLES[0]}.json"), cost_file(chosen))
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
             if not (setting.garments and setting.clips):
@@ -315,6 +322,8 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     read = {label: read_system(name) for label, (name, *_) in rows.items()}
     systems = {label: system for label, system in read.items() if system.weights_on is None}
     for name in full_size(vertices, is_smoke):
+        if name in systems:  # with its weights, and what they cost
+            continue
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
         systems[name] = System(
@@ -344,6 +353,15 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     for label, milliseconds in take_turns(parts, 1 if is_smoke else _TURNS).items():
         found[label]["latency_ms"] = milliseconds
     return {"vertices": vertices, "device": device_name(), "mean": found}
+
+
+def with_totals(costs: dict[str, Any], energies: Path) -> dict[str, Any]:
+    """Return the table of costs with the Total [J] of the rows that a table of energies at its size has."""
+    found = json.loads(energies.read_text()) if energies.exists() else {}
+    if found.get("vertices") == costs["vertices"]:
+        for label in costs["mean"].keys() & found["mean"].keys():
+            costs["mean"][label]["total"] = found["mean"][label]["total"]
+    return costs
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
-OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.05 % of the initial gap
+OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.03 % of the initial gap
 
 
 class Setting(NamedTuple):

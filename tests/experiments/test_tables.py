@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 from paper import rollouts
 from paper.rollouts import Setting, read_system
-from paper.tables import DEEP, check_costs, check_networks, plan_trainings, rows_of_setting, table_setting
+from paper.tables import (
+    DEEP,
+    SYSTEMS,
+    TABLES,
+    check_costs,
+    check_networks,
+    plan_trainings,
+    rows_of_setting,
+    table_setting,
+    with_changes,
+    with_totals,
+)
 
 from eslr_jax.assets.catalog import asset_names
 from eslr_jax.errors import NonFiniteError, Status
@@ -84,9 +95,30 @@ def test_controls_of_weights_show_no_training_cost():
 
 def test_default_rows_have_every_bundled_network_of_five_layers():
     bundled = {name for name in asset_names("model") if name.endswith("-5-correction")}
-    rows = [row.split("=")[1].split(",") for row in DEEP]
-    assert {first for first, *_ in rows} == bundled
-    assert all(Path(file).is_file() for _, *others in rows for file in others)
+    networks = {name for row in DEEP for name in row.split("=")[1].split(",")}
+    assert bundled <= networks
+    assert all(Path(file).is_file() for file in networks - bundled)
+
+
+def test_the_default_command_goes_on_with_the_shipped_tables():
+    rows = {label: tuple(names.split(",")) for label, names in (row.split("=", 1) for row in SYSTEMS)}
+    check_costs(rollouts.RESULTS / "model_cost_1k.json", tuple(rows))
+    for table in TABLES[:-1]:
+        file = rollouts.RESULTS / f"{table}.json"
+        kept = rows_of_setting(file, table_setting(table, None, None, 100, "1k"))
+        assert kept["networks"]
+        check_networks(file, with_changes(rows, table, True), kept["networks"])
+
+
+def test_costs_have_the_totals_of_the_table_of_their_size(file):
+    costs = {"vertices": "1k", "mean": {"mgn-5": {"latency_ms": 1.0}, "mgn-15": {"latency_ms": 2.0}}}
+    file.write_text(json.dumps({**TABLE, "mean": {"mgn-5": {"total": -0.3}, "guess": {"total": 9.0}}}))
+    assert with_totals(costs, file)["mean"] == {
+        "mgn-5": {"latency_ms": 1.0, "total": -0.3},
+        "mgn-15": {"latency_ms": 2.0},
+    }
+    other = {"vertices": "4k", "mean": {"mgn-5": {"latency_ms": 1.0}}}
+    assert "total" not in with_totals(other, file)["mean"]["mgn-5"]
 
 
 def test_a_row_is_of_the_networks_that_it_was_measured_with(file):
