@@ -58,7 +58,8 @@ class ModelConfig:
     refinement_steps: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
     world_edge_radius: float = 0.03  # [m] (HOOD)
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
-    remat: Literal["layers", "products", "none"] = "products"  # what a layer keeps for its backward pass
+    # What a backward pass computes again: whole layers, all but their products, or nothing.
+    remat: Literal["layers", "products", "none"] = "products"
     seed: int = 0  # of the random attention features
 
     @property
@@ -171,9 +172,7 @@ class TrainConfig:
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
-    playback_speeds: tuple[float, ...] = (
-        1.0,
-    )  # each clip is there once at each of these multiples of its speed
+    playback_speeds: tuple[float, ...] = (1.0,)  # each clip is there at all these multiples of its speed
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
     # With energy_set "hood": which of the three variants of HOOD's losses, see physics.hood. "metric" has the

@@ -174,6 +174,8 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, capsys, monkeypat
     from eslr_jax.assets.catalog import find_asset
     from eslr_jax.cli.assets import info
 
+    info(model="eslr-small", json_=True)  # also an architecture, of twelve steps
+    assert json.loads(capsys.readouterr().out)["config"]["refinement_steps"] == 14
     info(model="eslr-small:4", json_=True)
     assert json.loads(capsys.readouterr().out)["config"]["refinement_steps"] == 4
     bundled = find_asset("model", "eslr-small")

@@ -8,6 +8,7 @@ from eslr_jax.config import (
     SimConfig,
     TrainConfig,
     apply_overrides,
+    describe_keys,
     from_dict,
     parse_override,
     to_dict,
@@ -25,6 +26,11 @@ def test_round_trip_through_json():
 def test_unknown_key_suggests_the_closest():
     with pytest.raises(ConfigError, match="did you mean latent_size"):
         from_dict(ModelConfig, {"latent_sise": 64})
+
+
+@pytest.mark.parametrize("config", [TrainConfig, ModelConfig])
+def test_help_says_something_of_every_key(config):
+    assert all(line.partition(": ")[2] for line in describe_keys(config))
 
 
 def test_nested_unknown_key_names_its_table():

@@ -152,8 +152,8 @@ def info(
     """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs.
 
     Args:
-        model: Name of an architecture, or of a bundled network, or an exported file, as for `eslr simulate`; by
-            default the paper's, eslr-15.
+        model: Name of a bundled network, or an exported file, as for `eslr simulate`; or else of an architecture,
+            by default the paper's, eslr-15.
         scene: A garment, by name or file, on the bundled body.
         motion: Motion of the scene, by default cmu_016_32.
         vertices: Resolution of a bundled garment; from 50k on it is made at run time.
@@ -178,16 +178,15 @@ def info(
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
 
     model = model or _ARCHITECTURE
-    if model in MODELS:
+    try:
+        params, config = load_model(model)
+    except AssetError as error:
+        if is_path(model):
+            raise
+        if model not in MODELS:
+            raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
         config = MODELS[model]
         params = init_model(config)
-    else:
-        try:
-            params, config = load_model(model)
-        except AssetError as error:
-            if is_path(model):
-                raise
-            raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
     values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
     if json_:
         print(json.dumps(values, indent=2))

@@ -109,14 +109,14 @@ def train(
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
                 overflowed = any(np.any(entry["overflows"]) for entry in window)
-                means = _means(window, len(folders))
+                metrics = window_metrics(window, len(folders))
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
                 seconds = {
                     "seconds": time.perf_counter() - began,
                     "core_seconds": spent + time.process_time(),
                 }
-                records = [{"step": done, **seconds, "its": speed, **own} for own in means]
+                records = [{"step": done, **seconds, "its": speed, **own} for own in metrics]
                 for log, record in zip(logs, records, strict=True):
                     log.write(json.dumps(record) + "\n")
                     log.flush()
@@ -220,16 +220,25 @@ def is_first_process() -> bool:
     return jax.process_index() == 0
 
 
-def _means(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, float]]:
-    """Return every seed's shares and medians of a window; a reset has energies a hundred times the usual."""
+def window_metrics(window: list[dict[str, jax.Array]], seeds: int) -> list[dict[str, float]]:
+    """Return every seed's shares of a window, and medians over its good updates.
+
+    A median, as a reset has energies a hundred times the usual; a skipped update may have NaN.
+    """
     fetched = jax.device_get(window)
-    centers = {
-        name: (np.mean if name in _SHARES else np.median)(
-            [np.reshape(entry[name], seeds) for entry in fetched], axis=0
+    columns = {name: np.stack([np.reshape(entry[name], seeds) for entry in fetched]) for name in fetched[0]}
+    means = []
+    for place in range(seeds):
+        own = {name: values[:, place] for name, values in columns.items()}
+        is_good = own["skipped"] == 0
+        taken = is_good if np.any(is_good) else ~is_good
+        means.append(
+            {
+                name: float(np.mean(values) if name in _SHARES else np.median(values[taken]))
+                for name, values in own.items()
+            }
         )
-        for name in fetched[0]
-    }
-    return [{name: float(values[place]) for name, values in centers.items()} for place in range(seeds)]
+    return means
 
 
 def _check_skipped(

@@ -15,7 +15,7 @@ train() { # name, recipe, changes
   local folder="$out/$1" recipe="experiments/configs/paper/$2.toml"
   shift 2
   [[ -f $folder/model.npz ]] && return
-  if [[ -d $folder/checkpoints ]]; then
+  if compgen -G "$folder/checkpoints/[0-9]*" > /dev/null; then
     eslr train --out "$folder" --resume
   else
     eslr train --config "$recipe" --out "$folder" "${@/#/--set=}" ${STEPS:+--set=steps=$STEPS}

@@ -232,10 +232,10 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
         root_height: Height of the root joint in the first frame [m]; HOOD counts potential energy from near it.
     """
     origin = np.array([0.0, root_height + _ORIGIN_ABOVE_ROOT, 0.0], np.float32)
-    metrics = hood_metrics(
+    found = hood_metrics(
         trajectory.positions, scene, origin=origin, parameters=HoodParameters(), criterion="postcvpr"
     )
-    terms = {name: float(np.mean(getattr(metrics.terms, name))) for name in TERMS}
+    terms = {name: float(np.mean(getattr(found, name))) for name in TERMS}
     frames = measure_frames(trajectory.positions, scene)
     return {**terms, "total": sum(terms.values()), **extremes(frames, np.asarray(scene.garment.vertex_mask))}
 

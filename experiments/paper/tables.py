@@ -56,10 +56,11 @@ from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.training.checkpoint import has_checkpoint
 
 WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
-# Applied once a frame. First configs/paper/1k.toml, then as many steps again at half its learning rate; hood-5 and
-# mgn-16 have a fifth of the steps. The other networks have recipes of their own.
+# Applied once a frame. They were trained by configs/paper/1k.toml, and then for as many steps again at half its
+# learning rate. hood-5 and mgn-16 have a fifth of the steps. The other networks have recipes of their own.
 DEEP = (
     f"mgn-5=mgn-5-correction,{WEIGHTS / 'mgn-5_60k_s1.npz'}",
     f"mgn-16, 12,000 steps={WEIGHTS / 'mgn-16_12k.npz'}",
@@ -173,7 +174,7 @@ def run_training(training: Training, changes: tuple[str, ...]) -> None:
     """Train a network as `eslr train` does, or go on with it; nothing is done if it is trained."""
     if (training.folder / "model.npz").exists():
         return
-    if (training.folder / "checkpoints").exists():
+    if has_checkpoint(training.folder):
         train(training.folder, resume=True)
     else:
         train(training.folder, training.recipe, (*training.changes(), *changes))
@@ -205,7 +206,7 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     changed = dict(rows)
     for label, (name, *_) in rows.items():
         model = read_system(name).config.model
-        if isinstance(model, ModelConfig):
+        if isinstance(model, ModelConfig) and "~" not in name:  # which is a control or another mode itself
             fitting = CONTROLS if model.attention_blocks else CONTROLS_OF_WEIGHTS
             changes = fitting if has_controls else fitting[:1]
             if table == "unseen_garments" and model.attention_blocks:

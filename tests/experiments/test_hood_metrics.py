@@ -8,7 +8,7 @@ from hood_metrics import hood_metrics
 
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.physics.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_depths, hood_terms
+from eslr_jax.physics.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
 from eslr_jax.physics.inertia import vertex_masses
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
@@ -61,30 +61,20 @@ def test_metrics_of_a_trajectory_are_those_of_its_frames(worn):
     positions, scene = worn
     body, faces = scene.body.positions, scene.body.surface.faces
     found = jax.jit(hood_metrics)(positions, scene)
-    is_real = np.asarray(scene.garment.vertex_mask)
 
     @jax.jit
     def of_frame(position, current, previous, bodies):
         problem = HoodProblem(
             current, previous, bodies, scene.garment, scene.material, TIMESTEP, METRIC_PARAMETERS
         )
-
-        def terms(x):
-            return hood_terms(x, problem, criterion="metric")
-
-        depth = hood_depths(position, position, bodies.next, bodies.next, faces, 1e-3)
-        return terms(position), jax.grad(lambda x: sum(terms(x)))(position), depth
+        return hood_terms(position, problem, criterion="metric")
 
     for k in range(FRAMES - 2):
         bodies = BodyFrames(*body[k : k + 3], faces)
-        terms, gradient, depth = of_frame(positions[k + 2], positions[k + 1], positions[k], bodies)
+        terms = of_frame(positions[k + 2], positions[k + 1], positions[k], bodies)
         for name, value in terms._asdict().items():
-            np.testing.assert_allclose(getattr(found.terms, name)[k], value, rtol=1e-4, err_msg=name)
-        norm = np.linalg.norm(np.asarray(gradient)[is_real], axis=1).mean()
-        np.testing.assert_allclose(found.gradient_norm[k], norm, rtol=1e-4)
-        share = (np.asarray(depth)[is_real] > 0).mean()
-        assert 0.1 < share < 0.9, "the frame is to have vertices on both sides"
-        np.testing.assert_allclose(found.penetrating_share[k], share, rtol=1e-6)
+            np.testing.assert_allclose(getattr(found, name)[k], value, rtol=1e-4, err_msg=name)
+        assert terms.collision > 0
 
 
 @pytest.mark.slow
@@ -93,8 +83,8 @@ def test_heights_count_from_the_origin(worn):
     lower = np.array([0.0, -0.5, 0.0], np.float32)
     found, shifted = (jax.jit(hood_metrics)(positions, scene, origin=origin) for origin in (0 * lower, lower))
     weight = 9.81 * float(jnp.sum(vertex_masses(scene.garment, scene.material)))
-    np.testing.assert_allclose(shifted.terms.gravity - found.terms.gravity, 0.5 * weight, rtol=1e-4)
-    np.testing.assert_allclose(shifted.terms.stretch, found.terms.stretch, rtol=1e-2)
+    np.testing.assert_allclose(shifted.gravity - found.gravity, 0.5 * weight, rtol=1e-4)
+    np.testing.assert_allclose(shifted.stretch, found.stretch, rtol=1e-2)
 
 
 def test_a_scene_without_a_body_is_refused(worn):

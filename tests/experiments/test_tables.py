@@ -110,6 +110,11 @@ def test_the_default_command_goes_on_with_the_shipped_tables():
         check_networks(file, with_changes(rows, table, True), kept["networks"])
 
 
+def test_a_row_of_a_changed_network_has_no_controls_of_its_own():
+    rows = {"raw": ("eslr-small~raw",), "eslr-5": ("eslr-5-correction",)}
+    assert set(with_changes(rows, "native_garments", False)) == {*rows, "eslr-5, untrained"}
+
+
 def test_costs_have_the_totals_of_the_table_of_their_size(file):
     costs = {"vertices": "1k", "mean": {"mgn-5": {"latency_ms": 1.0}, "mgn-15": {"latency_ms": 2.0}}}
     file.write_text(json.dumps({**TABLE, "mean": {"mgn-5": {"total": -0.3}, "guess": {"total": 9.0}}}))

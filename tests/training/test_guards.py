@@ -16,7 +16,7 @@ from eslr_jax.graph.normalizer import WARMUP_UPDATES
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
-from eslr_jax.training.loop import train
+from eslr_jax.training.loop import train, window_metrics
 from eslr_jax.training.loss import LossReport
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import _advance, _Horizon, init_train_state, make_train_step, slot_problem
@@ -193,3 +193,11 @@ def test_statistics_come_first_and_then_weights_move(small_data):
         lambda one, other: np.any(one != other), moved.params["params"], start.params["params"]
     )
     assert np.mean(jax.tree.leaves(changed)) > 0.8
+
+
+def test_a_skipped_update_does_not_hide_the_others_of_a_line():
+    good = {"loss": np.float32([2.0, 3.0]), "skipped": np.float32([0.0, 0.0])}
+    bad = {"loss": np.float32([np.nan, 3.0]), "skipped": np.float32([1.0, 0.0])}
+    first, second = window_metrics([good, good, bad, good], 2)
+    assert first == {"loss": 2.0, "skipped": 0.25}
+    assert second == {"loss": 3.0, "skipped": 0.0}
