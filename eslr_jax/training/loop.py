@@ -109,14 +109,14 @@ def train(
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
                 overflowed = any(np.any(entry["overflows"]) for entry in window)
-                metrics = window_metrics(window, len(folders))
+                of_seeds = window_metrics(window, len(folders))
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
                 seconds = {
                     "seconds": time.perf_counter() - began,
                     "core_seconds": spent + time.process_time(),
                 }
-                records = [{"step": done, **seconds, "its": speed, **own} for own in metrics]
+                records = [{"step": done, **seconds, "its": speed, **own} for own in of_seeds]
                 for log, record in zip(logs, records, strict=True):
                     log.write(json.dumps(record) + "\n")
                     log.flush()

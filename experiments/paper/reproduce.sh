@@ -4,21 +4,22 @@
 #   experiments/paper/reproduce.sh [full|small|tshirt] [OUT]
 #
 # full: the paper's sizes at 4k vertices, by HOOD's recipe; needs a GPU with the extra `cuda`, and days.
-# small: five layers at 1k vertices, two seeds, and sixteen layers; some fourteen hours of one CPU core.
+# small: five and sixteen layers at 1k vertices, twice 30,000 steps, two seeds; some forty hours of one CPU core.
 # tshirt: the systems that are made for one garment, PBNS to MAT; less than an hour of one CPU core.
 # Run it again to go on where it stopped. STEPS=2 shortens every training, to see that all works.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 size=${1:-full} out=${2:-out/paper${STEPS:+-smoke}}  # what is trained in few steps is not taken for trained
 
-train() { # name, recipe, changes
+train() { # name, recipe, changes; $start_from are weights, if there are any
   local folder="$out/$1" recipe="experiments/configs/paper/$2.toml"
   shift 2
   [[ -f $folder/model.npz ]] && return
   if compgen -G "$folder/checkpoints/[0-9]*" > /dev/null; then
     eslr train --out "$folder" --resume
   else
-    eslr train --config "$recipe" --out "$folder" "${@/#/--set=}" ${STEPS:+--set=steps=$STEPS}
+    eslr train --config "$recipe" --out "$folder" ${start_from:+--start-from "$start_from"} \
+      "${@/#/--set=}" ${STEPS:+--set=steps=$STEPS}
   fi
   [[ -f $folder/model.npz ]] || exit 1 # after Ctrl-C it ends without an error
 }
@@ -51,14 +52,14 @@ elif [[ $size == full ]]; then
   done
   vertices=4k
 else
-  for model in mgn-5 hood-5 lsdmp-5 gsa-5 eslr-5; do
+  for model in mgn-5 hood-5 lsdmp-5 gsa-5 eslr-5 mgn-16; do
     for seed in 0 1; do
       train "$model-s$seed" 1k "model.base=$model" "seed=$seed"
+      start_from="$out/$model-s$seed/model.npz" train "$model-s$seed-on" 1k "model.base=$model" \
+        "seed=$((seed + 10))" horizon_growth=1 learning_rate=5e-4
     done
-    rows+=("$model=$out/$model-s0/model.npz,$out/$model-s1/model.npz")
+    rows+=("$model=$out/$model-s0-on/model.npz,$out/$model-s1-on/model.npz")
   done
-  train mgn-16-s0 1k model.base=mgn-16
-  rows+=("mgn-16=$out/mgn-16-s0/model.npz")
   vertices=1k
 fi
 python experiments/paper/tables.py --models guess=guess "${rows[@]}" optimum=optimum --controls \

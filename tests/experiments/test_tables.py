@@ -203,3 +203,26 @@ def test_the_papers_script_stops_where_a_training_was_stopped(tmp_path):
     ended = subprocess.run(["bash", script, "small", tmp_path / "out"], env=path, check=False)
     assert ended.returncode == 1
     assert (tmp_path / "calls").read_text().split() == ["eslr"]
+
+
+def test_the_papers_script_trains_every_network_twice_and_tabulates_the_second(tmp_path):
+    program = tmp_path / "eslr"  # writes what it is asked for, and weights where it is to write them
+    program.write_text(
+        '#!/bin/sh\necho "$@" >> "$CALLS"\nwhile [ "$1" != --out ]; do shift; done\n'
+        'mkdir -p "$2"; touch "$2/model.npz"\n'
+    )
+    (tmp_path / "python").write_text('#!/bin/sh\necho "$@" >> "$CALLS"\n')
+    for name in ("eslr", "python"):
+        (tmp_path / name).chmod(0o755)
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "CALLS": str(tmp_path / "calls")}
+    script = Path(rollouts.__file__).with_name("reproduce.sh")
+    out = tmp_path / "out"
+    subprocess.run(["bash", script, "small", out], env=path, check=True)
+    *trainings, tables = (tmp_path / "calls").read_text().splitlines()
+    networks = [f"{row.split('=')[0].split(',')[0]}" for row in DEEP]
+    assert len(trainings) == 4 * len(networks)
+    for network in networks:
+        first, second = f"{out}/{network}-s0/model.npz", f"{out}/{network}-s0-on/model.npz"
+        (going_on,) = (line for line in trainings if f"--start-from {first} " in line)
+        assert f"--set=model.base={network} --set=seed=10" in going_on
+        assert f" {network}={second},{out}/{network}-s1-on/model.npz " in tables
