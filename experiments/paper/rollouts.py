@@ -186,8 +186,9 @@ def measure_system(
     """Return the measures of a system on every garment, and on "all" of them.
 
     Energies and distances are means over frames, clips and garments; gaps are medians over frames: from the
-    states of the near-optimal rollout ("gap"), and from those of the system's own ("own_gap"). "not_finite"
-    is the share of rollouts with a prediction that was not finite.
+    states of the near-optimal rollout ("gap"), and from those of the system's own ("own_gap"). "stretch_median"
+    is the median over rollouts of their mean stretch energy, on which a single torn rollout has no weight.
+    "not_finite" is the share of rollouts with a prediction that was not finite.
     """
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
@@ -211,6 +212,7 @@ def measure_system(
     for garment, found in measured.items():
         medians = np.median(np.concatenate(gaps[garment], axis=1), axis=1)
         means = {column: float(np.mean([row[column] for row in found])) for column in found[0]}
+        means["stretch_median"] = float(np.median([row["stretch"] for row in found]))
         rows[garment] = {**means, **dict(zip(_GAPS, medians.tolist(), strict=True))}
     print(name, {column: round(value, 4) for column, value in rows["all"].items()}, flush=True)
     if share := rows["all"]["not_finite"]:

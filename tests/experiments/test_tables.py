@@ -176,7 +176,7 @@ def broken_rollouts(monkeypatch):
     monkeypatch.setattr(rollouts, "trajectory_gap", lambda *_, **__: gap)
     monkeypatch.setattr(rollouts, "stepped_potentials", lambda *_: np.ones(2))
     monkeypatch.setattr(rollouts, "distance_mm", lambda *_: 0.0)
-    monkeypatch.setattr(rollouts, "measure", lambda *_: {"total": 1.0})
+    monkeypatch.setattr(rollouts, "measure", lambda *_: {"stretch": 1.0})
     return [rollouts.Reference(None, gap)] * len(states)
 
 
