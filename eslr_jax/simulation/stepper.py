@@ -120,7 +120,7 @@ def find_start(
     point, prediction, status = _begin(params, problem, state, config)
     guess = prediction.guess
     if guess is None:
-        # Without a tolerance nobody asks, and the compiler drops it.
+        # The solver begins elsewhere, but measures its share of the gap from the energy of the inertial guess.
         guess = initial_guess(problem)
     return Start(point.position, guess.inertial_energy, prediction.previous), status
 

@@ -216,9 +216,12 @@ def test_bending_of_one_hinge_has_the_closed_form(angle):
 def test_bending_takes_lengths_and_areas_from_the_sewn_shape():
     positions, faces = folded_pair(0.8), np.array([[0, 1, 2], [1, 0, 3]])
     position = jnp.asarray(positions, jnp.float32)
-    as_worn, sewn = (make_garment(positions, faces, sewn_positions=scale * positions) for scale in (1.0, 1.5))
-    # k l^2 / A does not change with the scale of a mesh, and the angle is that of the positions.
-    expected = float(bending_energy(position, as_worn, COTTON))
+    # Along the hinge: k l^2 / A does not change with the scale of a mesh.
+    as_worn, sewn = (
+        make_garment(positions, faces, sewn_positions=positions * [1.0, 1.0, scale]) for scale in (1.0, 1.5)
+    )
+    # Squared lengths are 2.25 times as large and areas 1.5 times; the angle is that of the positions.
+    expected = 1.5 * float(bending_energy(position, as_worn, COTTON))
     np.testing.assert_allclose(bending_energy(position, sewn, COTTON), expected, rtol=1e-5)
 
 
