@@ -105,13 +105,15 @@ def _first_vertices(trajectory: Trajectory, count: int) -> Trajectory:
 
 
 def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> list[list[int]]:
-    """Group scenes that can be stacked: like vertex counts, frame counts and bodies."""
+    """Group scenes that can be stacked: like sizes of garments, frame counts and bodies."""
     groups: dict[tuple, list[int]] = {}
     for i, (garment, motion) in enumerate(zip(garments, poses, strict=True)):
         # The faces that are searched are those near the garments on the first body at rest.
         shape = (motion.faces, motion.is_obstacle, motion.rest_positions)
         body = hash(tuple(np.asarray(part).tobytes() for part in shape))
-        key = (choose_bucket(garment).vertices, motion.positions.shape[0], body)
+        columns = (garment.skin_weights.shape[1], garment.geodesic_embedding.shape[1])
+        kept = (*columns, garment.coarse is None, garment.is_recut)  # what padding leaves as it is
+        key = (choose_bucket(garment).vertices, motion.positions.shape[0], body, kept)
         groups.setdefault(key, []).append(i)
     return list(groups.values())
 

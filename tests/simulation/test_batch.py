@@ -10,7 +10,9 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
+from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes, shared_surface
 from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_batch, stack_scenes
 from eslr_jax.simulation.rollout import rollout_scene
@@ -62,6 +64,16 @@ def test_bodies_that_differ_in_what_is_an_obstacle_are_searched_apart(garments, 
     assert _group_alike(garments[:1] * 3, motions) == [[0, 1], [2]]
     taller = poses.replace(rest_positions=1.5 * np.asarray(poses.rest_positions))
     assert _group_alike(garments[:1] * 3, [poses, taller, poses]) == [[0, 2], [1]]
+
+
+def test_garments_that_padding_leaves_unlike_are_simulated_apart(garments, poses):
+    plain = garments[0]
+    count = len(plain.vertex_mask)
+    one_joint = plain.replace(skin_weights=np.ones((count, 1)), skin_indices=np.zeros((count, 1), np.int32))
+    long = plain.replace(geodesic_embedding=np.zeros((count, plain.geodesic_embedding.shape[1] + 1)))
+    recut = with_rest_positions(plain, plain.rest_positions)
+    kinds = [plain, one_joint, long, add_coarse_edges(plain), recut]
+    assert _group_alike(kinds + kinds, [poses] * 10) == [[i, i + 5] for i in range(5)]
 
 
 def test_counts_must_match(garments, poses):
