@@ -144,6 +144,30 @@ class GltfDocument:
             raise self.fail("has faces that are no triangles of its vertices")
         return points, faces.reshape(-1, 3).astype(np.int64)
 
+    def offsets(self, target: Any, shape: tuple[int, ...]) -> np.ndarray:
+        """Return by how much a morph target moves the positions of a primitive, which have this shape."""
+        index = _table(target).get("POSITION")  # a target may change only normals
+        offsets = np.zeros(shape) if index is None else self.array(index)
+        if offsets.shape != shape:
+            raise self.fail(f"has a shape of {len(offsets)} vertices for a mesh of {shape[0]}")
+        return offsets
+
+    def shaped_triangles(
+        self, node: dict[str, Any], primitive: dict[str, Any]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return `triangles` of a node's primitive, moved by its morph targets as much as their weights say."""
+        points, faces = self.triangles(primitive)
+        targets = primitive.get("targets") or []
+        weights = node.get("weights") or self.item("meshes", node["mesh"]).get("weights")
+        if not targets or not weights:
+            return points, faces
+        amounts = np.array(weights, np.float64)
+        if amounts.shape != (len(targets),) or not np.isfinite(amounts).all():
+            raise self.fail(f"has impossible weights of the {len(targets)} shapes of a mesh")
+        for number in np.flatnonzero(amounts):
+            points = points + amounts[number] * self.offsets(targets[number], points.shape)
+        return points, faces
+
     def _values(self, view_of: dict[str, Any], dtype: np.dtype, width: int, count: int) -> np.ndarray:
         """Return the raw values of an accessor or of a sparse part, [count, width]."""
         if "bufferView" not in view_of:

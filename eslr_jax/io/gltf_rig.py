@@ -55,7 +55,8 @@ def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
         meshes: Names of the meshes, or of their nodes, that make up the body; all skinned ones if empty.
 
     Returns:
-        The character in its bind pose, in world axes, with the vertices of the file.
+        The character in its bind pose, in world axes, with the vertices of the file and the shape that the file's
+        weights of morph targets give it.
 
     Raises:
         AssetError: The file is missing or damaged, or it lacks a skinned mesh that is named.
@@ -242,7 +243,7 @@ def _read_node(
         attributes = primitive.get("attributes", {})
         if "JOINTS_0" not in attributes:
             continue
-        points, faces = document.triangles(primitive)
+        points, faces = document.shaped_triangles(node, primitive)
         if np.linalg.det(space[:3, :3]) < 0:
             faces = faces[:, ::-1]
         weights, local = _read_weights(document, attributes, len(points))

@@ -236,7 +236,10 @@ def _read_stl(path: Path) -> MeshFile:
 
 
 def _read_glb(path: Path) -> MeshFile:
-    """Read all triangles of a glTF binary into one mesh, in the scene's frame, and share split vertices."""
+    """Read all triangles of a glTF binary into one mesh, in the scene's frame, and share split vertices.
+
+    Morph targets count as much as their weights at rest say.
+    """
     document = GltfDocument(path)
     world = document.world_matrices({}, 1)[0]
     positions, corners, uvs, names, materials, count = [], [], [], [], [], 0
@@ -245,7 +248,7 @@ def _read_glb(path: Path) -> MeshFile:
         for primitive in mesh.get("primitives", []):
             if primitive.get("mode", TRIANGLES) < TRIANGLES:
                 continue  # points and lines
-            points, faces = document.triangles(primitive)
+            points, faces = document.shaped_triangles(node, primitive)
             positions.append(points @ world[index, :3, :3].T + world[index, :3, 3])
             corners.append(faces + count)
             count += len(points)

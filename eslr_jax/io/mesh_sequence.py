@@ -233,7 +233,7 @@ def _read_shapes(document: GltfDocument, index: int) -> tuple[np.ndarray, np.nda
     parts, faces, count = [], [], 0
     for primitive in document.item("meshes", index).get("primitives", []):
         points, triangles = document.triangles(primitive)
-        offsets = [document.array(target["POSITION"]) for target in primitive.get("targets", [])]
+        offsets = [document.offsets(target, points.shape) for target in primitive.get("targets", [])]
         parts.append(np.stack([points, *offsets]))
         faces.append(triangles + count)
         count += len(points)

@@ -15,6 +15,7 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.body.rig import make_body, make_motion
 from eslr_jax.io.gltf_document import GltfDocument, sample_keys
 from eslr_jax.io.gltf_rig import gltf_clip_names, read_gltf_body, read_gltf_motion
+from eslr_jax.io.mesh import read_mesh_file
 from eslr_jax.io.skeleton import Skeleton, chain_positions
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -154,6 +155,46 @@ def test_key_frames_between_keys():
     turns = Rotation.from_euler("z", [[0], [90], [180]], degrees=True).as_quat()
     half = Rotation.from_quat(sample_keys("rotation", "LINEAR", times, turns, np.array([0.5])))
     assert np.degrees(half.magnitude()[0]) == pytest.approx(45.0)
+
+
+@pytest.mark.parametrize(("of_node", "of_mesh", "amounts"), [
+    ([], [0.5, 2.0], (0.5, 2.0)), ([1.0, 0.0], [0.5, 2.0], (1.0, 0.0)), ([0.0, 0.0], [0.5, 2.0], (0.0, 0.0)),
+    ([], [], (0.0, 0.0)),
+])  # fmt: skip
+def test_a_character_and_a_garment_have_the_shape_that_weights_of_targets_give(
+    tmp_path, of_node, of_mesh, amounts
+):
+    rng = np.random.default_rng(0)
+    points, faces, weights, indices = make_mesh(rng)
+    path, bare = tmp_path / "avatar.glb", tmp_path / "bare.glb"
+    write_character(bare, SKELETON, points, faces, weights, indices, unit=1.0)
+    offsets = rng.normal(size=(2, *points.shape)).astype(np.float32)
+    path.write_bytes(with_targets(gltf.GLTF2().load(str(bare)), offsets, of_node, of_mesh))
+    moved = np.tensordot(np.array(amounts), offsets, axes=1)[:, [0, 2, 1]] * [1, 1, -1]  # Z up to Y up
+    for read in (read_gltf_body, read_mesh_file):
+        found, before = read(path), read(bare)
+        np.testing.assert_allclose(found.positions, before.positions + moved, atol=1e-6)
+        np.testing.assert_array_equal(found.faces, before.faces)
+    path.write_bytes(with_targets(gltf.GLTF2().load(str(bare)), offsets, [1.0], of_mesh))
+    refuses(read_gltf_body, path, "impossible weights of the 2 shapes")
+
+
+def with_targets(document, offsets, of_node, of_mesh):
+    """Return a GLB whose only primitive has morph targets."""
+    blob = document.binary_blob()
+    for values in offsets:
+        document.bufferViews.append(gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=values.nbytes))
+        blob += values.tobytes()
+        view = len(document.bufferViews) - 1
+        document.accessors.append(
+            gltf.Accessor(bufferView=view, componentType=gltf.FLOAT, count=len(values), type="VEC3")
+        )
+        document.meshes[0].primitives[0].targets.append({"POSITION": len(document.accessors) - 1})
+    document.buffers[0].byteLength = len(blob)
+    document.meshes[0].weights = of_mesh
+    tables = json.loads(document.gltf_to_json())
+    next(node for node in tables["nodes"] if "mesh" in node)["weights"] = of_node
+    return pack(tables, blob)
 
 
 def edit(path, change):
