@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from eslr_jax.errors import AssetError, MeshError
-from eslr_jax.io.mesh import MeshFile, read_mesh_file
+from eslr_jax.io.mesh import MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.parsing import split_name
@@ -251,7 +251,8 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     """Return the positions of a moving garment in the vertex order of its garment file.
 
     The sequence may have that order, or the order of the mesh that the garment was fitted from, also where a
-    format has joined the vertices of a seam. It need not have the same faces, as long as most edges are the same.
+    format has joined or split the vertices of a seam. It need not have the same faces, as long as most edges are
+    the same.
 
     Args:
         sequence: The garment in motion.
@@ -268,6 +269,9 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
         if garment.joined_rows is not None:
             orders.append(order[garment.joined_rows])
     fitting = [order for order in orders if len(order) == num_rows]
+    if not fitting and num_rows > min(map(len, orders)):
+        sequence = _join_copies(sequence)
+        fitting = [order for order in orders if len(order) == sequence.positions.shape[1]]
     if not fitting:
         known = " or ".join(dict.fromkeys(str(len(order)) for order in orders))
         raise MeshError(
@@ -282,6 +286,14 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     raise MeshError(
         f"{sequence.name} has edges between other vertices than the garment: its vertices have another order, or "
         "it is another garment; keep the order of the garment's file"
+    )
+
+
+def _join_copies(sequence: MeshSequence) -> MeshSequence:
+    """Return a mesh whose vertices at one place in all frames are one; PLY splits them at seams of textures."""
+    kept, place = shared_vertices(sequence.positions.swapaxes(0, 1))
+    return dataclasses.replace(
+        sequence, positions=sequence.positions[:, kept], faces=place[np.asarray(sequence.faces)]
     )
 
 

@@ -16,7 +16,7 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.cli.runs import export
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.export import export_trajectory
-from eslr_jax.io.garment import GarmentFile
+from eslr_jax.io.garment import GarmentFile, in_vertex_order
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
 from eslr_jax.io.point_cache import write_mdd, write_pc2
 from eslr_jax.io.skin import Skin
@@ -148,6 +148,18 @@ def test_sequences_hold_every_frame_and_come_back_exactly(tmp_path, run, garment
     np.testing.assert_array_equal(
         back.positions[:, :count].astype(np.float32), run.positions[:, garment.vertex_map]
     )
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+@pytest.mark.parametrize("has_dropped", [False, True])
+def test_a_sequence_lies_on_the_garment_though_its_seams_are_split(tmp_path, run, garment, kind, has_dropped):
+    order = garment.vertex_map
+    if has_dropped:
+        garment = replace(garment, vertex_map=np.concatenate([[-1], order[:5], [-1], order[5:], [-1]]))
+    export_trajectory(run, tmp_path / "frames", garment=garment, format=kind)
+    sequence = read_mesh_sequence(tmp_path / "frames")
+    assert (sequence.positions.shape[1] > len(garment.vertex_map)) == (kind == "ply")
+    np.testing.assert_array_equal(in_vertex_order(sequence, garment).astype(np.float32), run.positions)
 
 
 def test_point_caches_hold_every_frame(tmp_path, run, garment):
