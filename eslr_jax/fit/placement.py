@@ -23,6 +23,7 @@ _TRIED_UNITS = (
 )  # feet and decimetres have to be given: no garment's file was seen in them
 _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from a scarf to a long coat
 _SLIDE_STEP = 0.04  # [m] between tried heights
+_SOLES = 0.02  # [m] by which soles may miss height 0 without taking along a garment that keeps its place
 _NEAR, _MIN_NEAR = 0.06, 0.03  # [m]; share of points nearer than that to the body below which nothing fits
 # What is usual costs less: factors on the cost of a fit.
 _PLACES = {"floor": 1.0, "body": 1.05, "found": 1.3}
@@ -104,7 +105,8 @@ def find_placement(
         units: Unit of the file, or metres per unit.
         up: Axis of the file that points up.
         front: Axis of the file that the wearer faces.
-        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own.
+        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own. If
+            these are within 2 cm of each other, it is the body's own, and the garment stays exactly.
         is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
         name: Name of the garment in messages.
 
@@ -124,7 +126,7 @@ def find_placement(
         )
     ]
     sample = sample_garment(positions, faces)
-    known = list(_known_candidates(sample, orientations, postures))
+    known = list(_known_candidates(sample, orientations, postures, stays=keep_place))
     best, rival = _choose(known, sample, postures)
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
@@ -153,10 +155,15 @@ def find_placement(
 
 
 def _known_candidates(
-    sample: Sample, orientations: list[Placement], postures: list[Posture]
+    sample: Sample, orientations: list[Placement], postures: list[Posture], *, stays: bool
 ) -> Iterable[Placement]:
-    """Yield every orientation at the known origins, in every posture."""
+    """Yield every orientation at the known origins, in every posture.
+
+    A garment that stays is not moved by the little that the soles of a body miss height 0.
+    """
     for start, (k, posture), place in itertools.product(orientations, enumerate(postures), ("floor", "body")):
+        if stays and place == "floor" and abs(posture.floor) < _SOLES:
+            continue
         offset = np.array([0.0, posture.floor if place == "floor" else 0.0, 0.0])
         yield _scored(start, sample, postures, posture=k, translation=offset, origin=place)
 

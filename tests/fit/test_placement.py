@@ -7,7 +7,7 @@ from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress
 
 from eslr_jax.errors import MeshError
 from eslr_jax.fit.placement import DOUBTFUL, find_placement
-from eslr_jax.fit.postures import arm_postures
+from eslr_jax.fit.postures import arm_postures, rest_posture
 
 GIVEN = {"units": "m", "up": "y", "front": "z"}
 
@@ -60,6 +60,20 @@ def test_kept_place_is_obeyed_even_beside_the_body(postures, shape, raised, asid
     else:
         np.testing.assert_allclose(placement.translation, (not raised) * floor)
         assert placement.warnings == ()
+
+
+@pytest.mark.parametrize("miss", [0.006, -0.018, 0.04])
+def test_a_kept_place_does_not_follow_soles_that_nearly_stand_on_the_origin(body, miss):
+    lift = np.array([0.0, miss - float(body.rest_positions[:, 1].min()), 0.0])
+    lifted = body.replace(
+        rest_positions=np.asarray(body.rest_positions) + lift,
+        joint_rest_positions=np.asarray(body.joint_rest_positions) + lift,
+    )
+    posture = rest_posture(lifted)
+    assert posture.floor == pytest.approx(miss, abs=1e-6)
+    positions, faces = skirt()
+    placement = find_placement(positions, faces, [posture], keep_place=True, **GIVEN)
+    np.testing.assert_allclose(placement.translation, [0.0, miss if miss > 0.02 else 0.0, 0.0], atol=1e-6)
 
 
 def test_refusal_names_only_the_options_that_are_missing(postures):
