@@ -103,11 +103,12 @@ def find_arms(body: Body) -> list[tuple[int, int]] | None:
     longest are the upper arm and the forearm. No joint names are needed.
     """
     joints = np.asarray(body.joint_rest_positions, np.float64)
+    aside = joints[:, 0] - body_middle(body)[0]
     off_axis = _OFF_AXIS * float(np.ptp(np.asarray(body.rest_positions)[:, 1]))
     arms = []
     for side in (1.0, -1.0):
-        chain = [int(np.argmax(side * joints[:, 0]))]
-        while body.parents[chain[-1]] >= 0 and side * joints[body.parents[chain[-1]], 0] > off_axis:
+        chain = [int(np.argmax(side * aside))]
+        while body.parents[chain[-1]] >= 0 and side * aside[body.parents[chain[-1]]] > off_axis:
             chain.append(body.parents[chain[-1]])
         if len(chain) < 3:
             return None
@@ -115,6 +116,11 @@ def find_arms(body: Body) -> list[tuple[int, int]] | None:
         upper = int(np.max(np.argsort(-lengths, kind="stable")[:2]))
         arms.append((chain[upper + 1], chain[upper]))
     return arms
+
+
+def body_middle(body: Body) -> Float[np.ndarray, "3"]:
+    """Return the median of the vertices in the rest pose [m]: a body may stand anywhere."""
+    return np.median(np.asarray(body.rest_positions, np.float64), axis=0)
 
 
 def shoulder_height(body: Body) -> float:

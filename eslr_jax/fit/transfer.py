@@ -127,7 +127,8 @@ def carry_shape(
     heights, _ = body_heights(positions, source)
     graded = _keep_ease(_spline(start, end, size)(positions), faces, size * heights, posture)
     placed, _ = push_out(graded, faces, posture)
-    is_trunk = np.abs(positions[:, 0]) < abs(here["left", "upper_arm"][0])
+    shoulders = np.array([here[side, "upper_arm"][0] for side in ("left", "right")])
+    is_trunk = np.abs(positions[:, 0] - shoulders.mean()) < 0.5 * np.ptp(shoulders)
     girth, length = _proportions(positions, placed, unique_edges(faces), is_trunk)
     if scale == "body":
         sewn = np.where(heights[:, None] > 0, placed, graded)  # what was tight stays tight

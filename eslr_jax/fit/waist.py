@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from eslr_jax.fit.postures import shoulder_height
+from eslr_jax.fit.postures import body_middle, shoulder_height
 from eslr_jax.geometry.topology import boundary_loops, vertex_components
 from eslr_jax.types import Body
 
@@ -76,16 +76,17 @@ def find_waist(
 
 def _gap_around_neck(points: np.ndarray, body: Body) -> float:
     """Return the largest angle around the neck that no point covers [rad]."""
-    rest = np.asarray(body.rest_positions, np.float64)
-    center = _trunk_center(rest, shoulder_height(body))
+    center = _trunk_center(body, shoulder_height(body))
     angle = np.sort(np.arctan2(*(points[:, [0, 2]] - center).T))
     return float(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max())
 
 
-def _trunk_center(rest: np.ndarray, height: float) -> np.ndarray:
+def _trunk_center(body: Body, height: float) -> np.ndarray:
     """Return x and z of the middle of the trunk at a height [m]."""
-    near = rest[(np.abs(rest[:, 1] - height) < 0.03) & (np.abs(rest[:, 0]) < 0.1 * np.ptp(rest[:, 1]))]
-    return near[:, [0, 2]].mean(axis=0) if len(near) else np.zeros(2)
+    rest, middle = np.asarray(body.rest_positions, np.float64), body_middle(body)
+    is_inner = np.abs(rest[:, 0] - middle[0]) < 0.1 * np.ptp(rest[:, 1])
+    near = rest[(np.abs(rest[:, 1] - height) < 0.03) & is_inner]
+    return near[:, [0, 2]].mean(axis=0) if len(near) else middle[[0, 2]]
 
 
 def _is_around_trunk(ring: np.ndarray, body: Body) -> bool:
@@ -94,6 +95,6 @@ def _is_around_trunk(ring: np.ndarray, body: Body) -> bool:
     height, low = ring[:, 1].mean(), rest[:, 1].min()
     if height < low + _CROTCH * np.ptp(rest[:, 1]):
         return False
-    angle = np.arctan2(*(ring[:, [0, 2]] - _trunk_center(rest, height)).T)
+    angle = np.arctan2(*(ring[:, [0, 2]] - _trunk_center(body, height)).T)
     turns = np.diff(np.append(angle, angle[0]))
     return abs(np.sum((turns + np.pi) % (2 * np.pi) - np.pi)) > np.pi

@@ -52,6 +52,20 @@ def test_the_own_body_changes_nothing(body, shirt):
     np.testing.assert_array_equal(load_garment_file("tshirt", body=body).rest_positions, shirt.rest_positions)
 
 
+@pytest.mark.slow
+def test_the_girth_is_that_of_the_trunk_wherever_the_body_stands(body, shirt, woman):
+    aside = np.array([[3.0, 0.0, 0.0]], np.float32)
+    moved = body.replace(
+        **{name: getattr(body, name) + aside for name in ("rest_positions", "joint_rest_positions")}
+    )
+    there = dataclasses.replace(shirt, rest_positions=shirt.rest_positions + aside)
+    reports = [
+        transfer_garment(garment, source, woman, scale="girth").metadata["transfer"]
+        for garment, source in ((shirt, body), (there, moved))
+    ]
+    assert reports[0] == pytest.approx(reports[1], abs=2e-3)
+
+
 @pytest.mark.parametrize("scale", ["body", "girth"])
 def test_a_bundled_garment_comes_in_the_size_of_the_body(small, shirt, scale):
     carried = load_garment_file("tshirt", body=small, fit=FitOptions(scale=scale))

@@ -9,12 +9,21 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.report import describe_cost, describe_fit
+from eslr_jax.fit.postures import find_arms
 from eslr_jax.fit.waist import WAISTBAND, find_waist
 
 
 def standing(shape, body):
     positions, faces = shape()
     return positions + np.array([0.0, float(np.asarray(body.rest_positions)[:, 1].min()), 0.0]), faces
+
+
+def aside(body, *, by=3.0):
+    """Return a body that stands elsewhere along x."""
+    return body.replace(
+        rest_positions=body.rest_positions + np.array([[by, 0.0, 0.0]], np.float32),
+        joint_rest_positions=body.joint_rest_positions + np.array([[by, 0.0, 0.0]], np.float32),
+    )
 
 
 def joined(*shapes):
@@ -33,6 +42,16 @@ def test_waistband_is_the_top_of_what_has_no_shoulders(body, shape):
     assert below[waist.is_held].max() <= WAISTBAND
     assert not waist.is_falling
     assert "waistband" in waist.reason
+
+
+@pytest.mark.parametrize("shape", [trousers, poncho, cape])
+def test_a_body_that_stands_elsewhere_has_the_same_pins(body, shape):
+    positions, faces = standing(shape, body)
+    waist = find_waist(positions, faces, body)
+    moved = find_waist(positions + np.array([3.0, 0.0, 0.0]), faces, aside(body))
+    np.testing.assert_array_equal(moved.is_held, waist.is_held)
+    assert moved.reason == waist.reason
+    assert find_arms(aside(body)) == find_arms(body)
 
 
 def test_a_cape_is_held_at_its_neckline(body):
