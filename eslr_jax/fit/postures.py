@@ -118,7 +118,7 @@ def find_arms(body: Body) -> list[tuple[int, int]] | None:
     return arms
 
 
-def body_middle(body: Body) -> Float[np.ndarray, "3"]:
+def body_middle(body: Body) -> Float[np.ndarray, " 3"]:
     """Return the median of the vertices in the rest pose [m]: a body may stand anywhere."""
     return np.median(np.asarray(body.rest_positions, np.float64), axis=0)
 

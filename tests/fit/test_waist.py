@@ -8,8 +8,8 @@ from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dr
 from eslr_jax.errors import ConfigError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
-from eslr_jax.fit.report import describe_cost, describe_fit
 from eslr_jax.fit.postures import find_arms
+from eslr_jax.fit.report import describe_cost, describe_fit
 from eslr_jax.fit.waist import WAISTBAND, find_waist
 
 
