@@ -15,9 +15,11 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from formats import write_walker
+from scipy.spatial import cKDTree
 
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.topology import vertex_normals
+from eslr_jax.io.gltf_rig import read_gltf_body
 from eslr_jax.io.mesh import read_mesh_file
 
 ROOT = Path(__file__).parents[2]
@@ -154,8 +156,9 @@ def test_a_garment_goes_to_the_simulator_with_its_texture(tmp_path, monkeypatch,
         polygons=faces,
         loops=range(7),
         uv_layers=SimpleNamespace(active=layer),
+        shape_keys=None,
     )
-    garment = SimpleNamespace(name="shirt", data=mesh, matrix_world=np.eye(4))
+    garment = SimpleNamespace(name="shirt", data=mesh, matrix_world=np.eye(4), active_shape_key_index=0)
     scene = SimpleNamespace(frame_start=0, frame_end=3, frame_current=1, frame_set=lambda frame: None)
     exchange.export_garment(tmp_path / "garment.obj", garment, scene)
     read = read_mesh_file(tmp_path / "garment.obj")
@@ -164,6 +167,51 @@ def test_a_garment_goes_to_the_simulator_with_its_texture(tmp_path, monkeypatch,
         assert read.corner_uvs is None
         return
     np.testing.assert_allclose(read.corner_uvs, uvs[[[0, 1, 2], [0, 2, 3], [4, 5, 6]]])
+
+
+def test_a_shape_is_that_of_the_mixed_keys_which_stay_as_they_are(monkeypatch):
+    exchange = without_blender(monkeypatch)
+    drawn, mixed = np.zeros((4, 3)), np.arange(12.0).reshape(4, 3)
+    keys = ["Basis", "Fat"]
+
+    def remove(key):
+        keys.remove(key)
+        thing.active_shape_key_index = 0
+
+    def add(from_mix):
+        assert from_mix
+        keys.append(mix)
+        return mix
+
+    mix = SimpleNamespace(data=_Values(mixed))
+    mesh = SimpleNamespace(vertices=_Values(drawn), shape_keys=keys)
+    thing = SimpleNamespace(data=mesh, active_shape_key_index=1, shape_key_add=add, shape_key_remove=remove)
+    np.testing.assert_array_equal(exchange.shown_shape(thing), mixed)
+    assert keys == ["Basis", "Fat"]
+    assert thing.active_shape_key_index == 1
+    mesh.shape_keys = None
+    np.testing.assert_array_equal(exchange.shown_shape(thing), drawn)
+
+
+@pytest.mark.slow
+@needs_blender
+def test_body_and_garment_go_to_the_simulator_as_their_shape_keys_shape_them(folder):
+    worker = Path(__file__).with_name("blender_shapes_worker.py")
+    command = [BLENDER, worker, ADDON / "eslr_garments", folder / "body.glb", folder / "out"]
+    (folder / "out").mkdir()
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300, check=False)
+    assert (folder / "out" / "shown.npz").exists(), done.stderr
+    shown = np.load(folder / "out" / "shown.npz")
+    for kind, found in (
+        ("body", read_gltf_body(folder / "out" / "body.glb").positions),
+        ("garment", read_mesh_file(folder / "out" / "garment.obj").positions),
+    ):
+        want, drawn = shown[kind], shown[f"{kind}_drawn"]
+        assert np.abs(want - drawn).max() > 0.05
+        order = cKDTree(want).query(found)  # the exporter of glTF splits and reorders vertices
+        np.testing.assert_allclose(order[0], 0.0, atol=1e-5)
+        assert len(np.unique(order[1])) == len(want)
+    assert bool(shown["is_as_before"])
 
 
 def test_a_garment_that_an_undo_made_anew_takes_the_simulation(tmp_path, monkeypatch):

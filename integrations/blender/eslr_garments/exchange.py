@@ -33,8 +33,26 @@ def to_z_up(points: np.ndarray) -> np.ndarray:
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
 
 
+def shown_shape(thing: bpy.types.Object) -> np.ndarray:
+    """Return a mesh's own vertices [vertices, 3] as its shape keys shape it in this frame, without modifiers."""
+    mesh, active = thing.data, thing.active_shape_key_index
+    points = np.empty((len(mesh.vertices), 3))
+    if mesh.shape_keys is None:
+        mesh.vertices.foreach_get("co", points.reshape(-1))
+        return points
+    mix = thing.shape_key_add(
+        from_mix=True
+    )  # Blender heeds muted keys, vertex groups, keys relative to others
+    mix.data.foreach_get("co", points.reshape(-1))
+    thing.shape_key_remove(mix)
+    thing.active_shape_key_index = active
+    return points
+
+
 def export_body(path: Path, body: bpy.types.Object, context: bpy.types.Context) -> None:
     """Write a skinned mesh with its armature and their animation in the scene's frames as a GLB file.
+
+    It has the shape that its shape keys give it in the current frame.
 
     Raises:
         ExchangeError: The body has no armature, does not move, or is not of a person's size.
@@ -42,15 +60,18 @@ def export_body(path: Path, body: bpy.types.Object, context: bpy.types.Context) 
     armature = body.find_armature()
     if armature is None:
         raise ExchangeError(f"{body.name} has no armature that deforms it; choose the body's skinned mesh")
-    corners = np.array([body.matrix_world @ vertex.co for vertex in body.data.vertices])
+    vertices, shape = body.data.vertices, shown_shape(body)
+    corners = shape @ np.array(body.matrix_world)[:3, :3].T
     size = float(np.ptp(corners, axis=0).max()) if len(corners) else 0.0
     if not _EXTENTS[0] <= size <= _EXTENTS[1]:
         raise ExchangeError(
             f"{body.name} is {size:.3g} m large; scale the character so that one unit is one metre"
         )
     chosen, active = list(context.selected_objects), context.view_layer.objects.active
-    frame = context.scene.frame_current
+    frame, drawn = context.scene.frame_current, np.empty_like(shape)
+    vertices.foreach_get("co", drawn.reshape(-1))
     try:
+        vertices.foreach_set("co", shape.reshape(-1))  # the exporter knows no vertex groups of shape keys
         for thing in context.view_layer.objects:
             thing.select_set(thing in (body, armature))
         bpy.ops.export_scene.gltf(
@@ -67,6 +88,7 @@ def export_body(path: Path, body: bpy.types.Object, context: bpy.types.Context) 
             export_texcoords=False,
         )
     finally:
+        vertices.foreach_set("co", drawn.reshape(-1))
         for thing in context.view_layer.objects:
             thing.select_set(thing in chosen)
         context.view_layer.objects.active = active
@@ -83,6 +105,8 @@ def export_body(path: Path, body: bpy.types.Object, context: bpy.types.Context) 
 def export_garment(path: Path, garment: bpy.types.Object, scene: bpy.types.Scene) -> None:
     """Write a garment's own mesh and its active texture coordinates, without modifiers, where it is in the world.
 
+    It has the shape that its shape keys give it in the current frame.
+
     Raises:
         ExchangeError: It has no faces, or moves as a whole.
     """
@@ -97,10 +121,9 @@ def export_garment(path: Path, garment: bpy.types.Object, scene: bpy.types.Scene
         )
     if not len(mesh.polygons):
         raise ExchangeError(f"{garment.name} has no faces; choose the garment's mesh")
-    points = np.empty((len(mesh.vertices), 3))
-    mesh.vertices.foreach_get("co", points.reshape(-1))
     matrix = np.array(garment.matrix_world)
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in to_y_up(points @ matrix[:3, :3].T + matrix[:3, 3])]
+    points = shown_shape(garment) @ matrix[:3, :3].T + matrix[:3, 3]
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in to_y_up(points)]
     layer = mesh.uv_layers.active
     if layer is not None and len(layer.data) == len(mesh.loops):
         uvs = np.empty((len(mesh.loops), 2), np.float32)
@@ -123,7 +146,7 @@ def check_place(path: Path) -> None:
     if np.abs(moved).max() > _MOVED:
         raise ExchangeError(
             f"the garment would be moved by {np.abs(moved).max():.2g} m; let the character's rest pose stand "
-            "with its feet at height 0, and the garment on it"
+            "with its soles within 2 cm of height 0, and the garment on it"
         )
 
 
