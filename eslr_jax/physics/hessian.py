@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
+from eslr_jax.physics.bending import hinge_stiffnesses
 from eslr_jax.physics.membrane import STIFFENING
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.repulsion import Pairs
@@ -162,7 +163,9 @@ def bending_blocks(
     if material.plate is not None:
         return np.zeros((len(garment.hinges), 12, 12))
     gradient = dihedral_gradients(position, garment).reshape(-1, 12)
-    return bending_stiffnesses(garment, material)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+    with jax.enable_x64(True):
+        stiffness = 2.0 * np.asarray(hinge_stiffnesses(*jax.tree.map(jnp.asarray, (garment, material))))
+    return stiffness[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
 
 
 def plate_matrix(
@@ -181,6 +184,7 @@ def plate_matrix(
     curvatures = _sparse_rows(
         weights.reshape(-1, table.shape[2]), table.reshape(-1, table.shape[2]), len(gradient)
     )
+    curvatures.eliminate_zeros()  # of hinges that are none, which stand as the first
     by_position = curvatures @ angles
     return scipy.sparse.csr_array(by_position.T @ by_position)
 
@@ -189,15 +193,6 @@ def _sparse_rows(values: np.ndarray, columns: np.ndarray, width: int) -> scipy.s
     """Return a matrix whose rows hold values at columns, both of shape [rows, entries]."""
     rows = np.repeat(np.arange(len(values)), values.shape[1])
     return scipy.sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width))
-
-
-def bending_stiffnesses(garment: Garment, material: Material) -> Float[np.ndarray, " hinges"]:
-    """Return k_b l^2 / (4 (A_a + A_b)) per hinge with rest lengths [J]; zero where padded."""
-    length = np.asarray(garment.hinge_rest_lengths, np.float64)
-    areas = np.asarray(garment.hinge_rest_areas, np.float64)
-    is_real = areas > 0
-    scale = np.where(is_real, length**2 / (4.0 * np.where(is_real, areas, 1.0)), 0.0)
-    return np.asarray(material.bending_stiffness, np.float64) * scale
 
 
 def vertex_blocks(

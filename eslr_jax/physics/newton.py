@@ -162,9 +162,11 @@ def _plate_couples(problem: FrameProblem) -> tuple[np.ndarray, np.ndarray]:
     if material.plate is None:
         return np.zeros(0, int), np.zeros(0, int)
     hinges = np.asarray(material.plate.hinges)
-    corners = np.asarray(garment.hinges)[hinges].reshape(len(hinges), -1)
+    # Where a face has no neighbour the table holds the first hinge, with rows of zeros.
+    face, slot = np.nonzero(np.any(np.asarray(material.plate.rows) != 0, axis=0).T)
+    corners = np.asarray(garment.hinges)[hinges[face, slot]]
     near = scipy.sparse.csr_array(
-        (np.ones(corners.size), (np.repeat(np.arange(len(hinges)), corners.shape[1]), corners.ravel())),
+        (np.ones(corners.size), (np.repeat(face, corners.shape[1]), corners.ravel())),
         shape=(len(hinges), len(garment.vertex_mask)),
     )
     return (near.T @ near).nonzero()

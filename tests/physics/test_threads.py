@@ -17,7 +17,7 @@ from eslr_jax.physics.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON, Weave
 from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.physics.newton import minimize_newton, potential_float64, to_float64
+from eslr_jax.physics.newton import _plate_couples, minimize_newton, potential_float64, to_float64
 from eslr_jax.physics.potential import evaluate, potential
 from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.rest_shape import with_rest_positions
@@ -107,6 +107,16 @@ def test_matrix_of_a_plate_equals_the_hessian_where_flat(sheet):
     expected = dense_hessian(bending_energy, flat, garment, material)
     found = hessian.plate_matrix(flat, garment, material).toarray()
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_newton_leaves_room_for_what_a_plate_couples_and_not_for_its_padding(woven_problem):
+    garment, material = to_float64((woven_problem.garment, woven_problem.material))
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(garment.rest_positions.shape)
+    matrix = hessian.plate_matrix(garment.rest_positions + noise, garment, material).tocoo()
+    found = set(zip(*_plate_couples(woven_problem), strict=True))
+    assert set(zip(matrix.row // 3, matrix.col // 3, strict=True)) <= found
+    across = {(garment.hinges[0, 0], last) for last in range(20, 25)}  # from the first hinge to the last row
+    assert not found & across
 
 
 @pytest.mark.slow
