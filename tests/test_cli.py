@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from formats import write_bvh
+from formats import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion
@@ -358,6 +358,24 @@ def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, capsys):
     assert values["LeftArm"] == "LeftArm"
     with pytest.raises(MotionError, match="needs no joint map"):
         joints("turn")
+
+
+def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body, capsys):
+    """SMPL parameters move a body of SMPL's family by name: its fingers rest."""
+    from eslr_jax.cli.bodies import joints
+
+    rng = np.random.default_rng(0)
+    np.savez(tmp_path / "body.npz", **smpl_model(body, rng))
+    write_amass(tmp_path / "walk.npz", rng.normal(0.0, 0.3, (4, 24, 3)), np.zeros((4, 3)), 30.0)
+    joints(str(tmp_path / "walk.npz"), str(tmp_path / "body.npz"), json_=True)
+    shown = json.loads(capsys.readouterr().out)
+    target = load_body(str(tmp_path / "body.npz"))
+    motion = load_motion(tmp_path / "walk.npz", body=target)
+    moves = np.abs(motion.rotations).max(axis=(0, 2)) > 1e-6
+    assert {name for name, other in shown.items() if other} == {
+        name for name, is_moving in zip(target.joint_names, moves, strict=True) if is_moving
+    }
+    assert shown["left_hand"] == ""
 
 
 def test_broken_motion_is_refused(tmp_path):

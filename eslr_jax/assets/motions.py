@@ -25,7 +25,7 @@ from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_motio
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import read_arrays
 from eslr_jax.io.parsing import split_name
-from eslr_jax.io.skeleton import Skeleton, SkeletonMotion
+from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.io.smpl import read_amass, read_smpl_pickle
 from eslr_jax.types import Body
 
@@ -93,8 +93,8 @@ def own_motion(body: str) -> str:
     return DEFAULT_MOTION
 
 
-def motion_skeleton(name: str) -> Skeleton:
-    """Return the skeleton whose joints a body follows in a motion.
+def moving_skeleton(name: str) -> SkeletonMotion:
+    """Return the moving skeleton whose joints a body follows in a motion.
 
     A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body.
 
@@ -109,9 +109,9 @@ def motion_skeleton(name: str) -> Skeleton:
     if name in PROCEDURAL:
         raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
     if _is_archived(name):
-        return skeleton_motion(_bundled_motion(name), load_body()).skeleton
+        return skeleton_motion(_bundled_motion(name), load_body())
     file, clip = split_name(name)
-    return read_skeleton_motion(file, clip).skeleton
+    return read_skeleton_motion(file, clip)
 
 
 def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:

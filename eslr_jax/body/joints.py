@@ -176,11 +176,12 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
 def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
     """Return the joint of the source that each joint of a rig follows.
 
-    A joint follows a joint of the same part; if two chains differ in length, their joints are matched in
-    proportion. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
+    A joint follows a joint of the same part: the one of the same name where the part has the same names in both
+    rigs, in whatever order; else they are matched from the hips outwards, in proportion if two chains differ in
+    length. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
     out, and move with their parent.
     """
-    if target.joint_names == source.joint_names:
+    if set(target.joint_names) == set(source.joint_names):
         return {name: name for name in target.joint_names}
     ours, theirs = find_parts(target), find_parts(source)
     result: dict[str, str] = {}
@@ -188,6 +189,10 @@ def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
         others = theirs.get((side, chain), [])
         for other in _FALLBACKS.get(chain, ()):
             others = others or theirs.get((side, other), [])
+        names = {target.joint_names[joint] for joint in joints}
+        if names == {source.joint_names[other] for other in others}:
+            result |= {name: name for name in names}
+            continue
         for position, joint in enumerate(joints if others else ()):
             share = -(-(position + 1) * len(others) // len(joints)) - 1
             result[target.joint_names[joint]] = source.joint_names[others[share]]
@@ -215,14 +220,26 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 
 
 def change_map(
-    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None
+    target: Skeleton,
+    source: Skeleton,
+    changes: Mapping[str, str] | None = None,
+    *,
+    same_names: bool = False,
 ) -> dict[str, str]:
     """Return the joint map between two rigs, with a user's changes, however few joints are in it.
+
+    Args:
+        target: Joints of the body.
+        source: Joints of the motion's file.
+        changes: Joints of the body to joints of the source; "" keeps one still.
+        same_names: Leave out joints that would follow one of another name, but for the changes.
 
     Raises:
         MotionError: A changed joint is not there.
     """
     result = map_joints(target, source)
+    if same_names:
+        result = {ours: theirs for ours, theirs in result.items() if ours == theirs}
     for ours, theirs in (changes or {}).items():
         _check_name(ours, target.joint_names, "the body")
         if theirs:
@@ -232,14 +249,18 @@ def change_map(
 
 
 def complete_map(
-    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None
+    target: Skeleton,
+    source: Skeleton,
+    changes: Mapping[str, str] | None = None,
+    *,
+    same_names: bool = False,
 ) -> dict[str, str]:
     """Return the joint map by which one rig follows another; see `change_map`.
 
     Raises:
         MotionError: A changed joint is not there, or nothing maps.
     """
-    result = change_map(target, source, changes)
+    result = change_map(target, source, changes, same_names=same_names)
     if len(result) < min(2, len(target)):  # the hips are always found
         raise MotionError(
             f"no joint of the motion ({', '.join(source.joint_names[:4])}, ...) is known to this body "

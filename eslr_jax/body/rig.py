@@ -22,6 +22,7 @@ from eslr_jax.types import Body
 
 MODEL_JOINTS = 18  # joints that a body shares with the SMPL family's 22 to be one of it
 GROUND_QUANTILE = 0.05  # of the lowest sole of each frame: robust to a toe that dips for a moment
+LOST_MOVE = 0.01  # [m] by which a character's joint may miss its place in the file without a word
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from Z up
 
 
@@ -155,8 +156,9 @@ def make_motion(
 ) -> Motion:
     """Carry a moving skeleton over to a body.
 
-    On its own rig a motion is kept, whatever the unit. On another rig, limbs point where the source's limbs
-    point, and the rest of the body turns as the source has turned since its rest pose. Steps are scaled by the
+    On its own rig the turns of the joints and the path of the hips are kept, whatever the unit. Where bones also move
+    or stretch, so that a joint with skin is more than 1 cm away, a warning says so. On another rig, limbs point where
+    the source's limbs point, and the rest of the body turns as the source has turned since its rest pose. Steps are scaled by the
     length of the legs, the floor is put at y = 0, and the motion starts above the origin.
 
     Args:
@@ -178,16 +180,10 @@ def make_motion(
     if up == "z" or is_judged:
         source = turn_motion(source, _Y_UP)
     target = body_skeleton(body)
-    mapping = complete_map(target, source.skeleton, joint_map)
+    is_model = is_body_model(target, source)
+    mapping = complete_map(target, source.skeleton, joint_map, same_names=is_model)
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
-    is_model = _is_body_model(target, source)
-    if is_model:  # joints follow by name, and rest where the parameters have none
-        changed = joint_map or {}
-        followed = [
-            other if name in changed or mapping.get(name) == name else -1
-            for name, other in zip(target.joint_names, followed, strict=True)
-        ]
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
     is_own = scale is not None
     ours, theirs = match_parts(target, source.skeleton, followed)
@@ -213,6 +209,9 @@ def make_motion(
         translations = translations + source.root_axes @ target.rest_positions[0]
     else:
         translations = scale * translations
+        places = chain_positions(turned, translations, target)
+        away = np.linalg.norm(places - scale * source.positions[:, followed], axis=2)
+        _warn_of_lost_moves(source.name, away, body)
     has_arms = all((side, "upper_arm") in find_named_parts(target.joint_names) for side in ("left", "right"))
     return Motion(
         source.name,
@@ -222,6 +221,27 @@ def make_motion(
         target.joint_names,
         arm_abduction=ARM_ABDUCTION if has_arms and not is_own else 0.0,
     )
+
+
+def _warn_of_lost_moves(name: str, away: NDArray, body: Body) -> None:
+    """Warn if a joint with skin misses its place in the file.
+
+    Args:
+        name: Name of the motion.
+        away: Distance of each joint from its place in the file [m], shape [frames, joints].
+        body: The body.
+    """
+    has_skin = np.zeros(away.shape[1], bool)
+    has_skin[np.asarray(body.skin_indices)[np.asarray(body.skin_weights) > 0]] = True
+    away = np.where(has_skin, away, 0.0)
+    frame, joint = np.unravel_index(away.argmax(), away.shape)
+    if away[frame, joint] > LOST_MOVE:
+        warnings.warn(
+            f"{name}: its bones move or stretch apart from turning, which is not played: joint "
+            f"{body.joint_names[joint]} is {100 * away[frame, joint]:.1f} cm away in frame {frame}; bake the "
+            "animation to rotations, or export the character as a moving mesh",
+            stacklevel=3,
+        )
 
 
 def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
@@ -270,8 +290,11 @@ def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
     return bool(rise[2] > abs(rise[1]))
 
 
-def _is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
-    """Tell whether a motion holds pose parameters of the body's own body model, such as SMPL."""
+def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
+    """Tell whether a motion holds pose parameters of the body's own body model, such as SMPL.
+
+    Joints then follow by name, and rest where the parameters have none.
+    """
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
     return source.root_axes is not None and len(shared) >= MODEL_JOINTS
 

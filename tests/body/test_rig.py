@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.assets import load_motion
-from eslr_jax.body.joints import complete_map, find_parts, name_part, read_joint_map, torso_axes
+from eslr_jax.body.joints import complete_map, find_parts, map_joints, name_part, read_joint_map, torso_axes
 from eslr_jax.body.motion import obstacle_surface, pose_body, still_motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.retarget import global_rotations
@@ -97,6 +97,19 @@ def test_hips_above_which_there_is_a_root_become_the_first_joint():
     np.testing.assert_allclose(torso_axes(found, find_parts(found)), np.eye(3), atol=1e-12)
 
 
+def test_joints_of_one_rig_follow_by_name_whatever_their_order():
+    """Two toes of two links: a file lists toe by toe, and a body, made from the hips outwards, link by link."""
+    thighs, toes = ["Bip01 L Thigh", "Bip01 R Thigh"], ("Toe0", "Toe01", "Toe1", "Toe11")
+    names = ["Bip01", "Bip01 Pelvis", "Bip01 Spine", *thighs, "Bip01 L Foot"]
+    names += [f"Bip01 L {toe}" for toe in toes]
+    source = Skeleton(tuple(names), (-1, 0, 1, 1, 1, 3, 5, 6, 5, 8), np.zeros((10, 3)))
+    target, _ = hips_first(source)
+    assert target.joint_names != source.joint_names
+    assert map_joints(target, source) == {name: name for name in names}
+    longer = Skeleton((*names, "Prop"), (*source.parents, 0), np.zeros((11, 3)))
+    assert map_joints(target, longer) == {name: name for name in names}
+
+
 def test_a_motion_of_this_rig_is_taken_as_it_is(body):
     motion = load_motion("cmu_016_32")
     back = make_motion(skeleton_motion(motion, body), body)
@@ -104,6 +117,22 @@ def test_a_motion_of_this_rig_is_taken_as_it_is(body):
     turned, again = (global_rotations(m.rotations, body.parents) for m in (motion, back))
     np.testing.assert_allclose(again, turned, atol=1e-9)
     assert back.arm_abduction == 0.0
+
+
+def test_what_a_characters_own_bones_do_but_turn_is_told(body):
+    source = skeleton_motion(load_motion("cmu_016_32"), body)
+    head, neck = (body.joint_names.index(name) for name in ("Head", "Neck1"))
+    stretched = source.positions.copy()
+    stretched[7, head] += [0.0, 0.05, 0.0]
+    moved = dataclasses.replace(source, positions=stretched)
+    with pytest.warns(UserWarning, match=r"Head is 5\.0 cm away in frame 7.*moving mesh"):
+        make_motion(moved, body)
+    indices = np.asarray(body.skin_indices)
+    bald = body.replace(skin_indices=np.where(indices == head, neck, indices))
+    stretched[7, head] += [0.0, 0.05, 0.0]
+    make_motion(moved, bald)  # a joint without skin may be anywhere
+    stretched[7, head] = source.positions[7, head] + [0.0, 0.005, 0.0]
+    make_motion(moved, body)
 
 
 def test_a_source_that_faces_elsewhere_moves_the_body_alike(body):
