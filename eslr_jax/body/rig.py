@@ -156,10 +156,11 @@ def make_motion(
 ) -> Motion:
     """Carry a moving skeleton over to a body.
 
-    On its own rig the turns of the joints and the path of the hips are kept, whatever the unit. Where bones also move
-    or stretch, so that a joint with skin is more than 1 cm away, a warning says so. On another rig, limbs point where
-    the source's limbs point, and the rest of the body turns as the source has turned since its rest pose. Steps are scaled by the
-    length of the legs, the floor is put at y = 0, and the motion starts above the origin.
+    On its own rig, the turns of the joints and the path of the hips are kept, whatever the unit. A warning tells
+    if bones also move or stretch, so that a joint with skin is more than 1 cm away from its place in the file.
+    On another rig, limbs point where the source's limbs point, and the rest of the body turns as the source has
+    turned since its rest pose. Steps are scaled by the length of the legs, the floor is put at y = 0, and the
+    motion starts above the origin.
 
     Args:
         source: The motion of a file.
