@@ -40,9 +40,8 @@ def shown_shape(thing: bpy.types.Object) -> np.ndarray:
     if mesh.shape_keys is None:
         mesh.vertices.foreach_get("co", points.reshape(-1))
         return points
-    mix = thing.shape_key_add(
-        from_mix=True
-    )  # Blender heeds muted keys, vertex groups, keys relative to others
+    # Blender heeds muted keys, vertex groups and keys relative to others.
+    mix = thing.shape_key_add(from_mix=True)
     mix.data.foreach_get("co", points.reshape(-1))
     thing.shape_key_remove(mix)
     thing.active_shape_key_index = active
