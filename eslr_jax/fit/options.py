@@ -22,8 +22,8 @@ class FitOptions:
         up: Axis of the file that points up.
         front: Axis of the file that the wearer faces.
         keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own. If
-            these are within 2 cm of each other, it is not moved at all. With units, up and front given, nothing is
-            refused.
+            these are within 2 cm of each other, it is not moved at all. With units, up and front given, nothing
+            is refused.
         arms: Recognise the pose of the arms that the garment was modelled in, or take the body's rest pose.
         components: Keep separate parts, join their open edges, keep the largest, or refuse them.
         join_gap: Distance across which `join` sews parts together [m].
