@@ -34,7 +34,7 @@ Pace = Callable[[int, float], int]
 class Timing(NamedTuple):
     """Where the time of a simulation went."""
 
-    compile_s: float
+    compile_s: float  # that the run waited for programs, also those whose buffers were too small
     frame_ms: float  # mean of the simulated frames
 
 
@@ -83,18 +83,35 @@ def simulate(
     check_scene(scene)
     done = None if done is None else good_frames(done)
     larger: Scene | None = scene
+    passes = []
     while larger is not None:
         scene = larger
-        trajectory, timing = _in_chunks(
+        trajectory, spent = _in_chunks(
             jax.tree.map(jnp.asarray, params), scene, config, _Loop(pace, on_frames, is_stopping), done
         )
+        passes.append(spent)
         larger, kept = enlarge_buffers(scene, trajectory), good_frames(trajectory)
         if larger is not None and is_stopping():  # what overflowed is simulated when somebody goes on
             trajectory, larger = kept, None
         done = kept if kept.num_frames > 1 else None  # what fitted stands
     if raises:
         raise_for_status(trajectory)
-    return Simulation(trajectory, timing, scene)
+    return Simulation(trajectory, _timing(passes), scene)
+
+
+class _Spent(NamedTuple):
+    """What one pass over a scene took."""
+
+    compile_s: float = 0.0
+    run_s: float = 0.0
+    frames: int = 0  # that ran, of the last chunk also those beyond the end
+
+
+def _timing(passes: list[_Spent]) -> Timing:
+    """Return the timing of all passes over a scene, also of those whose buffers were too small."""
+    frames = sum(spent.frames for spent in passes)
+    frame_ms = 1e3 * sum(spent.run_s for spent in passes) / max(frames, 1)
+    return Timing(sum(spent.compile_s for spent in passes), frame_ms)
 
 
 _join = jax.jit(join_frames)
@@ -110,7 +127,7 @@ class _Loop(NamedTuple):
 
 def _in_chunks(
     params: Any, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
-) -> tuple[Trajectory, Timing]:
+) -> tuple[Trajectory, _Spent]:
     """Simulate a scene a few frames at a time, and time compilation apart."""
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     inputs = frame_inputs(jax.device_get(scene))  # cut on the host, where it compiles nothing
@@ -125,7 +142,7 @@ def _in_chunks(
     start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))
     begin = 0 if before is None else before.num_frames - 1
     if before is not None and begin >= total:  # nothing is left
-        return before, Timing(0.0, 0.0)
+        return before, _Spent()
     state, done, seconds, compile_s = start, [], 0.0, 0.0
     for first in range(begin, total, chunk):
         bound = None if loop.pace is None else jnp.int32(iterations)  # all numbers share a program
@@ -152,7 +169,7 @@ def _in_chunks(
     trajectory = _join(start, joined, state)
     if before is not None:
         trajectory = _appended(before, trajectory)
-    return trajectory, Timing(compile_s, seconds * 1e3 / (chunk * len(done)))
+    return trajectory, _Spent(compile_s, seconds, chunk * len(done))
 
 
 def _appended(before: Trajectory, after: Trajectory) -> Trajectory:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from eslr_jax.io.unfinished import read_unfinished, write_unfinished
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-from eslr_jax.simulation.program import _compile
+from eslr_jax.simulation.program import _compile, find_program
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import (
     begin_compiling,
@@ -230,8 +231,24 @@ def test_unphysical_scenes_are_refused_by_name(scene, changes, message):
         simulate(None, scene.replace(**changes))
 
 
+def slow_first_program(monkeypatch, seconds):
+    """Make every run of the first program slower by `seconds`; return a list of waits for programs [s]."""
+    waits = []
+
+    def find(*arguments):
+        began = time.perf_counter()
+        program = find_program(*arguments)
+        waits.append(time.perf_counter() - began)
+        if len(waits) > 1:
+            return program
+        return lambda *values: (time.sleep(seconds), program(*values))[1]
+
+    monkeypatch.setattr("eslr_jax.simulation.simulate.find_program", find)
+    return waits
+
+
 @pytest.mark.slow
-def test_self_contact_that_overflows_gets_the_buffers_it_needs():
+def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     scene = crossing_sheets()
     few = scene.replace(self_contact=PairCapacity(pairs=20))
     short = rollout_scene(None, few, SOLVER)
@@ -239,7 +256,11 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs():
     with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ pairs or more"):
         raise_for_status(short)
     assert enlarge_buffers(few, short).self_contact.pairs > 20
+    waits = slow_first_program(monkeypatch, 5.0)
     found = simulate(None, few, config=SOLVER)
+    assert len(waits) > 1, "a program for every buffer"
+    assert found.timing.compile_s >= sum(waits)
+    assert found.timing.frame_ms * 2 * len(waits) > 5e3, "the mean is over the two frames of every pass"
     assert found.scene.self_contact.pairs > 20
     expected = rollout_scene(None, found.scene, SOLVER)
     assert Status(int(expected.status)) == Status.OK
