@@ -116,7 +116,7 @@ def directions(scene, seed=0):
     if scene.ground is not None:
         shapes["ground"] = ()
     if scene.air is not None:
-        shapes |= {"wind": (3,), "air_density": (), "damping": ()}
+        shapes |= {"wind": (3,), "air_density": (), "normal_drag": (), "tangential_drag": (), "damping": ()}
     if scene.self_contact is not None:
         shapes |= dict.fromkeys(OF_LAYERS, ())
     if scene.pin_targets is not None:
@@ -153,7 +153,12 @@ def changed(scene, change):
         scene = scene.replace(ground=scene.ground + 1e-3 * change["ground"])
     if "wind" in change:
         air = scene.air
-        air = air.replace(wind=air.wind + change["wind"], density=air.density * (1 + change["air_density"]))
+        air = air.replace(
+            wind=air.wind + change["wind"],
+            density=air.density * (1 + change["air_density"]),
+            normal_drag=air.normal_drag * (1 + change["normal_drag"]),
+            tangential_drag=air.tangential_drag * (1 + change["tangential_drag"]),
+        )
         scene = scene.replace(air=air, damping=scene.damping * (1 + change["damping"]))
     if "pins" in change:
         scene = scene.replace(pin_targets=scene.pin_targets + 1e-3 * change["pins"])
