@@ -172,7 +172,6 @@ class TrainConfig:
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
-    playback_speeds: tuple[float, ...] = (1.0,)  # each clip is there at all these multiples of its speed
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
     # With energy_set "hood": which of the three variants of HOOD's losses, see physics.hood. "metric" has the
@@ -266,8 +265,6 @@ class TrainConfig:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
-        if not self.playback_speeds or not all(0 < speed < float("inf") for speed in self.playback_speeds):
-            raise ValueError(f"playback_speeds must be positive multiples, got {self.playback_speeds}")
 
 
 Config = TypeVar("Config")

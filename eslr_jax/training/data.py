@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,10 +119,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
     """
     options = config.model.garment_options
     unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    clips = [load_motion(clip) for clip in split_clips(config.split)]
-    motions = [
-        dataclasses.replace(clip, fps=clip.fps * speed) for speed in config.playback_speeds for clip in clips
-    ]
+    motions = [load_motion(clip) for clip in split_clips(config.split)]
     return build_training_data(pad_alike(unpadded), load_body(), motions, has_shapes=config.shape_range > 0)
 
 

@@ -12,7 +12,7 @@ from eslr_jax.assets import split_clips
 from eslr_jax.body.motion import pose_body, shape_body
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import ConfigError
-from eslr_jax.training.data import build_training_data, load_training_data
+from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import slot_problem
@@ -55,18 +55,6 @@ def test_clips_are_played_back_and_forth_and_never_into_each_other(small_garment
     assert play(0, 1) == [0, 1, 2, 3, 2, 1, 0, 1]  # a clip's first frame has none before it
     assert play(5, 4) == [5, 6, 5, 4, 5, 6, 5, 4]
     assert play(2, 2) == [2] * 8  # stands still
-
-
-def test_clips_are_there_once_at_each_playback_speed(config):
-    config = dataclasses.replace(config, garments=("tshirt",), split="validation")
-    slow = load_training_data(config, "1k")
-    both = load_training_data(dataclasses.replace(config, playback_speeds=(1.0, 2.0)), "1k")
-    frames = len(slow.frames_left)
-    np.testing.assert_array_equal(both.joint_transforms[:frames], slow.joint_transforms)
-    clip = int(slow.frames_left[0]) + 1  # frames of the first clip
-    np.testing.assert_allclose(
-        both.joint_transforms[frames : frames + (clip + 1) // 2], slow.joint_transforms[:clip:2], atol=1e-4
-    )
 
 
 def test_a_body_stands_still_as_often_as_asked(config, small_data):
