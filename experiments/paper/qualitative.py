@@ -27,8 +27,8 @@ from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress")
-ABLATION = ("mgn-5-correction", "gsa-5-correction", "lsdmp-5-correction", "eslr-5-correction")
-MODELS = (*ABLATION, "eslr-small", "smooth-small+20", OPTIMUM)
+DEEP = tuple(f"{name}-5-correction" for name in ("hood", "mgn", "gsa", "lsdmp", "eslr"))
+MODELS = (*DEEP, "eslr-small", "smooth-small+20", OPTIMUM)
 _SIZE = (240, 340)  # of a picture, width and height [pixels]
 _CAMERA = 25.0  # [degrees] from the front towards the side
 _FULL_SCALE = 0.98  # quantile of the optimum's energy per area at which the colours end
