@@ -78,6 +78,15 @@ def make_limb() -> Body:
     return jax.tree.map(jnp.asarray, limb)
 
 
+def stand_at(body: Body, offset) -> Body:
+    """Return a body whose rest pose stands elsewhere, by an offset [m]."""
+    offset = np.asarray(offset, np.float32)
+    return body.replace(
+        rest_positions=np.asarray(body.rest_positions) + offset,
+        joint_rest_positions=np.asarray(body.joint_rest_positions) + offset,
+    )
+
+
 def swing_motion(body: Body, num_frames: int, *, sway: float = 0.02) -> Motion:
     """Return a motion of the limb sideways and round, by up to `sway` metres a frame."""
     time = np.arange(num_frames)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cloth import stand_at
 from garment_files import TO_Z_UP, bundled
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress
 
@@ -64,12 +65,7 @@ def test_kept_place_is_obeyed_even_beside_the_body(postures, shape, raised, asid
 
 @pytest.mark.parametrize("miss", [0.006, -0.018, 0.04])
 def test_a_kept_place_does_not_follow_soles_that_nearly_stand_on_the_origin(body, miss):
-    lift = np.array([0.0, miss - float(body.rest_positions[:, 1].min()), 0.0])
-    lifted = body.replace(
-        rest_positions=np.asarray(body.rest_positions) + lift,
-        joint_rest_positions=np.asarray(body.joint_rest_positions) + lift,
-    )
-    posture = rest_posture(lifted)
+    posture = rest_posture(stand_at(body, [0.0, miss - float(body.rest_positions[:, 1].min()), 0.0]))
     assert posture.floor == pytest.approx(miss, abs=1e-6)
     positions, faces = skirt()
     placement = find_placement(positions, faces, [posture], keep_place=True, **GIVEN)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cloth import stand_at
 from garment_files import TO_Z_UP, bundled, source
 from other_bodies import smpl_female
 
@@ -55,9 +56,7 @@ def test_the_own_body_changes_nothing(body, shirt):
 @pytest.mark.slow
 def test_the_girth_is_that_of_the_trunk_wherever_the_body_stands(body, shirt, woman):
     aside = np.array([[3.0, 0.0, 0.0]], np.float32)
-    moved = body.replace(
-        **{name: getattr(body, name) + aside for name in ("rest_positions", "joint_rest_positions")}
-    )
+    moved = stand_at(body, aside)
     there = dataclasses.replace(shirt, rest_positions=shirt.rest_positions + aside)
     reports = [
         transfer_garment(garment, source, woman, scale="girth").metadata["transfer"]

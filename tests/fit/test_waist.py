@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cloth import stand_at
 from garment_files import bundled, source
 from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress
 
@@ -16,14 +17,6 @@ from eslr_jax.fit.waist import WAISTBAND, find_waist
 def standing(shape, body):
     positions, faces = shape()
     return positions + np.array([0.0, float(np.asarray(body.rest_positions)[:, 1].min()), 0.0]), faces
-
-
-def aside(body, *, by=3.0):
-    """Return a body that stands elsewhere along x."""
-    return body.replace(
-        rest_positions=body.rest_positions + np.array([[by, 0.0, 0.0]], np.float32),
-        joint_rest_positions=body.joint_rest_positions + np.array([[by, 0.0, 0.0]], np.float32),
-    )
 
 
 def joined(*shapes):
@@ -48,10 +41,11 @@ def test_waistband_is_the_top_of_what_has_no_shoulders(body, shape):
 def test_a_body_that_stands_elsewhere_has_the_same_pins(body, shape):
     positions, faces = standing(shape, body)
     waist = find_waist(positions, faces, body)
-    moved = find_waist(positions + np.array([3.0, 0.0, 0.0]), faces, aside(body))
+    aside = stand_at(body, [3.0, 0.0, 0.0])
+    moved = find_waist(positions + np.array([3.0, 0.0, 0.0]), faces, aside)
     np.testing.assert_array_equal(moved.is_held, waist.is_held)
     assert moved.reason == waist.reason
-    assert find_arms(aside(body)) == find_arms(body)
+    assert find_arms(aside) == find_arms(body)
 
 
 def test_a_cape_is_held_at_its_neckline(body):
