@@ -162,9 +162,9 @@ def _known_candidates(
     A garment that stays is not moved by the little that the soles of a body miss height 0.
     """
     for start, (k, posture), place in itertools.product(orientations, enumerate(postures), ("floor", "body")):
-        if stays and place == "floor" and abs(posture.floor) < _SOLES:
+        offset = posture.stand if place == "floor" else np.zeros(3)
+        if stays and place == "floor" and np.linalg.norm(offset) < _SOLES:
             continue
-        offset = np.array([0.0, posture.floor if place == "floor" else 0.0, 0.0])
         yield _scored(start, sample, postures, posture=k, translation=offset, origin=place)
 
 
@@ -233,8 +233,8 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
             posture = postures[k]
             top = posture.positions[:, 1].max()
             for height in np.arange(posture.floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
-                offset = np.array([-0.5 * (low[0] + high[0]), height, -0.5 * (low[2] + high[2])])
-                offset[2] += _middle_depth(posture, low[1] + height, high[1] + height)
+                middle = [posture.stand[0], height, _middle_depth(posture, low[1] + height, high[1] + height)]
+                offset = middle - 0.5 * (low + high) * [1, 0, 1]
                 tried.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
         found += [(start, best) for best in sorted(tried, key=lambda placement: placement.cost)[:2]]
     refined = []
@@ -249,8 +249,10 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
 def _middle_depth(posture: Posture, low: float, high: float) -> float:
     """Return the middle of the trunk from back to front between two heights [m]."""
     points = posture.positions[posture.touchable]
-    here = points[(points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0]) < 0.2)]
-    return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else 0.0
+    here = points[
+        (points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0] - posture.stand[0]) < 0.2)
+    ]
+    return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else posture.stand[2]
 
 
 def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndarray:
@@ -274,7 +276,7 @@ def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> 
     here = fit_cost(best.apply(sample.points), posture)
     origins = [best.translation]
     if best.origin == "found":
-        origins = [np.array([0.0, height, 0.0]) for height in (posture.floor, 0.0)]
+        origins = [posture.stand, np.zeros(3)]
     turned = best.factor * sample.points @ best.rotation.T
     for origin in origins:
         costs = np.array([fit_cost(scale * turned + origin, posture) for scale in _SCALES])

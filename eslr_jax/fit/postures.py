@@ -15,6 +15,7 @@ from eslr_jax.types import Body
 
 ARM_ANGLES = (0.0, 25.0, 45.0, 65.0)  # degrees below the horizontal that are tried; 0 is the T-pose
 _OFF_AXIS = 0.04  # of the body's height: joints farther from the middle belong to a limb
+_ASIDE = 0.08  # of the body's height, half the depth of a trunk: a body whose root is farther stands aside
 _LIMB = 0.11  # of the body's height: length from which a bone is that of an arm or leg
 SHOULDERS = 0.8  # of the body's height, for a body without arms
 
@@ -63,6 +64,16 @@ class Posture:
     def floor(self) -> float:
         """Height of the lowest vertex [m]."""
         return float(self.positions[:, 1].min())
+
+    @cached_property
+    def stand(self) -> Float[np.ndarray, " 3"]:
+        """Place on the floor that is the origin of files which have it between the feet [m].
+
+        It is under the body's origin, or under the root of a body that stands aside. A moving mesh has many roots.
+        """
+        middle = np.median(self.joints[np.array(self.parents) < 0], axis=0)
+        middle[np.abs(middle) < _ASIDE * np.ptp(self.positions[:, 1])] = 0.0
+        return np.array([middle[0], self.floor, middle[2]])
 
     def heights(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """Return the distance of every point to the nearest touchable vertex [m], negative inside."""

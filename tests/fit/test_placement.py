@@ -47,6 +47,21 @@ def test_garment_in_the_bodys_frame_stays_there(postures):
     np.testing.assert_array_equal(placement.translation, 0.0)
 
 
+# What is lowered is not where the body is, and has to be moved along it.
+@pytest.mark.parametrize(
+    ("shape", "lowered"), [(skirt, 0.0), (poncho, 0.0), (trousers, 0.0), (poncho, 0.4), (trousers, 0.4)]
+)
+def test_a_body_that_stands_aside_wears_the_garment_at_the_same_place(body, postures, shape, lowered):
+    positions, faces = shape()
+    positions = positions - [0.0, lowered, 0.0]
+    aside = np.array([3.0, 0.0, -2.0])
+    usual = find_placement(positions, faces, postures)
+    moved = find_placement(positions, faces, arm_postures(stand_at(body, aside)))
+    assert (moved.factor, moved.posture, moved.up) == (usual.factor, usual.posture, usual.up)
+    np.testing.assert_array_equal(moved.rotation, usual.rotation)
+    np.testing.assert_allclose(moved.translation, usual.translation + aside, atol=0.04)
+
+
 @pytest.mark.parametrize("shape", [poncho, cape])
 @pytest.mark.parametrize("raised", [False, True])
 @pytest.mark.parametrize("aside", [0.0, 1.5])
