@@ -19,6 +19,7 @@ from rollouts import OPTIMUM, arguments, read_system, scenes_of, write
 from worn import Setting, Worn, check_optimum, not_finite
 
 from eslr_jax.assets import load_body, load_splits
+from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.membrane import stretch_energy
 from eslr_jax.render import render_frame, side_by_side, write_png
@@ -151,7 +152,7 @@ def main() -> None:
         for name, values in joined.items()
     }
     sizes = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
-    write({**sizes, "mean": rows}, chosen.out / "stretch_energy.json")
+    write({**sizes, "mean": rows, "environment": environment()}, chosen.out / "stretch_energy.json")
 
 
 if __name__ == "__main__":

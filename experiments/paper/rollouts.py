@@ -25,7 +25,6 @@ from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_ga
 from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
-from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
 from eslr_jax.physics.hood import HoodParameters
@@ -243,7 +242,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
 
 
 def write(result: dict[str, Any], path: Path) -> None:
-    """Write a result with the versions that made it."""
+    """Write a result, or nothing of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n")
+        temporary.write_text(json.dumps(result, indent=1) + "\n")

@@ -18,14 +18,15 @@ same network untrained.
 --train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
 paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
 A table is never written over one of another setting, nor a row that names its networks over one of others: give
-another --out or label. A row that a table has is kept, and not measured again.
+another --out or label. A row that a table has is kept, and not measured again. Rows are written one by one, each
+with the versions and the device that made it, so that several runs can fill a table.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from rollouts import (
     CONTROLS_OF_WEIGHTS,
     GUESS,
     OPTIMUM,
+    Reference,
     Setting,
     System,
     arguments,
@@ -50,10 +52,10 @@ from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
 from eslr_jax.body.motion import pose_body
 from eslr_jax.cli.train import train
 from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
 from eslr_jax.models.registry import MODELS, count_parameters, init_model
 from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.training.checkpoint import has_checkpoint
@@ -77,6 +79,8 @@ BUNDLED = (
 )
 SYSTEMS = (f"guess={GUESS}", *DEEP, *BUNDLED, f"optimum={OPTIMUM}")
 FULL_SIZE = ("mgn-48", "mgn-15", "eslr-15", "eslr-10", "hood")
+# Of a table of energies, each by the labels of its rows; notes are written by hand.
+PARTS = ("mean", "seeds", "garments", "networks", "environments", "notes")
 TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")
 _CLIPS = 3  # of the test split, if none are given
 _NEW_MOTION_FRAMES = 60  # the clips are short
@@ -145,9 +149,11 @@ def main() -> None:
             if not chosen.anew:
                 check_networks(file, asked, parts["networks"])
             missing = asked if chosen.anew else {k: row for k, row in asked.items() if k not in parts["mean"]}
-            if missing:  # else the near-optimal rollouts would be made for nothing
-                for result in energy_table(missing, setting, parts):
-                    write(result, file)
+            references = find_references(setting) if missing else []
+            for label, networks in missing.items():
+                row = measure_row(networks, setting, references)
+                parts = with_row(rows_of_setting(file, setting), label, row)  # another run may have written
+                write({**setting._asdict(), **parts}, file)
 
 
 def plan_trainings(rows: Rows, out: Path) -> tuple[Rows, list[Training]]:
@@ -215,35 +221,39 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     return changed
 
 
-def energy_table(rows: Rows, setting: Setting, parts: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield the table after every row: means over seeds, the seeds' own, and those of every garment.
+def measure_row(names: Sequence[str], setting: Setting, references: list[Reference]) -> dict[str, Any]:
+    """Return the parts of a row: means over its seeds, and the seeds' own if there are several."""
+    seeds = [measure_system(name, setting, references) for name in names]
+    means = {
+        garment: {column: float(np.mean([seed[garment][column] for seed in seeds])) for column in row}
+        for garment, row in seeds[0].items()
+    }
+    row = {
+        "mean": {**means.pop("all"), "seeds": len(seeds), **training_cost(names)},
+        "garments": means,
+        "networks": [short_name(name) for name in names],
+        "environments": environment(),
+    }
+    if len(seeds) > 1:
+        row["seeds"] = {column: [seed["all"][column] for seed in seeds] for column in seeds[0]["all"]}
+    return row
 
-    Args:
-        rows: Names by label.
-        setting: Garments and clips.
-        parts: Rows that the table has, of `rows_of_setting`; new ones are added.
+
+def with_row(parts: dict[str, dict[str, Any]], label: str, row: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the parts of a table with another row, or a new one in its place.
+
+    Rows that stand beside the same network untrained say what learning removes of the gap.
     """
-    shared = json.loads(json.dumps(setting._asdict()))
-    references = find_references(setting)
-    for label, names in rows.items():
-        seeds = [measure_system(name, setting, references) for name in names]
-        means = {
-            garment: {column: float(np.mean([seed[garment][column] for seed in seeds])) for column in row}
-            for garment, row in seeds[0].items()
-        }
-        parts["mean"][label] = {**means.pop("all"), "seeds": len(seeds), **training_cost(names)}
-        parts["garments"][label] = means
-        parts["networks"][label] = [short_name(name) for name in names]
-        parts["seeds"].pop(label, None)  # of the row before
-        if len(seeds) > 1:
-            parts["seeds"][label] = {
-                column: [seed["all"][column] for seed in seeds] for column in seeds[0]["all"]
-            }
-        with_control, _, _ = label.partition(", untrained")
-        if with_control != label and with_control in parts["mean"]:
-            row = parts["mean"][with_control]
-            row["learned_share"] = parts["mean"][label]["gap_share"] - row["gap_share"]
-        yield {**shared, **parts}
+    changed = {
+        name: {**rows, label: row[name]} if name in row else {k: v for k, v in rows.items() if k != label}
+        for name, rows in parts.items()
+    }
+    means = changed["mean"]
+    for name in means:
+        if untrained := means.get(f"{name}, untrained"):
+            learned = untrained["gap_share"] - means[name]["gap_share"]
+            means[name] = {**means[name], "learned_share": learned}
+    return changed
 
 
 def training_cost(names: Sequence[str]) -> dict[str, float]:
@@ -261,7 +271,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
             differ, and what to give.
     """
     found = json.loads(file.read_text()) if file.exists() else {}
-    parts = {name: found.get(name, {}) for name in ("mean", "seeds", "garments", "networks")}
+    parts = {name: found.get(name, {}) for name in PARTS}
     asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
     differs = [name for name, value in asked.items() if found.get(name, value) != value]
     if any(set(row) != set(setting.garments) for row in parts["garments"].values()):
@@ -353,7 +363,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
             }
     for label, milliseconds in take_turns(parts, 1 if is_smoke else _TURNS).items():
         found[label]["latency_ms"] = milliseconds
-    return {"vertices": vertices, "device": device_name(), "mean": found}
+    return {"vertices": vertices, "mean": found, "environment": environment()}
 
 
 def with_totals(costs: dict[str, Any], energies: Path) -> dict[str, Any]:

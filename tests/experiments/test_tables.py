@@ -12,6 +12,7 @@ from paper import rollouts
 from paper.rollouts import Setting, read_system
 from paper.tables import (
     DEEP,
+    PARTS,
     SYSTEMS,
     TABLES,
     check_costs,
@@ -20,6 +21,7 @@ from paper.tables import (
     rows_of_setting,
     table_setting,
     with_changes,
+    with_row,
     with_totals,
 )
 
@@ -28,15 +30,16 @@ from eslr_jax.errors import NonFiniteError, Status
 from eslr_jax.training.recipe import load_recipe
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
-ROW = {"stretch": 0.1}
+ROW = {"stretch": 0.1, "gap_share": 0.1}
 TABLE = {
     **SETTING._asdict(),
     "mean": {"mgn-5": ROW},
     "seeds": {},
     "garments": {"mgn-5": {"tshirt": ROW, "dress": ROW}},
     "networks": {"mgn-5": ["mgn-5-correction", "weights/second.npz"]},
+    "environments": {"mgn-5": {"device": "cpu"}},
+    "notes": {"mgn-5": "of older code"},
 }
-PARTS = ("mean", "seeds", "garments", "networks")
 
 
 @pytest.fixture
@@ -49,6 +52,22 @@ def file(tmp_path):
 
 def test_rows_of_the_same_setting_are_kept(file):
     assert rows_of_setting(file, SETTING) == {name: TABLE[name] for name in PARTS}
+
+
+def test_a_row_that_is_measured_again_changes_nothing_of_the_others(file):
+    row = {
+        "mean": {"gap_share": 1.0},
+        "networks": ["mgn-5-correction~untrained"],
+        "environments": {"device": "gpu"},
+    }
+    changed = with_row(rows_of_setting(file, SETTING), "mgn-5, untrained", row)
+    assert changed["mean"]["mgn-5, untrained"] == row["mean"]
+    assert changed["environments"] == {"mgn-5": {"device": "cpu"}, "mgn-5, untrained": {"device": "gpu"}}
+    assert changed["notes"] == TABLE["notes"]
+    assert changed["mean"]["mgn-5"]["learned_share"] == pytest.approx(0.9)
+    anew = with_row(changed, "mgn-5", {**row, "mean": {"gap_share": 0.2}})
+    assert anew["mean"]["mgn-5"] == {"gap_share": 0.2, "learned_share": pytest.approx(0.8)}
+    assert (anew["notes"], anew["garments"]) == ({}, {})  # what the new row doesn't have is not the old one's
 
 
 def test_without_a_table_there_are_no_rows(tmp_path):
