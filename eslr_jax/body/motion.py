@@ -71,7 +71,7 @@ def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: f
     """
     rotations = np.zeros((num_frames, len(body.joint_names), 3))
     if arm_angle:
-        rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=_front(body))
+        rotations = abduct_arms(rotations, body.joint_names, arm_angle, front=chest_direction(body))
     root = np.asarray(body.joint_rest_positions)[0].copy()
     root[1] -= float(np.asarray(body.rest_positions)[:, 1].min())  # soles on the floor
     return Motion(
@@ -122,7 +122,7 @@ def pose_body(
             f"arms can't be lifted by {arm_abduction:g} degrees; give {-_MAX_ABDUCTION:g} to {_MAX_ABDUCTION:g}"
         )
     if arm_abduction:
-        rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=_front(body))
+        rotations = abduct_arms(rotations, body.joint_names, arm_abduction, front=chest_direction(body))
     positions, transforms = turn_joints(body, rotations, translations)
     return body_motion(body, positions, transforms, fps=fps)
 
@@ -230,7 +230,7 @@ def joint_transforms(
     )
 
 
-def _front(body: Body) -> np.ndarray:
+def chest_direction(body: Body) -> np.ndarray:
     """Return the direction that the resting chest faces, shape [3]; +Z if the rig doesn't tell."""
     skeleton = Skeleton(body.joint_names, body.parents, np.asarray(body.joint_rest_positions, np.float64))
     axes = torso_axes(skeleton, find_parts(skeleton))

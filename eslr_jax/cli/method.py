@@ -57,7 +57,13 @@ def choose_method(
     simulator, model, iterations = options.simulator, options.model, options.iterations
     budget_ms, tolerance = request
     if choice is None and (budget_ms is not None or tolerance is not None):
-        choice = choose(read_calibration(), num_vertices, budget_ms=budget_ms, tolerance=tolerance)
+        choice = choose(
+            read_calibration(),
+            num_vertices,
+            budget_ms=budget_ms,
+            tolerance=tolerance,
+            substeps=options.substeps,
+        )
     if choice is not None:
         simulator = "physics" if choice.method == SOLVER else "network"
         model = None if choice.method == SOLVER else choice.method
@@ -78,10 +84,11 @@ def choose_method(
     return Method(simulator, model, params, config, choice, budget_ms, tolerance)
 
 
-def expected_frame_ms(method: Method, num_vertices: int) -> float:
+def expected_frame_ms(method: Method, num_vertices: int, substeps: int) -> float:
     """Return what a frame is expected to take on this machine [ms]."""
     from eslr_jax.simulation.budget import SOLVER, expected_ms, read_calibration
 
     if method.choice is not None:
         return method.choice.expected_ms
-    return expected_ms(read_calibration(), num_vertices, method.model or SOLVER, method.config.iterations)
+    name, iterations = method.model or SOLVER, method.config.iterations
+    return expected_ms(read_calibration(), num_vertices, name, iterations, substeps)

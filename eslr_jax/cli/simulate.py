@@ -123,7 +123,7 @@ def simulate(
         substeps: Number of shorter steps per frame; 2 keeps layers apart that swing fast against each other.
             The iterations are those of each substep.
         self_contact: Keep all layers of cloth apart, also within each garment of an outfit. By default layers of
-            one garment are kept apart where they can meet, and the garments of an outfit from each other.
+            a garment of one piece are kept apart where they can meet, and pieces and garments from each other.
         no_self_contact: Let layers of cloth pass through each other.
         ground: Model a level ground under the body's lowest point; auto does where cloth could reach it.
         wind: Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
@@ -297,7 +297,8 @@ def _announce(options: Options, setting: _Setting) -> None:
             say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
     num_vertices = len(stored.rest_positions)
     if num_vertices >= LARGE:
-        say(describe_load(num_vertices, scene.num_frames, expected_frame_ms(method, num_vertices)))
+        frame_ms = expected_frame_ms(method, num_vertices, scene.substeps)
+        say(describe_load(num_vertices, scene.num_frames, frame_ms))
 
 
 def _write(options: Options, out: Path, setting: _Setting, simulation: Simulation) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from eslr_jax.body.motion import chest_direction
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
@@ -84,6 +85,7 @@ def fit_garment(
         front=options.front,
         keep_place=options.keep_place,
         is_metric=source.is_metric,
+        facing=chest_direction(worn_by),
         name=name,
     )
     posture = postures[placement.posture]
@@ -167,7 +169,7 @@ def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
             f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
             "a region or a loop"
         )
-    if options.pin or source.is_pinned is None or not source.is_pinned.any():
+    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
         return []
     return [
         "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "

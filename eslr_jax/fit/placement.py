@@ -90,13 +90,14 @@ def find_placement(
     front: Axis = "auto",
     keep_place: bool = False,
     is_metric: bool = False,
+    facing: Float[np.ndarray, " 3"] | None = None,
     name: str = "garment",
 ) -> Placement:
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
-    costs less: feet at the origin, Y up and facing Z, or Z up and facing -Y. The confidence compares the best
-    placement with the next best one that differs from it.
+    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
+    compares the best placement with the next best one that differs from it.
 
     Args:
         positions: Vertex positions as the file has them, shape [vertices, 3].
@@ -108,6 +109,7 @@ def find_placement(
         keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own. If
             these are within 2 cm of each other, it is the body's own, and the garment stays exactly.
         is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
+        facing: Direction that the body faces, shape [3]; +Z if not given. The nearest axis is taken.
         name: Name of the garment in messages.
 
     Raises:
@@ -122,7 +124,7 @@ def find_placement(
     orientations = [
         Placement(factor, rotation, np.zeros(3), 0, *axes, "floor", weight * (1.0 if is_usual else _TURNED))
         for (factor, weight), (rotation, axes, is_usual) in itertools.product(
-            factors.items(), _rotations(up, front)
+            factors.items(), _rotations(up, front, _heading(facing))
         )
     ]
     sample = sample_garment(positions, faces)
@@ -161,11 +163,11 @@ def _known_candidates(
 
     A garment that stays is not moved by the little that the soles of a body miss height 0.
     """
-    for start, (k, posture), place in itertools.product(orientations, enumerate(postures), ("floor", "body")):
-        offset = posture.stand if place == "floor" else np.zeros(3)
-        if stays and place == "floor" and np.linalg.norm(offset) < _SOLES:
-            continue
-        yield _scored(start, sample, postures, posture=k, translation=offset, origin=place)
+    for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
+        for offset in posture.stands:
+            if not stays or np.linalg.norm(offset) > _SOLES:
+                yield _scored(start, sample, postures, posture=k, translation=offset, origin="floor")
+        yield _scored(start, sample, postures, posture=k, translation=np.zeros(3), origin="body")
 
 
 def _scored(start: Placement, sample: Sample, postures: list[Posture], **changes) -> Placement:
@@ -233,7 +235,7 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
             posture = postures[k]
             top = posture.positions[:, 1].max()
             for height in np.arange(posture.floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
-                middle = [posture.stand[0], height, _middle_depth(posture, low[1] + height, high[1] + height)]
+                middle = [posture.root[0], height, _middle_depth(posture, low[1] + height, high[1] + height)]
                 offset = middle - 0.5 * (low + high) * [1, 0, 1]
                 tried.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
         found += [(start, best) for best in sorted(tried, key=lambda placement: placement.cost)[:2]]
@@ -250,9 +252,9 @@ def _middle_depth(posture: Posture, low: float, high: float) -> float:
     """Return the middle of the trunk from back to front between two heights [m]."""
     points = posture.positions[posture.touchable]
     here = points[
-        (points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0] - posture.stand[0]) < 0.2)
+        (points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0] - posture.root[0]) < 0.2)
     ]
-    return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else posture.stand[2]
+    return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else posture.root[2]
 
 
 def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndarray:
@@ -276,7 +278,7 @@ def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> 
     here = fit_cost(best.apply(sample.points), posture)
     origins = [best.translation]
     if best.origin == "found":
-        origins = [posture.stand, np.zeros(3)]
+        origins = [*posture.stands, np.zeros(3)]
     turned = best.factor * sample.points @ best.rotation.T
     for origin in origins:
         costs = np.array([fit_cost(scale * turned + origin, posture) for scale in _SCALES])
@@ -314,16 +316,24 @@ def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: st
     }
 
 
-def _rotations(up: Axis, front: Axis) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
-    """Return rotations of file axes onto (left, up, front), with the axes and whether they are usual."""
+def _heading(facing: np.ndarray | None) -> np.ndarray:
+    """Return the quarter turn about Y from +Z to where a body faces, shape [3, 3]."""
+    x, _, z = (0.0, 0.0, 1.0) if facing is None else facing
+    x, z = (0.0, np.sign(z)) if abs(z) >= abs(x) else (np.sign(x), 0.0)
+    return np.array([[z, 0.0, x], [0.0, 1.0, 0.0], [-x, 0.0, z]])
+
+
+def _rotations(up: Axis, front: Axis, heading: np.ndarray) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
+    """Return rotations of file axes onto the body's, with the file's axes and whether they are usual."""
     result = []
     for vertical in ("y", "z") if up == "auto" else (up,):
         for facing in _VECTORS if front == "auto" else (front,):
             if facing[-1] == vertical[-1]:
                 continue
             y, z = _VECTORS[vertical], _VECTORS[facing]
-            rotation = np.stack([np.cross(y, z), y, z])
-            result.append((rotation, (vertical, facing), _USUAL_FRONT[vertical] == facing or front != "auto"))
+            rotation = heading @ np.stack([np.cross(y, z), y, z])
+            is_usual = _USUAL_FRONT[vertical] == facing or np.array_equal(rotation, np.eye(3))
+            result.append((rotation, (vertical, facing), is_usual or front != "auto"))
     if not result:
         raise MeshError(f"up {up} and front {front} are the same axis; give two different ones")
     return result

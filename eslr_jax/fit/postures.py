@@ -66,14 +66,19 @@ class Posture:
         return float(self.positions[:, 1].min())
 
     @cached_property
-    def stand(self) -> Float[np.ndarray, " 3"]:
-        """Place on the floor that is the origin of files which have it between the feet [m].
+    def stands(self) -> list[Float[np.ndarray, " 3"]]:
+        """Places on the floor that a file may mean by its origin, if that is between the feet [m].
 
-        It is under the body's origin, or under the root of a body that stands aside. A moving mesh has many roots.
+        They are under the body's origin and, if it stands aside, under its root.
         """
-        middle = np.median(self.joints[np.array(self.parents) < 0], axis=0)
-        middle[np.abs(middle) < _ASIDE * np.ptp(self.positions[:, 1])] = 0.0
-        return np.array([middle[0], self.floor, middle[2]])
+        x, _, z = self.root
+        is_aside = np.hypot(x, z) > _ASIDE * np.ptp(self.positions[:, 1])
+        return [np.array([x, self.floor, z]) for x, z in [(0.0, 0.0), (x, z)][: 1 + is_aside]]
+
+    @cached_property
+    def root(self) -> Float[np.ndarray, " 3"]:
+        """The root joint, or the middle of a moving mesh's many roots [m]."""
+        return np.median(self.joints[np.array(self.parents) < 0], axis=0)
 
     def heights(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """Return the distance of every point to the nearest touchable vertex [m], negative inside."""
@@ -138,8 +143,10 @@ def shoulder_height(body: Body) -> float:
     """Return the height of the upper arm joints in the rest pose [m]; an estimate if the rig has no arms."""
     arms = find_arms(body)
     if arms is None:
-        heights = np.asarray(body.rest_positions)[:, 1]
-        return float(heights.min() + SHOULDERS * np.ptp(heights))
+        positions = np.asarray(body.rest_positions)
+        heights = positions[:, 1]
+        is_aside = np.abs(positions[:, 0] - body_middle(body)[0]) > 2 * _OFF_AXIS * np.ptp(heights)
+        return float(heights.min() + SHOULDERS * np.ptp(heights[~is_aside]))  # without raised arms
     return float(np.mean(np.asarray(body.joint_rest_positions)[[joint for joint, _ in arms], 1]))
 
 

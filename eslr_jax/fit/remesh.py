@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.extras import require
@@ -96,8 +97,8 @@ def _onto_open_edges(
     loops = [positions[loop] for loop in boundary_loops(faces)]
     result = points.copy()
     for loop in boundary_loops(triangles) if loops else []:
-        middle = points[loop].mean(axis=0)
-        start = min(loops, key=lambda other: np.linalg.norm(other.mean(axis=0) - middle))
+        distances = [cKDTree(other).query(points[loop])[0].mean() for other in loops]
+        start = loops[int(np.argmin(distances))]
         end = np.roll(start, -1, axis=0)
         along = end - start
         share = np.einsum("lsx,sx->ls", points[loop][:, None] - start, along) / np.sum(along**2, axis=1)

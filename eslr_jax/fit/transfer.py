@@ -127,8 +127,9 @@ def carry_shape(
     heights, _ = body_heights(positions, source)
     graded = _keep_ease(_spline(start, end, size)(positions), faces, size * heights, posture)
     placed, _ = push_out(graded, faces, posture)
-    shoulders = np.array([here[side, "upper_arm"][0] for side in ("left", "right")])
-    is_trunk = np.abs(positions[:, 0] - shoulders.mean()) < 0.5 * np.ptp(shoulders)
+    left, right = (here[side, "upper_arm"] for side in ("left", "right"))
+    across = (left - right) * [1, 0, 1]
+    is_trunk = np.abs((positions - 0.5 * (left + right)) @ across) < 0.5 * across @ across
     girth, length = _proportions(positions, placed, unique_edges(faces), is_trunk)
     if scale == "body":
         sewn = np.where(heights[:, None] > 0, placed, graded)  # what was tight stays tight
@@ -178,15 +179,16 @@ def _landmarks(posture: Posture, skeleton: Skeleton) -> dict[Part, np.ndarray]:
         for part, joints in find_parts(skeleton).items()
         if part[1] in _JOINTS
     }
-    crotch = _crotch(posture, 0.5 * (places["left", "upper_leg"] + places["right", "upper_leg"]))
+    crotch = _crotch(posture, places["left", "upper_leg"], places["right", "upper_leg"])
     return places if crotch is None else places | {("", "crotch"): crotch}
 
 
-def _crotch(posture: Posture, hips: np.ndarray) -> np.ndarray | None:
+def _crotch(posture: Posture, left: np.ndarray, right: np.ndarray) -> np.ndarray | None:
     """Return the lowest point of the trunk between the legs [m]; None if the legs meet farther down."""
     height = float(np.ptp(posture.positions[:, 1]))
     points = posture.positions[posture.touchable]
-    middle = points[np.abs(points[:, 0] - hips[0]) < _MIDLINE * height, 1]
+    hips, across = 0.5 * (left + right), (left - right) * [1, 0, 1]  # whatever the body faces
+    middle = points[np.abs((points - hips) @ across) < _MIDLINE * height * np.linalg.norm(across), 1]
     if not len(middle) or not -_CROTCH[0] * height < middle.min() - hips[1] < _CROTCH[1] * height:
         return None
     return np.array([hips[0], middle.min(), hips[2]])

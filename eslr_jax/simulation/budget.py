@@ -66,6 +66,7 @@ def choose(
     *,
     budget_ms: float | None = None,
     tolerance: float | None = None,
+    substeps: int = 1,
 ) -> Choice:
     """Choose a simulator for a time per frame, or for a gap relative to the initial gap.
 
@@ -76,11 +77,12 @@ def choose(
         num_vertices: Of the garment.
         budget_ms: Milliseconds per frame to stay within.
         tolerance: Relative gap to stay below on 99 % of the frames.
+        substeps: Of a frame.
 
     Raises:
         ConfigError: Neither or both are given, the budget is too small, or the tolerance out of reach.
     """
-    methods = methods_at(calibration, num_vertices)
+    methods = methods_at(calibration, num_vertices, substeps)
     if budget_ms is not None and tolerance is None:
         return _within_budget(methods, budget_ms)
     if tolerance is not None and budget_ms is None:
@@ -88,28 +90,32 @@ def choose(
     raise ConfigError("give either a budget or a tolerance")
 
 
-def expected_ms(calibration: Calibration, num_vertices: int, name: str, iterations: int) -> float:
+def expected_ms(
+    calibration: Calibration, num_vertices: int, name: str, iterations: int, substeps: int = 1
+) -> float:
     """Return how long a frame takes on this device [ms]; of a network not measured, the solver's part.
 
     Args:
         calibration: Of this device.
         num_vertices: Of the garment.
         name: `SOLVER`, or the name of a network.
-        iterations: Of the solver.
+        iterations: Of the solver, in a substep.
+        substeps: Of a frame.
     """
-    methods = {method.name: method for method in methods_at(calibration, num_vertices)}
+    methods = {method.name: method for method in methods_at(calibration, num_vertices, substeps)}
     method = methods.get(name, methods[SOLVER])
     return method.fixed_ms + iterations * method.iteration_ms
 
 
-def methods_at(calibration: Calibration, num_vertices: int) -> list[Method]:
-    """Return the methods of the size measured nearest by, their costs scaled to a number of vertices."""
+def methods_at(calibration: Calibration, num_vertices: int, substeps: int = 1) -> list[Method]:
+    """Return the methods of the size measured nearest by, their costs scaled to vertices and to substeps."""
     nearest = min({m.vertices for m in calibration.methods}, key=lambda v: abs(np.log(v / num_vertices)))
+    scale = substeps * num_vertices / nearest
     return [
         dataclasses.replace(
             method,
-            fixed_ms=method.fixed_ms * num_vertices / nearest,
-            iteration_ms=method.iteration_ms * num_vertices / nearest,
+            fixed_ms=method.fixed_ms * scale,
+            iteration_ms=method.iteration_ms * scale,
         )
         for method in calibration.methods
         if method.vertices == nearest

@@ -11,6 +11,7 @@ from eslr_jax.simulation.budget import (
     Calibration,
     Method,
     choose,
+    expected_ms,
     keep_budget,
     read_calibration,
     write_calibration,
@@ -73,6 +74,13 @@ def test_costs_grow_with_the_garment_from_the_nearest_size():
     calibration = Calibration("here", (PLAIN, LARGE))
     assert choose(calibration, 8000, budget_ms=100.0).iterations == 11  # 8 ms, and 8 ms an iteration
     assert choose(calibration, 500, budget_ms=10.0).iterations == 19
+
+
+def test_a_frame_costs_as_much_as_its_substeps():
+    calibration = Calibration("here", (PLAIN,))  # 1 ms, and 1 ms an iteration
+    choice = choose(calibration, 1000, budget_ms=22.0, substeps=2)
+    assert (choice.iterations, choice.expected_ms) == (10, pytest.approx(22.0))
+    assert expected_ms(calibration, 1000, SOLVER, 10, 3) == pytest.approx(33.0)
 
 
 def test_an_iteration_costs_the_same_behind_every_method():

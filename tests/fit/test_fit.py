@@ -14,7 +14,7 @@ from eslr_jax.fit.pins import select_vertices
 from eslr_jax.fit.postures import arm_postures, find_arms, unpose
 from eslr_jax.fit.report import describe_fit
 from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.geometry.topology import vertex_components
+from eslr_jax.geometry.topology import boundary_loops, vertex_components
 from eslr_jax.io.garment import read_garment_source
 
 
@@ -311,10 +311,33 @@ def test_pins_that_remeshing_replaces_are_refused_or_told(body, shirt):
     with pytest.raises(ConfigError, match="counts vertices of the file, which edge_length replaces"):
         fit_garment(shirt_source, body, FitOptions(edge_length=0.03, pin=("vertices:0,5",)))
     held = dataclasses.replace(shirt_source, is_pinned=np.arange(len(shirt.rest_positions)) < 5)
-    fitted = fit_garment(held, body, FitOptions(edge_length=0.03))
-    assert any(
-        "the pins of the file are lost" in text for text in fitted.fit_warnings
-    )  # kept with the garment
+    for pin in ((), ("loop:top",), ("none",)):
+        told = fit_garment(
+            held, body, FitOptions(edge_length=0.03, pin=pin)
+        ).fit_warnings  # kept with the garment
+        assert any("the pins of the file are lost" in text for text in told) == (pin != ("none",))
+
+
+def test_remeshed_hems_of_two_layers_with_one_middle_stay_apart():
+    pytest.importorskip("pyacvd")
+    from eslr_jax.fit.remesh import remesh
+
+    radius, angle = (
+        np.array([0.20, 0.21, 0.25, 0.28]),
+        2 * np.pi * np.arange(60) / 60,
+    )  # a skirt and its lining
+    height = np.array([0.0, 0.2, 0.2, 0.0])
+    rings = np.stack(
+        [radius[:, None] * np.cos(angle), height[:, None] + 0 * angle, radius[:, None] * np.sin(angle)], 2
+    )
+    index = np.arange(240).reshape(4, 60)
+    quads = [index[:-1], np.roll(index[:-1], -1, 1), np.roll(index[1:], -1, 1), index[1:]]
+    a, b, c, d = (corner.ravel() for corner in quads)
+    points, faces, _ = remesh(
+        rings.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), 0.02
+    )
+    hems = sorted(np.linalg.norm(points[loop][:, [0, 2]], axis=1).mean() for loop in boundary_loops(faces))
+    np.testing.assert_allclose(hems, [0.20, 0.28], atol=2e-3)
 
 
 def test_vertices_too_deep_to_be_moved_out_are_counted_and_told(body, shirt):

@@ -6,6 +6,7 @@ from cloth import stand_at
 from garment_files import TO_Z_UP, bundled
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress
 
+from eslr_jax.body.motion import chest_direction
 from eslr_jax.errors import MeshError
 from eslr_jax.fit.placement import DOUBTFUL, find_placement
 from eslr_jax.fit.postures import arm_postures, rest_posture
@@ -45,6 +46,37 @@ def test_garment_in_the_bodys_frame_stays_there(postures):
     placement = find_placement(positions + standing(postures), faces, postures)
     assert placement.origin == "body"
     np.testing.assert_array_equal(placement.translation, 0.0)
+
+
+def test_a_file_in_the_axes_of_a_body_that_faces_backwards_is_left_as_it_is(body):
+    turn = np.diag([-1.0, 1.0, -1.0])  # as characters in VRM 0 stand
+    turned = body.replace(
+        rest_positions=np.asarray(body.rest_positions) @ turn,
+        joint_rest_positions=np.asarray(body.joint_rest_positions) @ turn,
+    )
+    facing = chest_direction(turned)
+    np.testing.assert_allclose(facing, [0.0, 0.0, -1.0], atol=0.3)
+    garment = bundled("tshirt_1k")
+    worn = np.asarray(garment.rest_positions)
+    for positions, front, rotation in ((worn @ turn, "-z", np.eye(3)), (worn, "z", turn)):
+        placement = find_placement(positions, garment.faces, [rest_posture(turned)], facing=facing)
+        assert (placement.up, placement.front) == ("y", front)
+        np.testing.assert_array_equal(placement.rotation, rotation)
+        np.testing.assert_allclose(placement.apply(positions), worn @ turn, atol=1e-6)
+    given = find_placement(
+        worn @ turn, garment.faces, [rest_posture(turned)], facing=facing, units="m", up="y", front="-z"
+    )
+    np.testing.assert_array_equal(given.rotation, np.eye(3))
+
+
+def test_a_file_may_have_the_origin_of_a_body_that_stands_aside(body):
+    positions, faces = skirt()
+    aside = stand_at(body, [3.0, 0.0, -2.0])
+    postures = arm_postures(aside)
+    exported = positions + np.array([3.0, 0.0, -2.0])  # as on a body whose export was lowered alone
+    placement = find_placement(exported, faces, postures)
+    assert placement.origin == "floor"
+    np.testing.assert_allclose(placement.translation, [0.0, postures[0].floor, 0.0])
 
 
 # What is lowered is not where the body is, and has to be moved along it.

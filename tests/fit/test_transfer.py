@@ -54,15 +54,29 @@ def test_the_own_body_changes_nothing(body, shirt):
 
 
 @pytest.mark.slow
-def test_the_girth_is_that_of_the_trunk_wherever_the_body_stands(body, shirt, woman):
-    aside = np.array([[3.0, 0.0, 0.0]], np.float32)
-    moved = stand_at(body, aside)
-    there = dataclasses.replace(shirt, rest_positions=shirt.rest_positions + aside)
+def test_the_girth_is_that_of_the_trunk_wherever_the_bodies_stand_and_face(body, shirt, woman):
+    aside, turn = (
+        np.array([3.0, 0.0, 0.0], np.float32),
+        np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32),
+    )
+
+    def turned(rig):
+        fields = ("rest_positions", "joint_rest_positions")
+        return rig.replace(**{name: np.asarray(getattr(rig, name)) @ turn for name in fields})
+
+    scenes = (
+        (shirt.rest_positions, body, woman),
+        (shirt.rest_positions + aside, stand_at(body, aside), woman),
+        (shirt.rest_positions @ turn, turned(body), turned(woman)),
+    )
     reports = [
-        transfer_garment(garment, source, woman, scale="girth").metadata["transfer"]
-        for garment, source in ((shirt, body), (there, moved))
+        transfer_garment(
+            dataclasses.replace(shirt, rest_positions=positions), source, target, scale="girth"
+        ).metadata["transfer"]
+        for positions, source, target in scenes
     ]
-    assert reports[0] == pytest.approx(reports[1], abs=2e-3)
+    assert reports[1] == pytest.approx(reports[0], abs=2e-3)
+    assert reports[2] == pytest.approx(reports[0], abs=2e-3)
 
 
 @pytest.mark.parametrize("scale", ["body", "girth"])

@@ -9,7 +9,7 @@ from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dr
 from eslr_jax.errors import ConfigError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
-from eslr_jax.fit.postures import find_arms
+from eslr_jax.fit.postures import find_arms, shoulder_height
 from eslr_jax.fit.report import describe_cost, describe_fit
 from eslr_jax.fit.waist import WAISTBAND, find_waist
 
@@ -55,6 +55,15 @@ def test_a_cape_is_held_at_its_neckline(body):
     np.testing.assert_array_equal(waist.is_held, below < WAISTBAND)
     assert "open around the neck" in waist.reason
     assert not waist.is_falling
+
+
+def test_raised_arms_of_a_body_without_a_rig_raise_no_shoulders(body):
+    raised = np.array(body.rest_positions)  # as the first frame of a moving mesh
+    middle, top = np.median(raised[:, 0]), raised[:, 1].max()
+    raised[np.abs(raised[:, 0] - middle) > 0.3, 1] = top + 0.5
+    bones = body.replace(parents=(-1,), joint_rest_positions=raised.mean(axis=0, keepdims=True))
+    expected = raised[:, 1].min() + 0.8 * (top - raised[:, 1].min())
+    assert shoulder_height(bones.replace(rest_positions=raised)) == pytest.approx(expected, abs=1e-3)
 
 
 def test_what_lies_on_the_shoulders_is_not_held(body):
