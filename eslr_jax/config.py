@@ -168,7 +168,7 @@ class SimConfig:
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
-    model: ModelConfig  # architecture: a name that `eslr info` knows, or a table with one as `base`
+    model: ModelConfig  # architecture: a name in `models.registry.MODELS`, or a table with one as `base`
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split

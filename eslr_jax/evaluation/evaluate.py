@@ -140,8 +140,13 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
 
 
 def _roll(params: Any, scene: Scene, config: SimConfig) -> Trajectory:
-    """Simulate all frames of a scene; one that goes wrong stands still from there on, and its status tells."""
-    return hold_last(simulate(params, scene, config=config, raises=False).trajectory, scene.num_frames)
+    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on.
+
+    Raises:
+        EslrError: The solver's rollout goes wrong.
+    """
+    simulation = simulate(params, scene, config=config, raises=params is None)
+    return hold_last(simulation.trajectory, scene.num_frames)
 
 
 def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
@@ -174,7 +179,7 @@ def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> 
 
 
 def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
-    """Return plain measures of a trajectory.
+    """Return plain measures of a trajectory; `num_frames` are those before the first bad one.
 
     Args:
         trajectory: What is measured.
@@ -194,7 +199,7 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     return {
         "finite": bool(np.isfinite(positions).all())
         and Status.NON_FINITE not in Status(int(trajectory.status)),
-        "num_frames": int(scene.num_frames),
+        "num_frames": scene.num_frames if trajectory.first_bad_frame < 0 else int(trajectory.first_bad_frame),
         "terms": terms,
         "total": sum(terms.values()),
         **extremes(measures, is_real),

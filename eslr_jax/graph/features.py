@@ -120,7 +120,7 @@ def mean_edge_length(garment: Garment, edges: Garment | CoarseEdges) -> Float[Ar
 
 
 def timestep_input(timestep: Float[Array, ""]) -> Float[Array, ""]:
-    """Return log10 of the timestep over a thirtieth of a second: 0 for a regular frame, 1 for the first."""
+    """Return log10 of the timestep over a thirtieth of a second: 0 for a regular frame."""
     return jnp.log10(timestep / REGULAR_TIMESTEP)
 
 

@@ -47,19 +47,15 @@ def required(inputs: GraphInputs, name: str) -> Array:
     return value
 
 
-def next_refinement(
-    inputs: GraphInputs, guess: Float[Array, "vertices 3"], gradient: Float[Array, "vertices 3"]
-) -> GraphInputs:
-    """Return the inputs of the next refinement step of the same frame.
+def next_refinement(inputs: GraphInputs, guess: Float[Array, "vertices 3"]) -> GraphInputs:
+    """Return the inputs of the next refinement step of the same frame, but for the gradient at its guess.
 
     Args:
         inputs: Inputs of the step just done.
         guess: Positions that this step predicted [m], shape [vertices, 3].
-        gradient: Gradient of the potential at these positions [N], shape [vertices, 3].
     """
     return inputs.replace(
         guess=guess,
-        gradient=gradient,
         correction=jnp.subtract(guess, required(inputs, "guess")),
         previous_gradient=required(inputs, "gradient"),
     )

@@ -46,6 +46,8 @@ def read_hood(path: str | Path) -> tuple[dict[str, Any], ModelConfig]:
     tensors = {str(name).removeprefix("model."): value for name, value in tensors.items()}
     try:
         return _convert(tensors)
+    except ValueError as error:
+        raise CheckpointError(f"{path} is of an architecture that is not converted: {error}") from error
     except KeyError as error:
         raise CheckpointError(
             f"{path} has no {error.args[0]}, which HOOD's networks postcvpr, cvpr, fine15 and fine48 have; "
@@ -69,7 +71,7 @@ def _convert(tensors: Tensors) -> tuple[dict[str, Any], ModelConfig]:
         trained["layers"] = _stack([_flat_step(tensors, f"processor_steps.{k}", size) for k in range(steps)])
     else:
         is_cvpr = f"{_CORE}processor_steps1.0.node_processor_dict.node.0.layers.0.weight" in tensors
-        steps = 0
+        steps, counts = 0, set()
         trained["level_embedding"] = _tensor(tensors, "vertexlevel_embedding.weight")
         for kind in COARSE_SETS:
             encoder = "edgeset_encoders." + ("coarse" if is_cvpr else kind)
@@ -80,6 +82,9 @@ def _convert(tensors: Tensors) -> tuple[dict[str, Any], ModelConfig]:
             layers = [_stage_step(tensors, f"{place}.{k}", sets) for k in range(count)]
             trained[f"stages_{stage}"] = _stack(layers)
             steps += count
+            counts.add(count)
+        if len(counts) > 1:
+            raise ValueError(f"its stages have {sorted(counts)} steps, and ours all have as many")
     config = ModelConfig(
         message_passing_steps=steps,
         smoothing_steps=0,

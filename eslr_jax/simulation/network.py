@@ -132,7 +132,7 @@ def refine(
             )
         position = pin(problem, inputs.guess + move)
         onward = jax.lax.stop_gradient(position) if detach else position
-        return next_refinement(inputs, onward, point.gradient), (position, point)
+        return next_refinement(inputs, onward), (position, point)
 
     _, (positions, starts) = jax.lax.scan(one_step, inputs, None, length=config.refinement_steps)
     return Refinement(guess, starts, positions)

@@ -31,7 +31,7 @@ from eslr_jax.training.data import TrainingData, load_training_data
 from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
-_SHARES = ("resets", "overflows", "skipped")  # metrics that are zero or one in a step
+_SHARES = ("resets", "overflows", "skipped")  # shares of the trajectories of a step
 
 Progress = Callable[[int, int, dict[str, float]], None]
 
@@ -59,7 +59,7 @@ def train(
         earlier: Training record of these weights, whose steps and core-hours the exported one counts too. A run
             that is resumed knows it.
         datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
-        on_progress: Called with steps done, steps in all, and the latest means, of the first seed.
+        on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
 
     Returns:
         The last state; of several seeds stacked, see `training.seeds`.

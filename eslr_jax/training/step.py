@@ -135,7 +135,7 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
     def train_step(state: TrainState, data: TrainingData) -> tuple[TrainState, dict[str, Array]]:
         pool = state.pools[resolution]
         count, size = pool.is_done.shape[0], config.batch_size
-        turn = state.step // len(config.vertices)
+        turn = state.step // len(state.pools)
         indices = (turn * size + jnp.arange(size)) % count
         key, start_key = jax.random.split(jax.random.wrap_key_data(state.key))
         slots = jax.tree.map(lambda leaf: leaf[indices], pool)

@@ -17,6 +17,7 @@ from eslr_jax.errors import AssetError, CheckpointError
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.graph.build import build_graph
 from eslr_jax.io.hood import read_hood
+from eslr_jax.io.torch_archive import read_torch
 from eslr_jax.io.weights import read_weights
 from eslr_jax.models.registry import MODELS, apply_model, check_params, count_parameters, scale_output
 
@@ -112,6 +113,21 @@ def test_what_is_no_network_of_hoods_is_refused(tmp_path):
         read_hood(path)
     with pytest.raises(AssetError, match=r"--out .*npz file"):
         convert(path, tmp_path / "hood.pth")
+
+
+def test_stages_of_unlike_length_are_refused(tmp_path):
+    path = tmp_path / "longer.pth"
+    content = read_torch(FIXTURES / "hood_postcvpr.pth", content="checkpoint")
+    tensors = content["training_module"]
+    more = {name.replace("levels.2.0.", "levels.2.1."): value for name, value in tensors.items()}
+    assert len(more | tensors) > len(tensors)
+    write_archive(
+        path, {"training_module": {name: Tensor(np.asarray(x)) for name, x in (more | tensors).items()}}
+    )
+    with pytest.raises(
+        CheckpointError, match=r"longer.pth is of an .* not converted: its stages have \[1, 2\] steps"
+    ):
+        read_hood(path)
 
 
 @pytest.mark.slow

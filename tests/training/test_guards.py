@@ -39,6 +39,16 @@ def with_a_broken_vertex(state):
     return state.replace(pools=(state.pools[0].replace(state=cloth.replace(position=place), is_done=alive),))
 
 
+def test_of_two_data_sets_every_trajectory_is_trained(config, small_data):
+    config = dataclasses.replace(config, slots_per_garment=2)
+    state = init_train_state(config, (small_data, small_data))
+    before = [np.array(pool.state.position) for pool in state.pools]
+    for k in range(4):
+        state, _ = make_train_step(config, k % 2)(state, small_data)
+    for pool, start in zip(state.pools, before, strict=True):
+        assert np.all(np.any(np.array(pool.state.position) != start, axis=(1, 2)))
+
+
 def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_starts_anew(
     config, small_data
 ):
