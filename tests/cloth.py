@@ -87,6 +87,12 @@ def stand_at(body: Body, offset) -> Body:
     )
 
 
+def turn_about(body: Body, turn: np.ndarray) -> Body:
+    """Return a body whose rest pose is turned about the origin: every place p is at p @ turn."""
+    fields = ("rest_positions", "joint_rest_positions")
+    return body.replace(**{name: np.asarray(getattr(body, name)) @ np.float32(turn) for name in fields})
+
+
 def swing_motion(body: Body, num_frames: int, *, sway: float = 0.02) -> Motion:
     """Return a motion of the limb sideways and round, by up to `sway` metres a frame."""
     time = np.arange(num_frames)

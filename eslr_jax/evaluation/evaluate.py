@@ -20,7 +20,7 @@ from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import simulated_terms
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene.plan import prepare_scene, shared_surface
-from eslr_jax.simulation.simulate import hold_last, simulate
+from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
 from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
@@ -199,7 +199,7 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     return {
         "finite": bool(np.isfinite(positions).all())
         and Status.NON_FINITE not in Status(int(trajectory.status)),
-        "num_frames": scene.num_frames if trajectory.first_bad_frame < 0 else int(trajectory.first_bad_frame),
+        "num_frames": good_frames(trajectory).num_frames,
         "terms": terms,
         "total": sum(terms.values()),
         **extremes(measures, is_real),

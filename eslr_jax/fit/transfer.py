@@ -128,8 +128,7 @@ def carry_shape(
     graded = _keep_ease(_spline(start, end, size)(positions), faces, size * heights, posture)
     placed, _ = push_out(graded, faces, posture)
     left, right = (here[side, "upper_arm"] for side in ("left", "right"))
-    across = (left - right) * [1, 0, 1]
-    is_trunk = np.abs((positions - 0.5 * (left + right)) @ across) < 0.5 * across @ across
+    is_trunk = _aside(positions, left, right) < _aside(left, left, right)
     girth, length = _proportions(positions, placed, unique_edges(faces), is_trunk)
     if scale == "body":
         sewn = np.where(heights[:, None] > 0, placed, graded)  # what was tight stays tight
@@ -187,11 +186,17 @@ def _crotch(posture: Posture, left: np.ndarray, right: np.ndarray) -> np.ndarray
     """Return the lowest point of the trunk between the legs [m]; None if the legs meet farther down."""
     height = float(np.ptp(posture.positions[:, 1]))
     points = posture.positions[posture.touchable]
-    hips, across = 0.5 * (left + right), (left - right) * [1, 0, 1]  # whatever the body faces
-    middle = points[np.abs((points - hips) @ across) < _MIDLINE * height * np.linalg.norm(across), 1]
+    middle = points[_aside(points, left, right) < _MIDLINE * height, 1]
+    hips = 0.5 * (left + right)
     if not len(middle) or not -_CROTCH[0] * height < middle.min() - hips[1] < _CROTCH[1] * height:
         return None
     return np.array([hips[0], middle.min(), hips[2]])
+
+
+def _aside(points: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return how far points are from the middle of two joints, along the level line through both [m]."""
+    across = (left - right) * [1, 0, 1]  # whatever the body faces
+    return np.abs((points - 0.5 * (left + right)) @ across) / np.linalg.norm(across)
 
 
 def _size(start: np.ndarray, end: np.ndarray) -> float:

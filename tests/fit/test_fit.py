@@ -12,6 +12,7 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.pins import select_vertices
 from eslr_jax.fit.postures import arm_postures, find_arms, unpose
+from eslr_jax.fit.remesh import remesh
 from eslr_jax.fit.report import describe_fit
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.topology import boundary_loops, vertex_components
@@ -312,31 +313,24 @@ def test_pins_that_remeshing_replaces_are_refused_or_told(body, shirt):
         fit_garment(shirt_source, body, FitOptions(edge_length=0.03, pin=("vertices:0,5",)))
     held = dataclasses.replace(shirt_source, is_pinned=np.arange(len(shirt.rest_positions)) < 5)
     for pin in ((), ("loop:top",), ("none",)):
-        told = fit_garment(
-            held, body, FitOptions(edge_length=0.03, pin=pin)
-        ).fit_warnings  # kept with the garment
+        told = fit_garment(held, body, FitOptions(edge_length=0.03, pin=pin)).fit_warnings
         assert any("the pins of the file are lost" in text for text in told) == (pin != ("none",))
 
 
 def test_remeshed_hems_of_two_layers_with_one_middle_stay_apart():
+    """A skirt and its lining, which one surface joins at the top."""
     pytest.importorskip("pyacvd")
-    from eslr_jax.fit.remesh import remesh
-
-    radius, angle = (
-        np.array([0.20, 0.21, 0.25, 0.28]),
-        2 * np.pi * np.arange(60) / 60,
-    )  # a skirt and its lining
-    height = np.array([0.0, 0.2, 0.2, 0.0])
-    rings = np.stack(
-        [radius[:, None] * np.cos(angle), height[:, None] + 0 * angle, radius[:, None] * np.sin(angle)], 2
-    )
-    index = np.arange(240).reshape(4, 60)
-    quads = [index[:-1], np.roll(index[:-1], -1, 1), np.roll(index[1:], -1, 1), index[1:]]
-    a, b, c, d = (corner.ravel() for corner in quads)
-    points, faces, _ = remesh(
-        rings.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), 0.02
-    )
-    hems = sorted(np.linalg.norm(points[loop][:, [0, 2]], axis=1).mean() for loop in boundary_loops(faces))
+    radius, height = np.array([0.20, 0.21, 0.25, 0.28]), np.array([0.0, 0.2, 0.2, 0.0])
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    x, z = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
+    positions = np.stack([x, np.broadcast_to(height[:, None], x.shape), z], axis=2).reshape(-1, 3)
+    here = np.arange(180).reshape(3, 60)
+    beside = np.roll(here, -1, axis=1)
+    halves = [[here, beside, beside + 60], [here, beside + 60, here + 60]]
+    faces = np.concatenate([np.stack(half, axis=-1).reshape(-1, 3) for half in halves])
+    points, triangles, _ = remesh(positions, faces, 0.02)
+    loops = boundary_loops(triangles)
+    hems = sorted(np.linalg.norm(points[loop][:, [0, 2]], axis=1).mean() for loop in loops)
     np.testing.assert_allclose(hems, [0.20, 0.28], atol=2e-3)
 
 
