@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, get_ty
 from eslr_jax.errors import ConfigError
 
 Criterion = Literal["postcvpr", "cvpr", "metric"]
-"""Readings of HOOD's losses, see `physics.hood`."""
+"""Readings of HOOD's losses, see `terms.hood`."""
 
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 """Edge sets of a garment's coarse levels, finest first (HOOD)."""
@@ -131,7 +131,7 @@ class Predictor(Protocol):
 
         Args:
             params: Its weights.
-            problem: The frame's `physics.problem.FrameProblem`.
+            problem: The frame's `terms.problem.FrameProblem`.
             state: Cloth at t, a `types.ClothState`.
         """
 
@@ -174,7 +174,7 @@ class TrainConfig:
     split: str = "train"  # clips of this split
     steps: int = 20_000  # of the optimiser
     energy_set: Literal["consistent", "hood"] = "consistent"  # of the loss
-    # With energy_set "hood": which of the three variants of HOOD's losses, see physics.hood. "metric" has the
+    # With energy_set "hood": which of the three variants of HOOD's losses, see terms.hood. "metric" has the
     # constants of HOOD's tables.
     criterion: Criterion = "postcvpr"
     self_contact: bool = False  # layers of cloth keep apart, as in SceneOptions

@@ -23,9 +23,9 @@ from eslr_jax.graph.features import (
     sheet_constants,
 )
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.physics.bending import RIGIDITY_PER_STIFFNESS
 from eslr_jax.physics.materials import COTTON, WOVEN, Weave, fabric_material, fabric_names, isotropic_nearest
 from eslr_jax.physics.validate import MATERIAL_RANGES
+from eslr_jax.terms.bending import RIGIDITY_PER_STIFFNESS
 from eslr_jax.types import Garment, Material, Threads
 
 _SHEET = tuple(MATERIAL_RANGES)  # numbers of an isotropic sheet

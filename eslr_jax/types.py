@@ -8,13 +8,12 @@ never out of range.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.errors import ConfigError
@@ -99,7 +98,7 @@ class Plate:
 
 @struct.dataclass
 class Threads:
-    """Stretch of a fabric with warp and weft on one garment's faces, see `physics.membrane`."""
+    """Stretch of a fabric with warp and weft on one garment's faces, see `terms.stretch`."""
 
     warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `geometry.weave`
     stiffness: Float[Array, "4 faces"]  # [N/m] along warp, along weft, coupling of both, shear
@@ -117,7 +116,7 @@ class Material:
     density: Float[Array, ...]  # [kg/m^2]
     lame_mu: Float[Array, ...]  # [Pa]
     lame_lambda: Float[Array, ...]  # [Pa]
-    bending_stiffness: Float[Array, ...]  # [J], see `physics.bending.hinge_stiffnesses`
+    bending_stiffness: Float[Array, ...]  # [J], see `terms.bending.hinge_stiffnesses`
     thickness: Float[Array, ...]  # [m]
     plate: Plate | None = None  # bending by flexural rigidity, in the place of `bending_stiffness`
     threads: Threads | None = None  # stretch and shear, in the place of the Lame parameters
@@ -240,20 +239,6 @@ class PairCapacity:
 
 
 @struct.dataclass
-class Air:
-    """Air that cloth moves through; see `physics.air`."""
-
-    # Velocity [m/s], shape [3]; or a function of points [m], shape [points, 3], and the time since the first
-    # frame [s] to velocities, shape [points, 3] or [3], such as `physics.air.gusts`.
-    wind: Float[Array, " 3"] | tuple[float, float, float] | Partial
-    density: Float[Array, ""] | float = 1.2  # [kg/m^3], at 20 degrees and sea level
-    normal_drag: Float[Array, ""] | float = 1.17  # of a square plate across the flow (Hoerner 1965, 3-15)
-    tangential_drag: Float[Array, ""] | float = (
-        0.02  # of a rough plate along it, both sides (Hoerner 1965, 2-6)
-    )
-
-
-@struct.dataclass
 class Scene:
     """All that a rollout reads. A part that is None is not modelled: the compiled step does not hold it."""
 
@@ -270,25 +255,8 @@ class Scene:
         None  # self-contact between different pieces only; None: all cloth
     )
     ground: Float[Array, ""] | None = None  # height of a level ground [m]
-    air: Air | None = None
-    damping: Float[Array, ""] | None = None  # of the fabric [s], see `physics.damping`
-    energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
+    terms: tuple[Any, ...] = ()  # `terms.term.Term`s, whose sum is minimised, see `scene.build.scene_terms`
     substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
-
-
-class PotentialTerms(NamedTuple):
-    """The energies of one frame [J], or of many along a leading axis; zero where a term is not modelled."""
-
-    stretch: Float[Array, "*frames"]
-    bending: Float[Array, "*frames"]
-    inertia: Float[Array, "*frames"]
-    gravity: Float[Array, "*frames"]  # counted from the frame's first positions
-    collision: Float[Array, "*frames"]
-    friction: Float[Array, "*frames"]
-    repulsion: Float[Array, "*frames"]  # between layers of cloth
-    air: Float[Array, "*frames"]  # drag and lift, as a dissipation potential
-    damping: Float[Array, "*frames"]  # of the fabric, likewise
-    own: Float[Array, "*frames"]  # of the scene's own terms, see `Scene.energies`
 
 
 @struct.dataclass
@@ -298,7 +266,7 @@ class Trajectory:
     positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
     friction_loads: Float[Array, "frames vertices"]  # normal forces that load the next frame's friction [N]
-    terms: PotentialTerms  # energies that each frame ended with [J], shape [frames]
+    energies: dict[str, Float[Array, " frames"]]  # that each frame ended with [J], by the names of the terms
     residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame
     gap_bounds: Float[
         Array, " frames"
@@ -319,8 +287,7 @@ class Trajectory:
         Their axes are frames, vertices and xyz, as many as an array has. What was not modelled is left out.
         """
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        terms = values.pop("terms")._asdict()
-        values |= {f"{name}_energy": track for name, track in terms.items()}
+        values |= {f"{name}_energy": track for name, track in values.pop("energies").items()}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 

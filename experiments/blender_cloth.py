@@ -33,7 +33,7 @@ from newton_cloth import prepare_cloth, springs, strip_stiffness
 from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.io.point_cache import write_pc2
-from eslr_jax.physics.problem import contact_thickness
+from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
 SECONDS_PER_FRAME = 1e-3**0.5  # of Blender's cloth, whatever the frame rate

@@ -47,7 +47,7 @@ from eslr_jax.physics.preconditioner import (
     stiffness,
     stretched_stiffness,
 )
-from eslr_jax.physics.problem import FrameProblem, push_out, pushed_out_guess
+from eslr_jax.terms.problem import FrameProblem, push_out, pushed_out_guess
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.network import predict

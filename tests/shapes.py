@@ -14,6 +14,7 @@ KERNELS = [
     "eslr_jax.graph",
     "eslr_jax.models",
     "eslr_jax.physics",
+    "eslr_jax.terms",
     "eslr_jax.scene.build",
     "eslr_jax.simulation.frame",
     "eslr_jax.simulation.network",

@@ -12,11 +12,11 @@ PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 # From the top of the house down; a room may import itself and what stands before it.
 ROOMS = [
     "errors", "extras", "types", "config", "numerics", "io", "geometry", "body", "fit", "assets", "contact",
-    "physics", "graph", "models", "fabric", "scene", "simulation", "training", "render", "evaluation",
+    "terms", "physics", "graph", "models", "fabric", "scene", "simulation", "training", "render", "evaluation",
     "viewer", "cli",
 ]  # fmt: skip
 KERNELS = {
-    "numerics", "body.lbs", "contact", "graph", "models", "physics", "scene.build", "simulation.frame",
+    "numerics", "body.lbs", "contact", "graph", "models", "terms", "physics", "scene.build", "simulation.frame",
     "simulation.network", "simulation.stepper", "simulation.rollout",
 }  # fmt: skip
 HOST_FILES = {"physics.newton", "physics.hessian", "physics.validate"}  # inside kernel rooms

@@ -224,9 +224,9 @@ def _prepare(options: Options, interrupted: Interrupted | None) -> _Setting:
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import describe_cost
-    from eslr_jax.physics.air import blowing
     from eslr_jax.scene.plan import SceneOptions, prepare_scene
     from eslr_jax.simulation.simulate import begin_compiling
+    from eslr_jax.terms.air import blowing
 
     request = read_request(options)
     names = options.garment or (DEFAULT_GARMENT,)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,22 +16,23 @@ from eslr_jax.evaluation.gap import map_frames, trajectory_states
 from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.run import Run
-from eslr_jax.numerics import product, scatter_corners
-from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.potential import potential, potential_terms
-from eslr_jax.physics.problem import FrameProblem, pushed_out_guess
+from eslr_jax.numerics import components, product, scatter_corners
+from eslr_jax.physics.guess import pushed_out_guess
+from eslr_jax.physics.potential import potential
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.stretch import principal_stretches
+from eslr_jax.terms.term import vertex_shares
 from eslr_jax.types import (
     ClothState,
     Garment,
     Material,
-    PotentialTerms,
     Scene,
 )
 
-# No file stores a user's own energies; energy lost to air and damping belongs to a frame, not to a shape.
-_TERMS = tuple(term for term in PotentialTerms._fields if term not in ("air", "damping", "own"))
+# Energy lost to air and damping belongs to a frame, not to a shape.
+_TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction", "repulsion")
 FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
 _CONTACT_FIELDS = ("collision-energy", "friction-energy", "repulsion-energy", "gap")
@@ -124,50 +125,23 @@ def _every_frame(
 
 
 def energy_shares(
-    term: str, position: Float[Array, "vertices 3"], problem: FrameProblem
+    name: str, position: Float[Array, "vertices 3"], problem: FrameProblem
 ) -> Float[Array, " vertices"]:
-    """Share one term of the potential out over the vertices [J]; the shares add up to it.
-
-    Every term is a sum over faces, hinges, vertices or pairs. Each summand is scaled by the mean of factors at
-    its vertices; the term is linear in these factors, and its gradient by them gives the share of each vertex.
+    """Share the energy of the terms of one name out over the vertices [J]; the shares add up to it.
 
     Args:
-        term: Name of an entry of `PotentialTerms`.
+        name: Of one of the problem's terms.
         position: Positions at t + 1 [m], shape [vertices, 3].
         problem: The frame's problem.
     """
-    garment, material = problem.garment, problem.material
-
-    def total(factors: Float[Array, " vertices"]) -> Float[Array, ""]:
-        on_faces, on_hinges = (factors[rows].mean(axis=1) for rows in (garment.faces, garment.hinges))
-        scaled = problem.replace(
-            garment=garment.replace(
-                vertex_areas=garment.vertex_areas * factors, rest_areas=garment.rest_areas * on_faces
-            ),
-            material=material.replace(bending_stiffness=material.bending_stiffness * on_hinges),
-        )
-        if material.plate is not None:  # its energy goes with the square of its rows
-            plate = material.plate.replace(rows=material.plate.rows * jnp.sqrt(on_faces))
-            scaled = scaled.replace(material=scaled.material.replace(plate=plate))
-        if problem.body is not None:
-            body = problem.body.replace(friction_load=problem.body.friction_load * factors)
-            rows = {name: _weigh(getattr(body, name), factors) for name in ("skin", "tips")}
-            scaled = scaled.replace(body=body.replace(**rows))
-        if problem.ground is not None:
-            load = problem.ground.friction_load * factors
-            scaled = scaled.replace(ground=problem.ground.replace(friction_load=load))
-        if problem.layers is not None:
-            scaled = scaled.replace(
-                layers=problem.layers.replace(pairs=_weigh(problem.layers.pairs, factors))
-            )
-        return getattr(potential_terms(position, scaled), term)
-
-    return jax.grad(total)(jnp.ones_like(garment.vertex_areas))
-
-
-def _weigh(rows: Any, factors: Float[Array, " vertices"]) -> Any:
-    """Return contacts of faces with their areas scaled by the mean factor of their corners; None stays None."""
-    return None if rows is None else rows.replace(areas=rows.areas * factors[rows.corners].mean(axis=1))
+    x = components(pin(problem, position))
+    parts = [
+        part
+        for term, data in zip(problem.terms, problem.data, strict=True)
+        if term.name == name
+        for part in term.elements(x, problem, data)
+    ]
+    return vertex_shares(tuple(parts), x[0].shape[0])
 
 
 def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:

@@ -9,9 +9,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from eslr_jax.evaluation.gap import map_frames, past_states, trajectory_states
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.potential import contact_load, evaluate, potential_terms
-from eslr_jax.physics.problem import FrameProblem, weight_norm
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.types import PotentialTerms, Scene, Trajectory
+from eslr_jax.terms.problem import FrameProblem, weight_norm
+from eslr_jax.types import Scene, Trajectory
 
 
 def foreign_trajectory(
@@ -41,7 +41,7 @@ def foreign_trajectory(
         positions=x,
         velocities=v,
         friction_loads=loads,
-        terms=PotentialTerms(*[unknown] * len(PotentialTerms._fields)),
+        energies={term.name: unknown for term in scene.terms},
         residuals=unknown,
         gap_bounds=unknown,
         iterations=jnp.full(len(x), iterations, jnp.int32).at[0].set(0),
@@ -99,7 +99,7 @@ def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
 
     def measure(
         position: Float[Array, "vertices 3"], problem: FrameProblem
-    ) -> tuple[PotentialTerms, Float[Array, ""], Int[Array, ""] | None]:
+    ) -> tuple[dict[str, Array], Float[Array, ""], Int[Array, ""] | None]:
         gradient = evaluate(position, problem).gradient
         residual = safe_norm(gradient.reshape(-1)) / weight_norm(problem)
         demand = None if problem.layers is None else problem.layers.pairs.count
@@ -107,7 +107,7 @@ def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
 
     states, inputs = trajectory_states(trajectory, scene)
     measured = map_frames(measure, trajectory.positions[1:], states, inputs, scene)
-    terms, residuals, demand = jax.tree.map(
+    energies, residuals, demand = jax.tree.map(
         lambda track: jnp.concatenate([jnp.zeros_like(track[:1]), track]), measured
     )
-    return trajectory.replace(terms=terms, residuals=residuals, pair_demand=demand)
+    return trajectory.replace(energies=energies, residuals=residuals, pair_demand=demand)

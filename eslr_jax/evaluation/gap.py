@@ -14,11 +14,11 @@ from jaxtyping import Array, Float
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.physics.lbfgs import unknown_point
 from eslr_jax.physics.potential import potential
-from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import find_start, make_stepper, past_state
+from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison

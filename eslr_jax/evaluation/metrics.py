@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.physics.membrane import principal_stretches
+from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Garment, Scene
 
 

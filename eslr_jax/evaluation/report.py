@@ -212,7 +212,7 @@ def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any
 
 def simulated_terms(trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return the energies of every simulated frame by name [J], each of shape [frames - 1]."""
-    return {name: np.asarray(values)[1:] for name, values in trajectory.terms._asdict().items()}
+    return {name: np.asarray(values)[1:] for name, values in trajectory.energies.items()}
 
 
 def environment() -> dict[str, Any]:

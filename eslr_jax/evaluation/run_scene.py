@@ -7,16 +7,16 @@ import numpy as np
 
 from eslr_jax.assets import prepare_stored
 from eslr_jax.contact.self_contact import default_capacity
-from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.run import Run
-from eslr_jax.physics.air import blowing
 from eslr_jax.physics.materials import constants_for
-from eslr_jax.scene.build import initial_state, start_integrator
+from eslr_jax.scene.build import initial_state, scene_terms, start_integrator
 from eslr_jax.scene.plan import piece_of_vertices
+from eslr_jax.terms.air import blowing
+from eslr_jax.terms.damping import Damping
 from eslr_jax.types import (
     BodyMotion,
     Garment,
@@ -54,11 +54,6 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
     Raises:
         ConfigError: The run had energies of its own, which no file holds.
     """
-    if has_contact and run.report.get("own_energies"):
-        raise ConfigError(
-            f"{run.name} was simulated with energies of its own, which its files don't hold; score its positions "
-            "in the scene that was simulated: evaluation.score.score_trajectory"
-        )
     usual, stored = constants_for(material), run.report.get("constants", {})
     constants = usual.replace(**{name: stored[name] for name in vars(usual) if name in stored})
     trajectory = run.trajectory
@@ -76,6 +71,12 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
     if pairs := run.report.get("self_contact_pairs"):
         capacity = PairCapacity(pairs=pairs)
     start = initial_state(positions[0], velocities[0]).replace(frame=jnp.int32(run.report.get("settle", 0)))
+    ground = jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None
+    air, damping = (
+        blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
+        run.report.get("damping_s"),
+    )
+    asked = ([] if air is None else [air]) + ([] if damping is None else [Damping(damping)])
     return Scene(
         garment=garment,
         material=material,
@@ -87,9 +88,8 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         num_frames=trajectory.num_frames,
         self_contact=capacity if has_layers else None,
         pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and has_pieces else None,
-        ground=jnp.float32(trajectory.ground) if has_contact and trajectory.ground is not None else None,
-        air=blowing(run.report.get("wind_m_s"), run.report.get("gust", 0.0)),
-        damping=run.report.get("damping_s"),
+        ground=ground,
+        terms=(*scene_terms(body, has_ground=ground is not None, has_layers=has_layers), *asked),
         substeps=run.report.get("substeps", 1),
     )
 

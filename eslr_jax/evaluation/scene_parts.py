@@ -24,6 +24,13 @@ from eslr_jax.types import BodyMotion, Scene
 Name = TypeVar("Name", bound=Hashable)
 _TURNS = 15  # timings of every part, in turns; medians count
 _ITERATIONS = 20  # of the solver's part
+_UNLESS_NEEDED = {  # terms that a scene lacks, and why
+    "collision": "no body and no ground in reach",
+    "friction": "no body and no ground in reach",
+    "repulsion": "no layers that can meet; see --self-contact",
+    "air": "not asked for",
+    "damping": "not asked for",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,41 +49,21 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         poses: The motion it was made from.
         config: Says whether there is a network.
     """
-    vertices = int(np.sum(scene.garment.vertex_mask))
-    modelled = {
-        "stretch": f"{int(np.sum(np.asarray(scene.garment.rest_areas) > 0))} faces",
-        "bending": f"{int(np.sum(np.asarray(scene.garment.hinge_rest_areas) > 0))} hinges",
-        "inertia and gravity": f"{vertices} vertices",
-    }
-    left_out: dict[str, str] = {}
+    modelled: dict[str, str] = {}
+    for term in scene.terms:
+        modelled[term.name] = ", ".join(filter(None, (modelled.get(term.name), term.describe(scene.garment))))
+    left_out = {name: why for name, why in _UNLESS_NEEDED.items() if name not in modelled}
 
     def sort(name: str, is_modelled: bool, size: str, why: str) -> None:
         (modelled if is_modelled else left_out)[name] = size if is_modelled else why
 
     total = int(np.asarray(poses.faces).shape[0])
     faces = 0 if scene.body is None else scene.body.surface.faces.shape[0]
-    sort("collision and friction", faces > 0, f"{faces} of {total} body faces", "no body in reach")
-    if 0 < faces < total:
-        left_out["other body faces"] = f"{total - faces} that the garment does not reach"
+    sort("body", faces > 0, f"{faces} of {total} faces", "out of reach")
     pinned = int(np.sum(scene.garment.is_pinned))
     sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
     has_ground = scene.ground is not None
     sort("ground", has_ground, f"at {float(scene.ground):.2f} m" if has_ground else "", "out of reach")
-    wind = None if scene.air is None else scene.air.wind
-    is_steady = wind is not None and not callable(wind)
-    speed = f"{np.linalg.norm(np.asarray(wind)):.1f} m/s" if is_steady else "a wind that changes"
-    sort("air", wind is not None, speed, "not asked for")
-    sort("damping", scene.damping is not None, f"{float(scene.damping or 0.0):g} s", "not asked for")
-    if scene.energies:
-        modelled["own terms"] = f"{len(scene.energies)}"
-    has_skin = scene.body is not None and scene.body.has_skin
-    sort("skin contacts", has_skin, "the body keeps under the cloth's faces", "not asked for")
-    sort(
-        "self-contact",
-        scene.self_contact is not None,
-        "layers of cloth keep apart",
-        "no layers that can meet; see --self-contact",
-    )
     material = {
         field.name: getattr(scene.material, field.name) for field in dataclasses.fields(scene.material)
     }

@@ -97,7 +97,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
         "skin_contacts": scene.body is not None and scene.body.has_skin,
         "tips": scene.body is not None and scene.body.has_tips,
         "constants": {name: float(value) for name, value in vars(scene.constants).items()},
-        "own_energies": len(scene.energies),
+        "terms": [term.name for term in scene.terms],
         "ground_m": None if scene.ground is None else float(scene.ground),
     }
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.types import PotentialTerms, Trajectory
+from eslr_jax.types import Trajectory
 
 NAME = "unfinished.npz"
-_FORMAT = "eslr-unfinished-2"
-_TERMS = {name: f"terms_{name}" for name in PotentialTerms._fields}
+_FORMAT = "eslr-unfinished-3"
+_ENERGY = "energy_"  # before the name of a term
 _FIELDS = {
     "positions": ("f", "frames vertices 3"),
     "velocities": ("f", "frames vertices 3"),
@@ -24,7 +24,6 @@ _FIELDS = {
     "iterations": ("iu", "frames"),
 }
 _PAIRS = "pair_demand"
-_LAYOUT = _FIELDS | dict.fromkeys(_TERMS.values(), ("f", "frames")) | {_PAIRS: ("iu", "frames")}
 _REMEDY = "start without --resume in another folder"
 
 
@@ -40,7 +39,7 @@ def write_unfinished(folder: Path, trajectory: Trajectory, options: dict[str, An
         AssetError: The file can't be written.
     """
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in _FIELDS}
-    arrays |= {key: np.asarray(getattr(trajectory.terms, name)) for name, key in _TERMS.items()}
+    arrays |= {_ENERGY + name: np.asarray(track) for name, track in trajectory.energies.items()}
     if trajectory.pair_demand is not None:
         arrays[_PAIRS] = np.asarray(trajectory.pair_demand)
     text = {"format": np.array(_FORMAT), "options": np.array(json.dumps(options))}
@@ -62,10 +61,12 @@ def read_unfinished(folder: Path) -> tuple[Trajectory, dict[str, Any]]:
     arrays = read_arrays(path, content="interrupted simulation")
     if str(arrays.get("format", "")) != _FORMAT:
         raise AssetError(f"{path} was written by another version; {_REMEDY}")
-    lost = [name for name in ("options", *_FIELDS, *_TERMS.values()) if name not in arrays]
+    lost = [name for name in ("options", *_FIELDS) if name not in arrays]
     if lost:
         raise AssetError(f"{path} lacks {', '.join(lost)}; {_REMEDY}")
-    check_layout(arrays, _LAYOUT, what=str(path), remedy=_REMEDY)
+    energies = [name for name in arrays if name.startswith(_ENERGY)]
+    layout = _FIELDS | dict.fromkeys(energies, ("f", "frames")) | {_PAIRS: ("iu", "frames")}
+    check_layout(arrays, layout, what=str(path), remedy=_REMEDY)
     try:
         options = json.loads(str(arrays["options"]))
         if not isinstance(options, dict):
@@ -74,7 +75,7 @@ def read_unfinished(folder: Path) -> tuple[Trajectory, dict[str, Any]]:
         raise AssetError(f"{path} is damaged: its options can't be read; {_REMEDY}") from error
     trajectory = Trajectory(
         **{name: arrays[name] for name in _FIELDS},
-        terms=PotentialTerms(**{name: arrays[key] for name, key in _TERMS.items()}),
+        energies={name.removeprefix(_ENERGY): arrays[name] for name in energies},
         pair_demand=arrays.get(_PAIRS),
         status=np.int32(0),  # pyright: ignore[reportArgumentType]
         first_bad_frame=np.int32(-1),  # pyright: ignore[reportArgumentType]

@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from eslr_jax.physics.bending import hinge_stiffnesses
-from eslr_jax.physics.membrane import STIFFENING
-from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.physics.repulsion import Pairs
+from eslr_jax.terms.bending import hinge_stiffnesses
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.repulsion import Pairs
+from eslr_jax.terms.stretch import STIFFENING
 from eslr_jax.types import Contacts, Garment, Material, Threads
 
 

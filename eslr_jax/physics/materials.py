@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.physics.bending import RIGIDITY_PER_STIFFNESS
+from eslr_jax.terms.bending import RIGIDITY_PER_STIFFNESS
 from eslr_jax.types import Material, PhysicsConstants
 
 _COTTON: dict[str, Any] = {

@@ -10,11 +10,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.numerics import Vector3, components, scatter_corners
-from eslr_jax.physics.collision import penetration, skin_diagonal
-from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.physics.repulsion import repulsion_diagonal
-from eslr_jax.types import Garment, Material
+from eslr_jax.numerics import Vector3, components
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Term
 
 _TERMS = 4  # of the Chebyshev series; more measured no better per second (experiments/tried.md)
 _REACH = 0.9  # share of every spring that is inverted; one is exact and needs many terms
@@ -32,28 +30,10 @@ class Stiffness:
     springs: Float[Array, "vertices degree"]  # [N/m], the same both ways; zero where padded or pinned
 
 
-def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " vertices"]:
-    """Return the membrane's stiffness per vertex at rest [N/m], averaged over the triangle's plane.
-
-    Moving one corner along its height changes the strain by 1/height, so the curvature is A h (lambda + 2 mu)
-    / height^2 = h (lambda + 2 mu) |opposite edge|^2 / (4 A); with threads their mean stiffness.
-    """
-    corners = garment.sewn_positions[garment.faces]
-    opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
-    squared = jnp.sum(opposite * opposite, axis=-1)
-    if material.threads is None:
-        modulus = material.thickness * (material.lame_lambda + 2.0 * material.lame_mu)
-    else:  # averaged over the plane as well
-        modulus = 0.5 * (material.threads.stiffness[0] + material.threads.stiffness[1])
-    is_real = garment.rest_areas > 0
-    scale = jnp.where(is_real, modulus / (4.0 * jnp.where(is_real, garment.rest_areas, 1.0)), 0.0)
-    return scatter_corners(scale[:, None] * squared, garment.face_incidence)
-
-
 def hessian_diagonal(
     problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: inertia, stretch, contacts and friction at `position`.
+    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at `position`.
 
     Padded vertices get one, so that dividing by it is safe.
 
@@ -61,54 +41,22 @@ def hessian_diagonal(
         problem: The frame's problem.
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
-    garment = problem.garment
-    diagonal = problem.masses / problem.inertial_timestep**2 + _membrane_diagonal(problem)
-    if problem.body is not None:
-        body = problem.body
-        depth = penetration(position, body.nearest, body.thickness)
-        depth = depth + penetration(position, body.opposing, body.thickness)
-        diagonal = diagonal + _touch_diagonal(problem, depth, body.friction_load)
-    if problem.ground is not None:
-        ground = problem.ground
-        depth = penetration(position, ground.contacts, ground.thickness)
-        diagonal = diagonal + _touch_diagonal(problem, depth, ground.friction_load)
-    diagonal = diagonal + pair_diagonal(problem, position)
-    return jnp.where(garment.vertex_mask, diagonal, 1.0)
+    return jnp.where(problem.garment.vertex_mask, sum_diagonals(problem, position), 1.0)
 
 
-def _touch_diagonal(
-    problem: FrameProblem, depth: Float[Array, " vertices"], load: Float[Array, " vertices"]
+def sum_diagonals(
+    problem: FrameProblem,
+    position: Float[Array, "vertices 3"],
+    is_counted: Callable[[Term], bool] = lambda term: True,
 ) -> Float[Array, " vertices"]:
-    """Return the stiffness per vertex [N/m] of a contact so deep [m], with friction under a normal force [N].
-
-    The contact's curvature acts along one of three axes, that of friction along two.
-    """
-    constants = problem.constants
-    slip = constants.friction_speed * problem.timestep
-    touch = 2.0 * constants.collision_stiffness * problem.garment.vertex_areas * depth
-    return touch + constants.friction_coefficient * load / (3.0 * slip)
-
-
-def _membrane_diagonal(problem: FrameProblem) -> Float[Array, " vertices"]:
-    """Return the stiffness per vertex of the strain and of its change [N/m]."""
-    diagonal = stretch_diagonal(problem.garment, problem.material)
-    return diagonal if problem.strain is None else (1.0 + problem.strain.rate) * diagonal
-
-
-def pair_diagonal(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
-    """Return the stiffness per vertex [N/m] of contact between faces and points, at positions [m]."""
-    constants, diagonal = problem.constants, jnp.zeros(position.shape[0], position.dtype)
-    if problem.body is not None:
-        skin, tips = problem.body.skin, problem.body.tips
-        stiffness, thickness = constants.collision_stiffness, constants.collision_thickness
-        if skin is not None:
-            diagonal += skin_diagonal(position, skin, stiffness, thickness)
-        if tips is not None:
-            diagonal += repulsion_diagonal(position, tips, stiffness, thickness)
-    if problem.layers is not None:
-        layers, stiffness = problem.layers, constants.repulsion_stiffness
-        diagonal += repulsion_diagonal(position, layers.pairs, stiffness, layers.thickness, layers.limit)
-    return diagonal
+    """Return the sum of the curvatures per vertex [N/m] that some of the terms estimate at positions [m]."""
+    x = components(position)
+    diagonals = (
+        term.diagonal(x, problem, data)
+        for term, data in zip(problem.terms, problem.data, strict=True)
+        if is_counted(term)
+    )
+    return sum(diagonals, jnp.zeros_like(x[0]))
 
 
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
@@ -126,7 +74,8 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
-    share = jnp.where(is_free, _membrane_diagonal(problem) / degree, 0.0)
+    elastic = sum_diagonals(problem, position, lambda term: term.is_elastic)
+    share = jnp.where(is_free, elastic / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(
         diagonal=hessian_diagonal(problem, position),

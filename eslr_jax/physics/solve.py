@@ -25,7 +25,7 @@ from eslr_jax.physics.lbfgs import Minimum, Stop, minimize
 from eslr_jax.physics.minres import LinearSolution, solve_symmetric
 from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import stretched_stiffness
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.terms.problem import FrameProblem
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
 # Residual of the linear system to reach, relative to its right side, and the most iterations. In float32 1e-4

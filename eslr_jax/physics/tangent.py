@@ -15,14 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.numerics import Vector3, components, gather_corners, segment_sum
-from eslr_jax.physics.air import air_energy
-from eslr_jax.physics.bending import bending_energy, hinge_energies
-from eslr_jax.physics.damping import damping_energy
-from eslr_jax.physics.membrane import face_energies
-from eslr_jax.physics.potential import own_energy, pair_energies, vertex_terms
-from eslr_jax.physics.preconditioner import hessian_diagonal, pair_diagonal
-from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.numerics import Vector3, components, segment_sum
+from eslr_jax.physics.preconditioner import hessian_diagonal, sum_diagonals
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.term import mesh_corners
 from eslr_jax.types import Garment
 
 _LEFT, _RIGHT = 2, 3  # the corners of a hinge that no edge joins
@@ -33,9 +29,8 @@ class Tangent(NamedTuple):
 
     columns: Int[Array, "slots vertices"]  # vertex of every block in a vertex's row; its own comes first
     blocks: Float[Array, "slots 3 3 vertices"]  # [N/m]; zero where a slot is not used
-    pairs: (
-        Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]] | None
-    )  # of contact with faces, air, damping, own energies, and of a plate beyond its hinges
+    # Products with what no block holds: energies whose elements are no faces, hinges or vertices.
+    others: Callable[[Float[Array, "vertices 3"]], Float[Array, "vertices 3"]] | None
     is_free: Bool[Array, "1 vertices"]
 
 
@@ -46,42 +41,46 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
         problem: The frame's problem.
         position: Where it is taken [m], shape [vertices, 3].
     """
-    garment, material = problem.garment, problem.material
+    garment = problem.garment
     position = pin(problem, position)
     is_free = garment.vertex_mask
     if problem.pin_targets is not None:
         is_free = is_free & ~garment.is_pinned
-    at_faces = gather_corners(position, garment.faces, garment.face_incidence)
-    at_hinges = gather_corners(position, garment.hinges, garment.hinge_incidence)
-    faces = _element_blocks(lambda corners: face_energies(corners, garment, material), at_faces)
-    hinges = _element_blocks(lambda corners: hinge_energies(corners, garment, material), at_hinges)
-    (vertices,) = (_element_blocks(lambda x: sum(vertex_terms(x[0], problem)), (components(position),)),)
-    body, pairs = problem.body, None
-    has_faces = body is not None and not (body.skin is None and body.tips is None)
-    dissipates = problem.flow is not None or problem.strain is not None
-    is_plate = material.plate is not None
-    if has_faces or dissipates or is_plate or problem.layers is not None or problem.energies:
+    x = components(position)
+    faces, hinges, vertices = (_element_blocks(on, x, problem) for on in ("faces", "hinges", "vertices"))
+    rest = [
+        (remainder, data)
+        for term, data in zip(problem.terms, problem.data, strict=True)
+        if (remainder := term.remainder(problem)) is not None
+    ]
+    others = None
+    if rest:
 
-        def others(x: Float[Array, "vertices 3"]) -> Float[Array, ""]:
-            parts = components(x)
-            lost = air_energy(parts, problem) + damping_energy(parts, problem)
-            if is_plate:  # the hinges alone stand in the matrix, where they precondition
-                lost += bending_energy(parts, garment, material)
-                lost -= bending_energy(parts, garment, material.replace(plate=None))
-            return sum(pair_energies(parts, problem), lost + own_energy(x, problem))
+        def remaining(x: Float[Array, "vertices 3"]) -> Float[Array, ""]:
+            return sum(remainder(components(x), data) for remainder, data in rest)  # type: ignore[return-value]
 
-        _, pairs = jax.linearize(jax.grad(others), position)
+        _, others = jax.linearize(jax.grad(remaining), position)
     columns, slots = _pattern(garment)
     values = jnp.concatenate([_as_rows(faces), _as_rows(hinges)])
     num_slots, num_vertices = columns.shape
     rows = segment_sum(values, slots, num_slots * num_vertices)
     blocks = rows.reshape(num_vertices, num_slots, 3, 3).transpose(1, 2, 3, 0)
-    return Tangent(columns, blocks.at[0].add(vertices), pairs, is_free[None])
+    return Tangent(columns, blocks.at[0].add(vertices), others, is_free[None])
 
 
-def _element_blocks(energy: Callable, corners: tuple[Vector3, ...]) -> Float[Array, "size size items"]:
-    """Return the Hessian of every item's energy by its corners, from all items' energies or their sum [N/m]."""
-    _, product = jax.linearize(jax.grad(lambda x: jnp.sum(energy(x))), corners)
+def _element_blocks(on: str, x: Vector3, problem: FrameProblem) -> Float[Array, "size size items"]:
+    """Return the Hessian [N/m], by their corners, of the energies of all faces, hinges or vertices."""
+    corners, _ = mesh_corners(on, x, problem.garment)
+
+    def energy(corners: tuple[Vector3, ...]) -> Float[Array, ""]:
+        energies = (
+            jnp.sum(term.corner_energies(corners, problem, data))
+            for term, data in zip(problem.terms, problem.data, strict=True)
+            if term.on == on
+        )
+        return sum(energies, jnp.zeros((), x[0].dtype))
+
+    _, product = jax.linearize(jax.grad(energy), corners)
     leaves, tree = jax.tree.flatten(corners)
 
     def column(unit: Float[Array, " size"]) -> Float[Array, "size items"]:
@@ -156,8 +155,8 @@ def apply(matrix: Tangent, move: Float[Array, "3 vertices"]) -> Float[Array, "3 
         for row in range(3)
     ]
     force = jnp.stack(rows)  # type: ignore[arg-type]
-    if matrix.pairs is not None:
-        force = force + matrix.pairs(free.T).T
+    if matrix.others is not None:
+        force = force + matrix.others(free.T).T
     return jnp.where(matrix.is_free, force, move)
 
 
@@ -172,7 +171,8 @@ def inverse_diagonal(
 ) -> Float[Array, "3 3 vertices"]:
     """Return the inverses of the blocks on the diagonal [m/N]; of an estimate where one is indefinite."""
     unit = jnp.eye(3, dtype=position.dtype)[:, :, None]
-    blocks = matrix.blocks[0] + unit * pair_diagonal(problem, position)[None, None]
+    beyond = sum_diagonals(problem, position, lambda term: term.remainder(problem) is not None)
+    blocks = matrix.blocks[0] + unit * beyond[None, None]
     a, b, c, d, e, f = (blocks[i, j] for i in range(3) for j in range(i, 3))
     cofactors = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
     determinant = a * cofactors[0] + b * cofactors[1] + c * cofactors[2]

@@ -9,7 +9,8 @@ import numpy as np
 from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
-    from eslr_jax.types import Air, Garment, Material, PhysicsConstants
+    from eslr_jax.terms.air import Air
+    from eslr_jax.types import Garment, Material, PhysicsConstants
 
 
 class Range(NamedTuple):

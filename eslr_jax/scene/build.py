@@ -6,7 +6,6 @@ from typing import Literal
 
 import jax.numpy as jnp
 from flax import struct
-from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.body import lbs
@@ -14,8 +13,15 @@ from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
 from eslr_jax.physics.materials import constants_for
+from eslr_jax.terms.bending import Bending
+from eslr_jax.terms.collision import Collision, SkinCollision
+from eslr_jax.terms.friction import Friction
+from eslr_jax.terms.gravity import Gravity
+from eslr_jax.terms.inertia import Inertia
+from eslr_jax.terms.repulsion import Repulsion, TipCollision
+from eslr_jax.terms.stretch import Stretch
+from eslr_jax.terms.term import Term
 from eslr_jax.types import (
-    Air,
     BodyMotion,
     BodySurface,
     ClothState,
@@ -48,9 +54,7 @@ class ScenePlan:
     has_tips: bool = struct.field(pytree_node=False, default=False)  # the body has tips finer than the cloth
     integrator: Integrator = struct.field(pytree_node=False, default="euler")
     ground: Float[Array, ""] | None = None  # height of a level ground [m]; None: no ground
-    air: Air | None = None
-    damping: Float[Array, ""] | None = None  # of the fabric [s]
-    energies: tuple[Partial, ...] = ()  # terms of one's own, see `SceneOptions.energies`
+    terms: tuple[Term, ...] = ()  # besides those that `scene_terms` finds
     substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
 
 
@@ -78,6 +82,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     velocity = (skinned[1] - skinned[0]) / poses.timestep
     if plan.starts_at_rest:
         velocity = jnp.zeros_like(velocity)
+    met = scene_terms(body, has_ground=plan.ground is not None, has_layers=plan.self_contact is not None)
     return Scene(
         garment=garment,
         material=material,
@@ -90,11 +95,29 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         self_contact=plan.self_contact,
         pieces=plan.pieces,
         ground=plan.ground,
-        air=plan.air,
-        damping=plan.damping,
-        energies=plan.energies,
+        terms=(*met, *plan.terms),
         substeps=plan.substeps,
     )
+
+
+def scene_terms(body: SceneBody | None, *, has_ground: bool, has_layers: bool) -> tuple[Term, ...]:
+    """Return the terms that every scene has, and those of what its cloth can touch.
+
+    Args:
+        body: The scene's body.
+        has_ground: Whether there is a ground.
+        has_layers: Whether layers of cloth keep apart.
+    """
+    terms: list[Term] = [Stretch(), Bending(), Inertia(), Gravity()]
+    if body is not None or has_ground:
+        terms += [Collision(), Friction()]
+    if body is not None and body.has_skin:
+        terms.append(SkinCollision())
+    if body is not None and body.has_tips:
+        terms.append(TipCollision())
+    if has_layers:
+        terms.append(Repulsion())
+    return tuple(terms)
 
 
 def slice_tracks(scene: Scene, frames: slice) -> Scene:

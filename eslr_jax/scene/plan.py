@@ -20,11 +20,13 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
-from eslr_jax.numerics import as_partial
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air, validate_damping, validate_substeps
 from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
-from eslr_jax.types import Air, Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
+from eslr_jax.terms.air import Air
+from eslr_jax.terms.damping import Damping
+from eslr_jax.terms.term import Term
+from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, PhysicsConstants, Scene
 
 # [m] that cloth may be away from its skinned place, besides its distance from the body at rest. Body faces that
 # are farther away are left out.
@@ -58,10 +60,8 @@ class SceneOptions:
     # A level ground at the lowest point of the moving body; auto: if cloth could reach it.
     ground: Ground = "auto"
     air: Air | None = None  # drag and wind; None: a vacuum
-    damping: float | None = None  # of the fabric [s], see `physics.damping`; None: none
-    # Terms of one's own: functions of positions [m], shape [vertices, 3], and the frame's `FrameProblem` to an
-    # energy [J]. The arguments that a `jax.tree_util.Partial` binds are traced, for jit, vmap and grad.
-    energies: tuple[Callable[..., Array], ...] = ()
+    damping: float | None = None  # of the fabric [s], see `terms.damping`; None: none
+    terms: tuple[Term, ...] = ()  # of one's own, see `terms.term.Term`
 
 
 def plan_scene(
@@ -134,9 +134,7 @@ def plan_scene(
         integrator=options.integrator,
         substeps=validate_substeps(options.substeps),
         ground=ground_height(poses) if has_ground else None,
-        air=None if options.air is None else validate_air(options.air),
-        damping=None if options.damping is None else validate_damping(options.damping),
-        energies=tuple(map(as_partial, options.energies)),
+        terms=_asked_for(options),
     )
 
 
@@ -230,6 +228,16 @@ def prepare_scenes(
         _build(garment, motion, material, plan)
         for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
     ]
+
+
+def _asked_for(options: SceneOptions) -> tuple[Term, ...]:
+    """Return the terms that are modelled because somebody asks for them."""
+    terms: list[Term] = []
+    if options.air is not None:
+        terms.append(validate_air(options.air))
+    if options.damping is not None:
+        terms.append(Damping(validate_damping(options.damping)))
+    return (*terms, *options.terms)
 
 
 def _check_choices(options: SceneOptions) -> None:

@@ -13,19 +13,18 @@ from eslr_jax.contact.layer_edges import LayerPairs, with_edges
 from eslr_jax.contact.nearest import are_pinched, find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
 from eslr_jax.contact.skin import find_skin_contacts
-from eslr_jax.physics.air import air_flow
-from eslr_jax.physics.collision import contact_forces
-from eslr_jax.physics.damping import past_strain
-from eslr_jax.physics.problem import (
+from eslr_jax.scene.build import slice_tracks
+from eslr_jax.terms.collision import contact_forces
+from eslr_jax.terms.problem import (
     BodyContact,
     FrameProblem,
     GroundContact,
     SecondOrder,
     SelfContact,
     contact_thickness,
+    with_terms,
 )
-from eslr_jax.physics.repulsion import pair_heights
-from eslr_jax.scene.build import slice_tracks
+from eslr_jax.terms.repulsion import pair_heights
 from eslr_jax.types import ClothState, PastState, Scene, SceneBody
 
 
@@ -93,8 +92,8 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         timestep=scene.timestep,
         position=state.position,
         inertial_guess=state.position + scene.timestep * state.velocity,
+        time=(state.frame + 1).astype(scene.timestep.dtype) * scene.timestep,
         pin_targets=inputs.pin_targets,
-        energies=scene.energies,
     )
     if state.past is not None:
         problem = _second_order(problem, state, state.past)
@@ -103,20 +102,12 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
         problem = problem.replace(body=body)
     if scene.ground is not None:
         problem = problem.replace(ground=_ground_contact(scene, state, scene.ground))
-    if scene.air is not None:
-        time = (state.frame + 1).astype(scene.timestep.dtype) * scene.timestep
-        problem = problem.replace(
-            air=scene.air, flow=air_flow(scene.air, state.position, scene.garment, time)
-        )
-    if scene.damping is not None:
-        strain = past_strain(scene.damping, scene.timestep, state.position, scene.garment)
-        problem = problem.replace(strain=strain)
     if scene.self_contact is not None:
         cloth = (state.position, problem.inertial_guess, scene.garment)
         pairs = find_self_contacts(*cloth, scene.self_contact, pieces=scene.pieces)
         pairs = with_edges(*cloth[:2], pairs, scene.garment)
         problem = problem.replace(layers=_layers(problem, pairs))
-    return problem
+    return with_terms(problem, scene.terms)
 
 
 def first_problem(scene: Scene) -> FrameProblem:

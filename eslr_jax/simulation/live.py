@@ -8,31 +8,42 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
+from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.numerics import Vector3
 from eslr_jax.physics.materials import constants_for
-from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
-from eslr_jax.types import Air, BodyMotion, ClothState, Garment, Material, Scene
+from eslr_jax.terms.air import Air
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Elements, Term
+from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene
 
 MOST_ITERATIONS = 100
 _CONFIG = SimConfig(iterations=MOST_ITERATIONS)
 _HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
 
 
-class Hand(NamedTuple):
-    """What holds the cloth."""
+@struct.dataclass
+class Hand(Term):
+    """What holds the cloth: a spring from a vertex to a place."""
+
+    name = "hand"
 
     vertex: Int[Array, ""]
     place: Float[Array, " 3"]  # [m]
     stiffness: Float[Array, ""]  # [N/m]; zero where nothing is held
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: None) -> tuple[Elements, ...]:
+        """Return the energy of the spring [J]."""
+        squared = sum((part[self.vertex] - place) ** 2 for part, place in zip(x, self.place, strict=True))
+        return (Elements(0.5 * self.stiffness * squared[None], self.vertex[None, None]),)
 
 
 class Stage(NamedTuple):
@@ -74,9 +85,7 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     Raises:
         MotionError: The motion has fewer than two frames.
     """
-    options = SceneOptions(
-        has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), energies=(Partial(_pull, no_hand()),)
-    )
+    options = SceneOptions(has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), terms=(no_hand(),))
     scene = prepare_scene(
         garment, poses, material=material, options=options, on_shapes=partial(_begin_compiling, material)
     )
@@ -113,11 +122,11 @@ def _staged(scene: Scene, material: Material) -> Stage:
 
 def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
-    air = jax.tree.map(jnp.asarray, Air(jnp.asarray(wind, jnp.float32)))
+    asked = jax.tree.map(jnp.asarray, (Air(jnp.asarray(wind, jnp.float32)), hand))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
     constants = jax.tree.map(jnp.asarray, constants_for(material))
-    energies = (Partial(_pull, hand),)
-    constant = stage.constant.replace(material=material, constants=constants, air=air, energies=energies)
+    terms = (*stage.constant.terms[: -len(asked)], *asked)  # they stand last
+    constant = stage.constant.replace(material=material, constants=constants, terms=terms)
     return stage._replace(constant=constant)
 
 
@@ -171,9 +180,3 @@ def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, dire
     aside = np.where(along > 0, aside, np.inf)
     is_close = aside <= aside.min() + 0.01
     return int(np.flatnonzero(is_close)[np.argmin(along[is_close])])
-
-
-def _pull(hand: Hand, position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, ""]:
-    """Return the energy of the spring between a hand and its vertex [J]."""
-    offset = position[hand.vertex] - hand.place
-    return 0.5 * hand.stiffness * jnp.sum(offset * offset)

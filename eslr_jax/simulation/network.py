@@ -16,8 +16,8 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import InitialGuess, initial_guess
 from eslr_jax.physics.potential import Point, evaluate, potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
-from eslr_jax.physics.problem import FrameProblem, pin
 from eslr_jax.physics.subspace import combine_directions
+from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.types import ClothState
 
 

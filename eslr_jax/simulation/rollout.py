@@ -156,7 +156,7 @@ def step_frame(
     end = end.replace(frame=number, first_bad_frame=bad_frame, past=past)
     demand = reports.pair_demand
     return end, FrameReport(
-        terms=jax.tree.map(lambda values: values[-1], reports.terms),
+        energies=jax.tree.map(lambda values: values[-1], reports.energies),
         residual=residual,
         iterations=jnp.max(reports.iterations),
         gap_bound=jnp.max(reports.gap_bound),
@@ -179,7 +179,7 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         positions=with_start(start.position, frames.positions),
         velocities=with_start(start.velocity, frames.velocities),
         friction_loads=with_start(start.friction_load, frames.friction_loads),
-        terms=reports.terms,
+        energies=reports.energies,
         residuals=reports.residual,
         gap_bounds=reports.gap_bound,
         iterations=reports.iterations,

@@ -14,19 +14,19 @@ from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import MAX_APPROACH, approach
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
-from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.guess import initial_guess, separate
 from eslr_jax.physics.lbfgs import Minimum
 from eslr_jax.physics.potential import Point, contact_load, evaluate, potential_terms
-from eslr_jax.physics.problem import FrameProblem, pin, separate, weight_norm
 from eslr_jax.physics.solve import Start, lower_point, solve
 from eslr_jax.simulation.network import Prediction, predict
-from eslr_jax.types import ClothState, PastState, PotentialTerms
+from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
+from eslr_jax.types import ClothState, PastState
 
 
 class FrameReport(NamedTuple):
     """How a frame went."""
 
-    terms: PotentialTerms  # energies that it ended with [J]
+    energies: dict[str, Float[Array, ""]]  # that it ended with [J], by the names of the terms
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
     # Share of the initial gap that the solver left at most; infinite without one.
@@ -92,7 +92,7 @@ def make_stepper(
         position = pin(problem, minimum.position)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
-            terms=potential_terms(position, problem),
+            energies=potential_terms(position, problem),
             residual=residual,
             iterations=minimum.iterations,
             gap_bound=minimum.gap_bound,
@@ -167,10 +167,9 @@ def next_state(
     status = state.status | status | problem_status(problem)
     status = status | _finiteness(position) | _finiteness(jnp.asarray(residual))
     frame = state.frame + 1
-    origin = problem.position if problem.bdf2 is None else problem.bdf2.origin
     return ClothState(
         position=position,
-        velocity=(position - origin) / problem.inertial_timestep,
+        velocity=(position - problem.origin) / problem.inertial_timestep,
         friction_load=contact_load(position, problem),
         frame=frame,
         status=status,

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.config import TrainConfig
+from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential_terms
-from eslr_jax.physics.problem import FrameProblem, pin, pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.network import predict_acceleration, refine
-from eslr_jax.types import ClothState, PotentialTerms
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.types import ClothState
 
 _FALL = 0.01  # [m]; the loss of set "consistent" is in units of the work of lifting the garment by this
 _MIN_GAP = 1e-2  # after a refinement step, as a share of the first one's: the optimum is not known better
@@ -22,7 +23,7 @@ _MIN_INITIAL_GAP = 1e-7  # [J] of a frame in which nothing happens
 _MIN_DISTANCE = 1e-5  # [m] likewise, root of the sum over vertices
 
 
-EnergyTerms = Callable[[Array, FrameProblem], PotentialTerms]
+EnergyTerms = Callable[[Array, FrameProblem], dict[str, Array]]
 """From positions [m] and the frame's problem to energies [J]."""
 
 
@@ -30,7 +31,7 @@ class LossReport(NamedTuple):
     """What one evaluation of the loss shows."""
 
     onward: Float[Array, "vertices 3"]  # positions at t + 1 [m], from which the trajectory goes on
-    terms: PotentialTerms  # at the network's prediction [J]
+    energies: dict[str, Array]  # by term, at the network's prediction [J]
     inertial_energy: Float[Array, ""]  # potential at the pushed-out inertial guess [J]
 
 
@@ -64,9 +65,9 @@ def physics_loss(
     else:
         positions = refine(params, problem, state, config.model, detach=True).positions
     terms = jax.vmap(terms_of, in_axes=(0, None))(positions, problem)
-    energies = sum(terms)
+    energies = sum(terms.values())
     guess = pushed_out_guess(problem)
-    guess_value = sum(terms_of(guess, problem))
+    guess_value = sum(terms_of(guess, problem).values())
     onward = positions[-1]
     if config.iterations:
         start = Start(jax.lax.stop_gradient(positions[-1]), guess_value)

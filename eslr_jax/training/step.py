@@ -20,7 +20,12 @@ from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import is_warming_up
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
-from eslr_jax.physics.hood import (
+from eslr_jax.physics.potential import potential_terms
+from eslr_jax.scene.build import scene_terms
+from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
+from eslr_jax.simulation.network import graph_inputs
+from eslr_jax.simulation.stepper import next_state
+from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
     HoodParameters,
@@ -28,12 +33,8 @@ from eslr_jax.physics.hood import (
     collision_weight,
     hood_terms,
 )
-from eslr_jax.physics.membrane import principal_stretches
-from eslr_jax.physics.potential import potential_terms
-from eslr_jax.physics.problem import FrameProblem
-from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
-from eslr_jax.simulation.network import graph_inputs
-from eslr_jax.simulation.stepper import next_state
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
@@ -253,7 +254,7 @@ def _sample_gradient(
         "inertial_energy": report.inertial_energy,
         "resets": (is_astray | ~is_good).astype(jnp.float32),
         "overflows": (overflow > 0).astype(jnp.float32),
-        **report.terms._asdict(),
+        **report.energies,
     }
     return gradient, _Sample(slot, metrics, statistics)
 
@@ -288,16 +289,18 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
     frames = (slot.frame, data.next_frame(slot.frame, slot.before))
     transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
+    searched = SceneBody(data.surface, body.start[None, :0])
     scene = Scene(
         garment=garment,
         material=slot.material,
         constants=PhysicsConstants(collision_stiffness=config.collision_stiffness),
         timestep=jnp.float32(1.0 / FPS),
         initial_state=slot.state,
-        body=SceneBody(data.surface, body.start[None, :0]),
+        body=searched,
         pin_targets=None,
         num_frames=0,
         self_contact=default_capacity(garment.vertex_mask.shape[0]) if config.self_contact else None,
+        terms=scene_terms(searched, has_ground=False, has_layers=config.self_contact),
     )
     inputs = FrameInput(body, data.skinned(index, later, slot.shape))
     return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.referee import judge
-from eslr_jax.physics.bending import bending_energy
+from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.guess import initial_guess
-from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.membrane import principal_stretches, stretch_energy
+from eslr_jax.terms.problem import vertex_masses
+from eslr_jax.terms.stretch import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import potential
-from eslr_jax.physics.problem import FrameProblem, pin
+from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.types import Scene, Trajectory

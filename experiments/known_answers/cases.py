@@ -18,9 +18,9 @@ from eslr_jax.config import SimConfig
 from eslr_jax.fabric import Described, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
-from eslr_jax.physics.bending import bending_energy, dihedral_angles, plate_curvatures
+from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.physics.materials import COTTON, Weave, stretch_stiffness
-from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Air, Garment, Material, PhysicsConstants, Scene, Trajectory
 from known_answers.sheets import cantilever_rigidity, grid, irregular, tube

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.physics.hood import (
+from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
     Criterion,
@@ -41,7 +41,7 @@ def hood_metrics(
         scene: Their scene, with a body; every face that it searches counts.
         origin: Point from which heights count [m], shape [3].
         parameters: Weights and thresholds.
-        criterion: Frames of the body that count, see `physics.hood`.
+        criterion: Frames of the body that count, see `terms.hood`.
 
     Source: HOOD, repository at 9bc1076, utils/metrics.py.
     """

@@ -35,7 +35,7 @@ from supervised import Truth, fit, load_truth
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
-from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
 
 _WIDTH, _LAYERS, _HEADS = 64, 3, 4  # MAT: 512, 6, 8

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.geometry.geodesic import geodesic_distances, geodesic_graph
 from eslr_jax.numerics import safe_normalize
-from eslr_jax.physics.collision import penetration
+from eslr_jax.terms.collision import penetration
 from eslr_jax.types import Contacts, Garment
 
 _GEODESIC_REACH = 0.05  # [m] over which a face's weight for another falls by e

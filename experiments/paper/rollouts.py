@@ -27,7 +27,7 @@ from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajector
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
-from eslr_jax.physics.hood import HoodParameters
+from eslr_jax.terms.hood import HoodParameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene

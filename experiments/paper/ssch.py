@@ -32,7 +32,7 @@ from supervised import Truth, fit, load_truth
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body import lbs
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.physics.collision import penetration
+from eslr_jax.terms.collision import penetration
 from eslr_jax.types import BodySurface, Garment
 
 _LATENTS = 25  # SSCH

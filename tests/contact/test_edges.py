@@ -11,7 +11,7 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, skin_heights
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.physics.collision import skin_energy
+from eslr_jax.terms.collision import skin_energy
 
 HALF = 0.03  # [m] of the ridge and of the valley
 ROOF = np.array([[-HALF, 0, 0], [HALF, 0, 0], [0, -0.03, HALF], [0, -0.03, -HALF]])  # a ridge along x

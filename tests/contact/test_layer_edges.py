@@ -8,7 +8,7 @@ from cloth import make_garment
 
 from eslr_jax.contact.layer_edges import with_edges
 from eslr_jax.contact.self_contact import find_self_contacts
-from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
+from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
 from eslr_jax.types import PairCapacity, tree_cast
 
 HALF = 0.03  # [m] of a ridge along x, and of a valley along z over it

@@ -12,7 +12,7 @@ from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.physics.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
+from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
 from eslr_jax.types import PairCapacity, tree_cast
 
 NEAR, RADIUS, COSINE = 0.02, 0.04, 0.8

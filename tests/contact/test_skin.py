@@ -13,7 +13,7 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.physics.collision import skin_diagonal, skin_energy
+from eslr_jax.terms.collision import skin_diagonal, skin_energy
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene

@@ -19,7 +19,7 @@ from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.io.run import read_run, scene_record
 from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.potential import potential, potential_terms
-from eslr_jax.physics.problem import pushed_out_guess
+from eslr_jax.terms.problem import pushed_out_guess
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, prepare_scene

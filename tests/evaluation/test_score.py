@@ -13,7 +13,7 @@ from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.models.registry import init_model
-from eslr_jax.physics.air import blowing
+from eslr_jax.terms.air import blowing
 from eslr_jax.types import PairCapacity
 
 FRAMES = 7

@@ -8,8 +8,8 @@ from hood_metrics import hood_metrics
 
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.physics.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
-from eslr_jax.physics.inertia import vertex_masses
+from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
+from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.types import PhysicsConstants, Scene, SceneBody

@@ -20,10 +20,10 @@ from newton_cloth import (
 )
 
 from eslr_jax.config import SimConfig
-from eslr_jax.physics.bending import bending_energy
-from eslr_jax.physics.collision import contact_forces
+from eslr_jax.terms.bending import bending_energy
+from eslr_jax.terms.collision import contact_forces
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.problem import contact_thickness
+from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Contacts
 

@@ -12,7 +12,7 @@ from cloth import make_garment, make_sheet
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.physics.problem import BodyContact, FrameProblem
+from eslr_jax.terms.problem import BodyContact, FrameProblem
 from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
 
 TIMESTEP = 1 / 30

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.physics.air import air_flow, blowing, gusts
+from eslr_jax.terms.air import air_flow, blowing, gusts
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air
 from eslr_jax.scene.plan import SceneOptions, prepare_scene

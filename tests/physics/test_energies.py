@@ -11,12 +11,12 @@ from cloth import make_garment, make_sheet
 from draped_ball import drifting_ball
 from physics_cases import make_case, pad_case, to_numpy
 
-from eslr_jax.physics.bending import bending_energy, dihedral_angles
+from eslr_jax.terms.bending import bending_energy, dihedral_angles
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.membrane import principal_stretches, stretch_energy
+from eslr_jax.terms.stretch import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import PotentialTerms, contact_load, potential, potential_terms
 from eslr_jax.physics.preconditioner import stretch_diagonal
-from eslr_jax.physics.problem import weight_norm
+from eslr_jax.terms.problem import weight_norm
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
 

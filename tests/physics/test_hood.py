@@ -12,7 +12,7 @@ import reference
 from cloth import make_garment, make_sheet
 from physics_cases import TIMESTEP, pad_case, to_numpy
 
-from eslr_jax.physics.hood import (
+from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
     HoodParameters,

@@ -12,15 +12,15 @@ from physics_cases import make_case
 from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import TipPairs, default_capacity
 from eslr_jax.physics import hessian
-from eslr_jax.physics.bending import bending_energy
+from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.physics.newton import minimize_newton, potential_float64
 from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.preconditioner import stiffness
-from eslr_jax.physics.problem import SelfContact
-from eslr_jax.physics.repulsion import pair_heights, repulsion_energy
+from eslr_jax.terms.problem import SelfContact
+from eslr_jax.terms.repulsion import pair_heights, repulsion_energy
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_problem
 from eslr_jax.types import PhysicsConstants, Scene

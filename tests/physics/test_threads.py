@@ -13,10 +13,10 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import Described, describe_fabric, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
-from eslr_jax.physics.bending import bending_energy
+from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON, Weave
-from eslr_jax.physics.membrane import stretch_energy
+from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.physics.newton import _plate_couples, minimize_newton, potential_float64, to_float64
 from eslr_jax.physics.potential import evaluate, potential
 from eslr_jax.physics.preconditioner import stiffness

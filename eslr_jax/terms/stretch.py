@@ -2,13 +2,46 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float
 
-from eslr_jax.numerics import Vector3, dot3, gather_corners, in_memory, safe_norm, safe_sqrt, sub3
+from eslr_jax.numerics import (
+    Vector3,
+    dot3,
+    gather_corners,
+    in_memory,
+    safe_norm,
+    safe_sqrt,
+    scatter_corners,
+    sub3,
+)
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Term
 from eslr_jax.types import Garment, Material, Threads
 
 STIFFENING = 0.01  # strain beyond a thread's limit at which it is twice as stiff
+
+
+@struct.dataclass
+class Stretch(Term):
+    """The membrane's energy."""
+
+    name = "stretch"
+    on = "faces"
+    is_elastic = True
+
+    def corner_energies(
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
+    ) -> Float[Array, " faces"]:
+        """Return the energy of every face [J]; see `face_energies`."""
+        return face_energies(corners, problem.garment, problem.material)
+
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
+        """Return the curvature at rest [N/m]; see `stretch_diagonal`."""
+        return stretch_diagonal(problem.garment, problem.material)
 
 
 def deformation_gradient(corners: tuple[Vector3, ...], garment: Garment) -> tuple[Vector3, Vector3]:
@@ -113,6 +146,24 @@ def _limit_energies(
         limit, stiffness = in_memory(limit, stiffness)
         energy = energy + stiffness * jnp.maximum(strain - limit, 0.0) ** 3
     return garment.rest_areas * energy / (6.0 * STIFFENING)
+
+
+def stretch_diagonal(garment: Garment, material: Material) -> Float[Array, " vertices"]:
+    """Return the membrane's stiffness per vertex at rest [N/m], averaged over the triangle's plane.
+
+    Moving one corner along its height changes the strain by 1/height, so the curvature is A h (lambda + 2 mu)
+    / height^2 = h (lambda + 2 mu) |opposite edge|^2 / (4 A); with threads their mean stiffness.
+    """
+    corners = garment.sewn_positions[garment.faces]
+    opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
+    squared = jnp.sum(opposite * opposite, axis=-1)
+    if material.threads is None:
+        modulus = material.thickness * (material.lame_lambda + 2.0 * material.lame_mu)
+    else:  # averaged over the plane as well
+        modulus = 0.5 * (material.threads.stiffness[0] + material.threads.stiffness[1])
+    is_real = garment.rest_areas > 0
+    scale = jnp.where(is_real, modulus / (4.0 * jnp.where(is_real, garment.rest_areas, 1.0)), 0.0)
+    return scatter_corners(scale[:, None] * squared, garment.face_incidence)
 
 
 def principal_stretches(

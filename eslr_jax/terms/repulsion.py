@@ -10,16 +10,80 @@ the cloth (`TipPairs`); they don't give way.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
 from eslr_jax.contact.self_contact import TipPairs
-from eslr_jax.numerics import Vector3, components, cross3, dot3, safe_normalize, segment_sum, sub3, take3
+from eslr_jax.numerics import (
+    Vector3,
+    components,
+    cross3,
+    dot3,
+    in_memory,
+    safe_normalize,
+    segment_sum,
+    sub3,
+    take3,
+)
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Elements, Term
+from eslr_jax.types import Garment
 
 Pairs = LayerPairs | TipPairs
 _SWEEPS = 4  # of `push_apart`
+
+
+@struct.dataclass
+class Repulsion(Term):
+    """Layers of cloth keep apart."""
+
+    name = "repulsion"
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
+        """Return the energy of every pair [J]; see `repulsion_energies`."""
+        layers = problem.layers
+        return (
+            _elements(x, layers.pairs, problem.constants.repulsion_stiffness, layers.thickness, layers.limit),
+        )  # type: ignore[union-attr]
+
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
+        """Return an estimate of the curvature [N/m]; see `repulsion_diagonal`."""
+        layers, stiffness = problem.layers, problem.constants.repulsion_stiffness
+        return repulsion_diagonal(x, layers.pairs, stiffness, layers.thickness, layers.limit)  # type: ignore[union-attr]
+
+    def describe(self, garment: Garment) -> str:
+        """Return what touches what."""
+        return "layers of cloth"
+
+
+@struct.dataclass
+class TipCollision(Term):
+    """Tips of the body that are finer than the cloth's mesh against its faces."""
+
+    name = "collision"
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
+        """Return the energy of every tip [J]; see `repulsion_energies`."""
+        constants, tips = problem.constants, problem.body.tips  # type: ignore[union-attr]
+        return (_elements(x, tips, constants.collision_stiffness, constants.collision_thickness),)
+
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
+        """Return an estimate of the curvature [N/m]; see `repulsion_diagonal`."""
+        constants, tips = problem.constants, problem.body.tips  # type: ignore[union-attr]
+        return repulsion_diagonal(x, tips, constants.collision_stiffness, constants.collision_thickness)
+
+    def describe(self, garment: Garment) -> str:
+        """Return what touches what."""
+        return "faces off the body's tips"
+
+
+def _elements(x: Vector3, pairs: Pairs, *distances: Any) -> Elements:
+    return Elements(repulsion_energies(x, pairs, *distances), pairs.corners)
 
 
 def pair_heights(
@@ -55,14 +119,14 @@ def overlaps(
     return jnp.where(pairs.side != 0, jnp.maximum(thickness - height, 0.0), 0.0)
 
 
-def repulsion_energy(
+def repulsion_energies(
     position: Float[Array, "vertices 3"] | Vector3,
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
     limit: Float[Array, ""] | float | None = None,
-) -> Float[Array, ""]:
-    """Return stiffness sum_pairs a_p f(max(thickness - d, 0)) [J]; f(x) = x^3, and linear beyond the limit.
+) -> Float[Array, " pairs"]:
+    """Return stiffness a_p f(max(thickness - d, 0)) of every pair [J]; f(x) = x^3, and linear beyond the limit.
 
     Args:
         position: Cloth vertices at t + 1 [m].
@@ -75,15 +139,16 @@ def repulsion_energy(
         and the nearest place on the face in place of a corner.
     """
     depth = overlaps(position, pairs, thickness)
-    barrier = pairs.areas * depth * depth * depth
+    (areas,) = in_memory(stiffness * pairs.areas)
+    barrier = areas * depth * depth * depth
     if limit is not None:
-        linear = pairs.areas * limit * limit * (3.0 * depth - 2.0 * limit)
+        linear = areas * limit * limit * (3.0 * depth - 2.0 * limit)
         barrier = jnp.where(depth < limit, barrier, linear)
-    return stiffness * jnp.sum(barrier)
+    return barrier
 
 
 def repulsion_diagonal(
-    position: Float[Array, "vertices 3"],
+    position: Float[Array, "vertices 3"] | Vector3,
     pairs: Pairs,
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, " pairs"] | Float[Array, ""] | float,
@@ -98,7 +163,8 @@ def repulsion_diagonal(
         depth = jnp.minimum(depth, limit)
     curvature = 2.0 * stiffness * pairs.areas * depth
     weights = pairs.weights.T
-    return segment_sum((weights**2 * curvature[None]).ravel(), pairs.corners.T.ravel(), position.shape[0])
+    num_vertices = components(position)[0].shape[0]
+    return segment_sum((weights**2 * curvature[None]).ravel(), pairs.corners.T.ravel(), num_vertices)
 
 
 def push_apart(

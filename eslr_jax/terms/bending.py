@@ -9,18 +9,54 @@ of 20 to 5 mm. A `plate` has the same, given flexural rigidity on any mesh, see 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3, arctan2, cross3, dot3, gather_corners, gather_values, in_memory, sub3
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Elements, Term
 from eslr_jax.types import Garment, Material, Plate
 
 RIGIDITY_PER_STIFFNESS = 0.25
 """[N m/J] of equilateral triangles: sqrt(3)/2 of the hinges' stiffness by angle, which is k / (2 sqrt(3)) there.
 
 Source: Seung and Nelson 1988, doi 10.1103/PhysRevA.38.1005."""
+
+
+@struct.dataclass
+class Bending(Term):
+    """The energy of hinges, or of a plate on the faces."""
+
+    name = "bending"
+    on = "hinges"
+
+    def corner_energies(
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
+    ) -> Float[Array, " hinges"]:
+        """Return the energy of every hinge [J]; of a plate, that of its nearest isotropic sheet's."""
+        return hinge_energies(corners, problem.garment, problem.material)
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
+        """Return the energies of the hinges, or of a plate's faces [J]."""
+        garment, material = problem.garment, problem.material
+        energies = angle_energies(dihedral_angles(x, garment)[0], garment, material)
+        return (Elements(energies, garment.hinges if material.plate is None else garment.faces),)
+
+    def remainder(self, problem: FrameProblem) -> Callable[[Vector3, Any], Float[Array, ""]] | None:
+        """Return what a plate adds to its hinges: those alone stand in the tangent, where they precondition."""
+        if problem.material.plate is None:
+            return None
+
+        def beyond_hinges(x: Vector3, data: Any) -> Float[Array, ""]:
+            return self.energy(x, problem, data) - jnp.sum(self._assembled(x, problem, data).energies)
+
+        return beyond_hinges
 
 
 def dihedral_angles(
@@ -31,11 +67,14 @@ def dihedral_angles(
     theta = atan2(e_hat . (n_a x n_b), n_a . n_b); the two area factors of the unnormalised normals cancel.
     A collapsed hinge has a zero gradient.
     """
-    return _angles(_hinge_corners(position, garment))
+    return _angles(hinge_corners(position, garment))
 
 
-def _hinge_corners(position: Float[Array, "vertices 3"] | Vector3, garment: Garment) -> tuple[Vector3, ...]:
-    # Gathered once: XLA would repeat the gathers in every one of the twelve components of the gradient.
+def hinge_corners(position: Float[Array, "vertices 3"] | Vector3, garment: Garment) -> tuple[Vector3, ...]:
+    """Return the positions of the hinges' corners, by components [m], gathered once.
+
+    XLA would repeat the gathers in every one of the twelve components of the gradient.
+    """
     return jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
 
 
@@ -98,28 +137,6 @@ def _corner_angles_jvp(primals, tangents):
     return _corner_angles(*primals), change
 
 
-def bending_energy(
-    position: Float[Array, "vertices 3"] | Vector3,
-    garment: Garment,
-    material: Material,
-    *,
-    use_current_length: bool = False,
-) -> Float[Array, ""]:
-    """Return the bending energy [J] at positions [m], shape [vertices, 3]: of the plate, or of `hinge_energies`.
-
-    With the current length it is HOOD's own energy, which knows no plate.
-    """
-    if material.plate is not None and not use_current_length:
-        return angle_energy(dihedral_angles(position, garment)[0], garment, material)
-    energies = hinge_energies(
-        _hinge_corners(position, garment),
-        garment,
-        material,
-        use_current_length=use_current_length,
-    )
-    return jnp.sum(energies)
-
-
 def hinge_energies(
     corners: tuple[Vector3, ...],
     garment: Garment,
@@ -144,8 +161,10 @@ def hinge_energies(
     return stiffness * angle * angle
 
 
-def angle_energy(angle: Float[Array, " hinges"], garment: Garment, material: Material) -> Float[Array, ""]:
-    """Return the bending energy [J] by the angles of the hinges [rad].
+def angle_energies(
+    angle: Float[Array, " hinges"], garment: Garment, material: Material
+) -> Float[Array, " hinges"] | Float[Array, " faces"]:
+    """Return the energies [J] of hinges by their angles [rad], or of the faces of the material's plate.
 
     Raises:
         ConfigError: The material has a plate, and the garment is not of the shape that it was made for.
@@ -155,10 +174,10 @@ def angle_energy(angle: Float[Array, " hinges"], garment: Garment, material: Mat
             "bending in N m does not follow a rest shape of with_rest_positions; give bending_stiffness instead, "
             "or prepare_garment with the new shape and describe the fabric for that"
         )
-    if material.plate is not None:
-        moments = plate_curvatures(angle, material.plate)
-        return 0.5 * sum((jnp.sum(moment * moment) for moment in moments), jnp.zeros((), angle.dtype))
-    return jnp.sum(hinge_stiffnesses(garment, material) * angle * angle)
+    if material.plate is None:
+        return hinge_stiffnesses(garment, material) * angle * angle
+    moments = plate_curvatures(angle, material.plate)
+    return 0.5 * dot3(moments, moments)
 
 
 def plate_curvatures(angle: Float[Array, " hinges"], plate: Plate) -> Vector3:

@@ -1,6 +1,6 @@
 """Energy set `hood`: HOOD's published losses with every quirk, so that its tables can be compared.
 
-`physics.potential` lists the differences from set `consistent` side by side. HOOD's code has three variants of
+`eslr_jax.terms` lists the differences from set `consistent` side by side. HOOD's code has three variants of
 the same six terms, which use different frames of the body:
 
 | criterion    | collision: nearest centroid | collision: planes | friction: body motion | weight, eps |
@@ -33,11 +33,12 @@ from eslr_jax.numerics import (
     safe_normalize,
     sub3,
 )
-from eslr_jax.physics.bending import bending_energy
-from eslr_jax.physics.gravity import gravity_energy
-from eslr_jax.physics.inertia import inertia_energy, vertex_masses
-from eslr_jax.physics.membrane import stretch_energy
-from eslr_jax.types import Garment, Material, PotentialTerms
+from eslr_jax.terms.bending import hinge_corners, hinge_energies
+from eslr_jax.terms.gravity import gravity_energies
+from eslr_jax.terms.inertia import inertia_energies
+from eslr_jax.terms.problem import vertex_masses
+from eslr_jax.terms.stretch import stretch_energy
+from eslr_jax.types import Garment, Material
 
 _CHUNK = 64  # garment vertices whose distances to all faces are held at once
 _FLOOR_AXIS = 2  # friction's "floor normal" is z although gravity acts along y
@@ -207,8 +208,8 @@ def criterion_depths(
 
 def hood_terms(
     position: Float[Array, "vertices 3"], problem: HoodProblem, *, criterion: Criterion = "postcvpr"
-) -> PotentialTerms:
-    """Return HOOD's six losses [J] of one step; what HOOD lacks is zero.
+) -> dict[str, Float[Array, ""]]:
+    """Return HOOD's six losses [J] of one step, by name.
 
     Sums go over vertices, faces and edges, without means; gravity counts from the world's origin. In the two
     training criteria pinned vertices have already moved when the losses are taken: they add a constant to
@@ -231,12 +232,13 @@ def hood_terms(
         position = jnp.where(is_pinned, fixed, position)
     guess = problem.current + (problem.current - problem.previous)
     depth = criterion_depths(position, problem, criterion)
-    return PotentialTerms(
-        stretch=stretch_energy(position, garment, material),
-        bending=bending_energy(position, garment, material, use_current_length=True),
-        inertia=inertia_energy(position, guess, masses, jnp.asarray(problem.timestep, position.dtype)),
-        gravity=gravity_energy(position, None, masses, parameters.gravity),
-        collision=parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask),
-        friction=hood_friction_energy(position, problem, criterion),
-        **dict.fromkeys(("repulsion", "air", "damping", "own"), jnp.zeros((), position.dtype)),
-    )
+    hinges = hinge_corners(position, garment)
+    timestep = jnp.asarray(problem.timestep, position.dtype)
+    return {
+        "stretch": stretch_energy(position, garment, material),
+        "bending": jnp.sum(hinge_energies(hinges, garment, material, use_current_length=True)),
+        "inertia": jnp.sum(inertia_energies(position, guess, masses, timestep)),
+        "gravity": jnp.sum(gravity_energies(position, None, masses, parameters.gravity)),
+        "collision": parameters.collision_weight * masked_sum(depth * depth * depth, garment.vertex_mask),
+        "friction": hood_friction_energy(position, problem, criterion),
+    }

@@ -14,7 +14,7 @@ Source: Hoerner 1965, Fluid-Dynamic Drag, chapter 3 (plates across and along a f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,17 +24,15 @@ from jaxtyping import Array, Float
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3, cross3, dot3, gather_corners, safe_normalize, sub3
-from eslr_jax.types import Air, Garment
-
-if TYPE_CHECKING:
-    from eslr_jax.physics.problem import FrameProblem
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Elements, Term
+from eslr_jax.types import Garment
 
 _NUM_WAVES = 8  # of a gust, in each direction
 _LONGEST, _SHORTEST = 4.0, 0.5  # [s], periods of a gust's waves
 
 
-@struct.dataclass
-class AirFlow:
+class AirFlow(NamedTuple):
     """The air around every face during a frame."""
 
     areas: Float[Array, " faces"]  # at t [m^2], zero where padded
@@ -42,56 +40,66 @@ class AirFlow:
     wind: Float[Array, "faces 3"]  # at t + 1 [m/s]
 
 
-def air_flow(
-    air: Air, position: Float[Array, "vertices 3"], garment: Garment, time: Float[Array, ""]
-) -> AirFlow:
-    """Return the air around the faces of a garment.
+@struct.dataclass
+class Air(Term):
+    """Air that cloth moves through."""
 
-    Args:
-        air: The scene's air.
-        position: Vertex positions at t [m].
-        garment: Faces; padded ones have no area.
-        time: At t + 1, since the scene's first frame [s].
-    """
-    a, b, c = gather_corners(position, garment.faces, garment.face_incidence)
-    doubled = jnp.stack(cross3(sub3(b, a), sub3(c, a)), axis=-1)
-    normals = safe_normalize(doubled)
-    centers = jnp.stack(_mean((a, b, c)), axis=-1)
-    wind = air.wind(centers, time) if callable(air.wind) else jnp.asarray(air.wind, position.dtype)
-    return AirFlow(
-        areas=0.5 * jnp.sum(doubled * normals, axis=-1),
-        normals=normals,
-        wind=jnp.broadcast_to(wind, normals.shape).astype(position.dtype),
-    )
+    name = "air"
 
+    # Velocity [m/s], shape [3]; or a function of points [m], shape [points, 3], and the time since the first
+    # frame [s] to velocities, shape [points, 3] or [3], such as `gusts`.
+    wind: Float[Array, " 3"] | tuple[float, float, float] | Partial
+    density: Float[Array, ""] | float = 1.2  # [kg/m^3], at 20 degrees and sea level
+    normal_drag: Float[Array, ""] | float = 1.17  # of a square plate across the flow (Hoerner 1965, 3-15)
+    # Of a rough plate along the flow, both sides (Hoerner 1965, 2-6).
+    tangential_drag: Float[Array, ""] | float = 0.02
 
-def air_energy(position: Vector3, problem: FrameProblem) -> Float[Array, ""]:
-    """Return the dissipation potential of the air [J]; zero where the scene has none.
+    def prepare(self, problem: FrameProblem) -> AirFlow:
+        """Return the air around the faces of the cloth."""
+        position, garment = problem.position, problem.garment
+        a, b, c = gather_corners(position, garment.faces, garment.face_incidence)
+        doubled = jnp.stack(cross3(sub3(b, a), sub3(c, a)), axis=-1)
+        normals = safe_normalize(doubled)
+        if callable(self.wind):
+            wind = self.wind(jnp.stack(_mean((a, b, c)), axis=-1), problem.time)
+        else:
+            wind = jnp.asarray(self.wind, position.dtype)
+        return AirFlow(
+            areas=0.5 * jnp.sum(doubled * normals, axis=-1),
+            normals=normals,
+            wind=jnp.broadcast_to(wind, normals.shape).astype(position.dtype),
+        )
 
-    Args:
-        position: Candidate positions at t + 1 [m], by components.
-        problem: The frame's problem.
-    """
-    air, flow = problem.air, problem.flow
-    if air is None or flow is None:
-        return jnp.zeros((), position[0].dtype)
-    garment, timestep = problem.garment, problem.inertial_timestep
-    origin = problem.position if problem.bdf2 is None else problem.bdf2.origin
-    now, before = (
-        _mean(gather_corners(x, garment.faces, garment.face_incidence)) for x in (position, origin)
-    )
-    normals, wind = tuple(flow.normals.T), tuple(flow.wind.T)
-    moved = sub3(now, before)
-    through = (moved[0] / timestep - wind[0], moved[1] / timestep - wind[1], moved[2] / timestep - wind[2])
-    across = dot3(through, normals)
-    along = dot3(through, through) - across * across
-    is_still = along <= 0  # the root has no gradient there
-    along = jnp.where(is_still, 0.0, along)
-    cubed = along * jnp.sqrt(jnp.where(is_still, 1.0, along))
-    scale = timestep * air.density * flow.areas / 6.0
-    return jnp.sum(
-        scale * (air.normal_drag * jnp.abs(across) * across * across + air.tangential_drag * cubed)
-    )
+    def elements(self, x: Vector3, problem: FrameProblem, data: AirFlow) -> tuple[Elements, ...]:
+        """Return the dissipation potential of every face [J]."""
+        garment, timestep = problem.garment, problem.inertial_timestep
+        now, before = (
+            _mean(gather_corners(places, garment.faces, garment.face_incidence))
+            for places in (x, problem.origin)
+        )
+        normals, wind = tuple(data.normals.T), tuple(data.wind.T)
+        moved = sub3(now, before)
+        through = (
+            moved[0] / timestep - wind[0],
+            moved[1] / timestep - wind[1],
+            moved[2] / timestep - wind[2],
+        )
+        across = dot3(through, normals)
+        along = dot3(through, through) - across * across
+        is_still = along <= 0  # the root has no gradient there
+        along = jnp.where(is_still, 0.0, along)
+        cubed = along * jnp.sqrt(jnp.where(is_still, 1.0, along))
+        scale = timestep * self.density * data.areas / 6.0
+        drag = self.normal_drag * jnp.abs(across) * across * across + self.tangential_drag * cubed
+        return (Elements(scale * drag, garment.faces),)
+
+    def describe(self, garment: Garment) -> str:
+        """Return its speed."""
+        return (
+            "a wind that changes"
+            if callable(self.wind)
+            else f"{np.linalg.norm(np.asarray(self.wind)):.1f} m/s"
+        )
 
 
 def blowing(wind: Sequence[float] | None, gust: float = 0.0) -> Air | None:

@@ -6,19 +6,14 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
-from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
-from eslr_jax.physics.air import AirFlow
-from eslr_jax.physics.collision import penetration
-from eslr_jax.physics.damping import PastStrain
-from eslr_jax.physics.inertia import vertex_masses
-from eslr_jax.physics.repulsion import push_apart
-from eslr_jax.types import Air, Contacts, Garment, Material, PhysicsConstants
+from eslr_jax.terms.term import Term
+from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
 
@@ -69,18 +64,16 @@ class FrameProblem:
     constants: PhysicsConstants
     timestep: Float[Array, ""]  # [s]
     position: Float[Array, "vertices 3"]  # at t [m]
-    inertial_guess: Float[
-        Array, "vertices 3"
-    ]  # where inertia alone takes the cloth [m], see `simulation.frame`
+    # Where inertia alone takes the cloth [m], see `simulation.frame`.
+    inertial_guess: Float[Array, "vertices 3"]
+    time: Float[Array, ""] | float = 0.0  # at t + 1, since the scene's first frame [s]
     body: BodyContact | None = None
     ground: GroundContact | None = None
     layers: SelfContact | None = None
-    air: Air | None = None
-    flow: AirFlow | None = None  # of that air, around the faces
-    strain: PastStrain | None = None  # None: the fabric has no damping
-    energies: tuple[Partial, ...] = ()  # of positions and this problem to joules
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
     bdf2: SecondOrder | None = None  # None: implicit Euler
+    terms: tuple[Term, ...] = ()  # whose sum is the potential
+    data: tuple[Any, ...] = ()  # what each of them has prepared, see `with_terms`
 
     @property
     def inertial_timestep(self) -> Any:  # NumPy in float64 references
@@ -88,9 +81,24 @@ class FrameProblem:
         return self.timestep if self.bdf2 is None else self.bdf2.timestep
 
     @property
+    def origin(self) -> Float[Array, "vertices 3"]:
+        """Positions from which a frame's velocity counts [m]: those at t, or what BDF2 puts in their place."""
+        return self.position if self.bdf2 is None else self.bdf2.origin
+
+    @property
     def masses(self) -> Float[Array, " vertices"]:
         """Lumped masses [kg], shape [vertices]; zero where padded."""
         return vertex_masses(self.garment, self.material)
+
+
+def vertex_masses(garment: Garment, material: Material) -> Float[Array, " vertices"]:
+    """Return lumped masses [kg]; zero for padded vertices."""
+    return material.density * garment.vertex_areas
+
+
+def with_terms(problem: FrameProblem, terms: tuple[Term, ...]) -> FrameProblem:
+    """Return a problem whose potential is the sum of some terms, each prepared for the frame."""
+    return problem.replace(terms=terms, data=tuple(term.prepare(problem) for term in terms))
 
 
 def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> Float[Array, ""]:
@@ -117,49 +125,3 @@ def pin(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Ar
     if problem.pin_targets is None:
         return position
     return jnp.where(problem.garment.is_pinned[:, None], problem.pin_targets, position)
-
-
-def push_out(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with vertices inside the body or the ground lifted out of it.
-
-    A vertex goes to the tangent plane of its nearest body point, offset by the contact thickness. The cubic
-    collision energy has no curvature at first touch, so a minimiser that begins deep inside only halves the
-    depth per iteration. This projection costs little and ends 30 to 2000 times lower in energy.
-    """
-    position = pin(problem, position)
-    if problem.body is not None:
-        position = _lifted(position, problem.body.nearest, problem.body.thickness)
-    if problem.ground is not None:
-        position = _lifted(position, problem.ground.contacts, problem.ground.thickness)
-    return pin(problem, position)
-
-
-def _lifted(
-    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
-) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], a thickness [m] or more above their tangent planes."""
-    lift = penetration(position, contacts, thickness)
-    return position + lift[:, None] * contacts.next_normals
-
-
-def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with layers pushed apart and faces pushed off the body's tips.
-
-    Like the body's, their barriers have no curvature at first touch: from deep inside, an iteration of the
-    solver only halves the depth.
-    """
-    if problem.body is not None and problem.body.tips is not None:
-        position = push_apart(position, problem.body.tips, problem.constants.collision_thickness)
-        position = push_out(problem, position)
-    if problem.layers is not None:
-        position = push_apart(position, problem.layers.pairs, problem.layers.thickness)
-        position = push_out(problem, position)
-    return position
-
-
-def pushed_out_guess(problem: FrameProblem) -> Float[Array, "vertices 3"]:
-    """Return the inertial guess [m], pushed out of the body and its layers apart, shape [vertices, 3].
-
-    The initial gap of a frame counts from its energy.
-    """
-    return separate(problem, push_out(problem, problem.inertial_guess))

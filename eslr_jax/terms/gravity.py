@@ -1,0 +1,48 @@
+"""Gravity along -y."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flax import struct
+from jaxtyping import Array, Float
+
+from eslr_jax.numerics import Vector3, components, in_memory
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Term
+
+
+@struct.dataclass
+class Gravity(Term):
+    """The weight's energy, counted from the frame's first positions."""
+
+    name = "gravity"
+    on = "vertices"
+
+    def corner_energies(
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
+    ) -> Float[Array, " vertices"]:
+        """Return the energy of every vertex [J]; see `gravity_energies`."""
+        return gravity_energies(corners[0], problem.position, problem.masses, problem.constants.gravity)
+
+
+def gravity_energies(
+    position: Float[Array, "vertices 3"] | Vector3,
+    reference: Float[Array, "vertices 3"] | None,
+    masses: Float[Array, " vertices"],
+    gravity: Float[Array, ""] | float,
+) -> Float[Array, " vertices"]:
+    """Return m_v g (y_v - y_reference) of every vertex [J].
+
+    Args:
+        position: Vertex positions [m].
+        reference: Where the energy is zero, usually the frame's start; None is the world origin (HOOD).
+            A near reference keeps float32 sums exact and the total independent of where the scene stands.
+        masses: Vertex masses [kg].
+        gravity: Acceleration [m/s^2].
+    """
+    height = components(position)[1]
+    if reference is not None:
+        height = height - reference[:, 1]
+    (weights,) = in_memory(gravity * masses)
+    return weights * height

@@ -1,0 +1,112 @@
+"""What a term of the potential is: one energy, a sum over small elements of the cloth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.numerics import Vector3, gather_corners, segment_sum
+
+if TYPE_CHECKING:
+    from eslr_jax.terms.problem import FrameProblem
+    from eslr_jax.types import Garment
+
+
+class Elements(NamedTuple):
+    """The summands of an energy, and the vertices that each of them depends on."""
+
+    energies: Float[Array, " elements"]  # [J]
+    vertices: Int[Array, "elements corners"]
+
+
+class Term:
+    """One energy of a frame's potential.
+
+    A subclass is a frozen pytree (`flax.struct.dataclass`). Its fields are its constants, which are traced, and
+    its choices, which are static. It has `corner_energies` if its elements are the faces, hinges or vertices of
+    the mesh, else `elements`. All else has a default. `scene.terms` holds the terms that a scene models:
+    potential, gradient, tangent, preconditioner, report and colours walk it.
+    """
+
+    name: ClassVar[str]  # in reports, colours and `Trajectory.energies`; terms of one name are added up
+    on: ClassVar[Literal["faces", "hinges", "vertices"] | None] = None  # its elements; None: of its own
+    is_elastic: ClassVar[bool] = False  # its curvature acts between neighbours, and not against a fixed place
+
+    def prepare(self, problem: FrameProblem) -> Any:
+        """Return what is computed once a frame, from its state; `data` of the other methods."""
+        return None
+
+    def corner_energies(
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
+    ) -> Float[Array, " elements"]:
+        """Return the energy of every face, hinge or vertex [J].
+
+        Args:
+            corners: Positions at t + 1 of the elements' corners, by components [m].
+            problem: The frame's problem.
+            data: Of `prepare`.
+        """
+        raise TypeError(f"{type(self).__name__} needs `corner_energies` or `elements`")
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
+        """Return the energies [J] of all elements at positions x at t + 1, by components [m]."""
+        return (self._assembled(x, problem, data),)
+
+    def _assembled(self, x: Vector3, problem: FrameProblem, data: Any) -> Elements:
+        corners, vertices = mesh_corners(self.on, x, problem.garment)
+        return Elements(self.corner_energies(corners, problem, data), vertices)
+
+    def energy(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, ""]:
+        """Return the energy [J] at positions x at t + 1, by components [m]."""
+        return sum_elements(self.elements(x, problem, data), x)
+
+    def remainder(self, problem: FrameProblem) -> Callable[[Vector3, Any], Float[Array, ""]] | None:
+        """Return the part of the energy that the blocks of `corner_energies` leave out; None where nothing is."""
+        if self.on is not None:
+            return None
+        return lambda x, data: self.energy(x, problem, data)
+
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"] | float:
+        """Return an estimate of the energy's curvature per vertex [N/m], along a direction in the mean."""
+        return 0.0
+
+    def describe(self, garment: Garment) -> str:
+        """Return a few words on what it models (host)."""
+        sizes = {
+            "faces": garment.rest_areas,
+            "hinges": garment.hinge_rest_areas,
+            "vertices": garment.vertex_mask,
+        }
+        return "" if self.on is None else f"{int(np.sum(np.asarray(sizes[self.on]) > 0))} {self.on}"
+
+
+def mesh_corners(
+    on: str | None, x: Vector3, garment: Garment
+) -> tuple[tuple[Vector3, ...], Int[Array, "elements corners"]]:
+    """Return the positions of the corners of faces, hinges or vertices, and the vertices that these are."""
+    if on == "faces":
+        return gather_corners(x, garment.faces, garment.face_incidence), garment.faces
+    if on == "hinges":
+        return gather_corners(x, garment.hinges, garment.hinge_incidence), garment.hinges
+    return (x,), jnp.arange(x[0].shape[0], dtype=jnp.int32)[:, None]
+
+
+def sum_elements(parts: tuple[Elements, ...], x: Vector3) -> Float[Array, ""]:
+    """Return the sum of the energies of elements [J], in the precision of x."""
+    return sum((jnp.sum(part.energies) for part in parts), jnp.zeros((), x[0].dtype))
+
+
+def vertex_shares(parts: tuple[Elements, ...], num_vertices: int) -> Float[Array, " vertices"]:
+    """Return energies [J] shared out over the vertices, those of an element evenly over its corners."""
+    return sum(
+        segment_sum(
+            jnp.broadcast_to((energies / vertices.shape[1])[:, None], vertices.shape).ravel(),
+            vertices.ravel(),
+            num_vertices,
+        )
+        for energies, vertices in parts
+    )  # type: ignore[return-value]
