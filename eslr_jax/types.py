@@ -249,13 +249,15 @@ class Scene:
     initial_state: ClothState
     body: SceneBody | None
     pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
+    terms: tuple[
+        Any, ...
+    ]  # `terms.term.Term`s, whose sum each frame minimises, see `scene.build.scene_terms`
     num_frames: int = struct.field(pytree_node=False)
     self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
     pieces: Int[Array, " vertices"] | None = (
         None  # self-contact between different pieces only; None: all cloth
     )
     ground: Float[Array, ""] | None = None  # height of a level ground [m]
-    terms: tuple[Any, ...] = ()  # `terms.term.Term`s, whose sum is minimised, see `scene.build.scene_terms`
     substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
 
 

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
+from flax import struct
 from known_answers.drape import hang
 from other_bodies import child
 from PIL import Image
@@ -48,6 +47,8 @@ from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_s
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.simulate import last_frames, simulate
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.term import Term
 
 RESULTS = Path(__file__).parent / "results"
 COPIED = {
@@ -226,16 +227,24 @@ def fabrics(frames: int) -> np.ndarray:
 
 def extend(frames: int) -> np.ndarray:
     """A T-shirt without and with the guide's own energy."""
-    blown = shoot(("tshirt",), frames, energies=(Partial(_push, _WIND),))
-    still = shoot(("tshirt",), frames, energies=(Partial(_push, 0.0),))
+    blown = shoot(("tshirt",), frames, terms=(Push(_WIND),))
+    still = shoot(("tshirt",), frames, terms=(Push(0.0),))
     pictures = [figures(shot, [frames - 1], camera=0.0)[0] for shot in (still, blown)]
     return side_by_side(pictures, ("0 N/m2", f"{_WIND:g} N/m2"))
 
 
-def _push(pressure: Any, position: Any, problem: Any) -> Any:
-    """Return the energy [J] of a steady wind along x."""
-    moved = position[:, 0] - problem.position[:, 0]
-    return -pressure * jnp.sum(problem.garment.vertex_areas * moved)
+@struct.dataclass
+class Push(Term):
+    """The guide's own energy: a steady wind along x."""
+
+    name = "push"
+    on = "vertices"
+
+    pressure: float  # [N/m^2]
+
+    def corner_energies(self, corners: tuple, problem: FrameProblem, data: None) -> jax.Array:
+        """Return the energy of every vertex [J]."""
+        return -self.pressure * problem.garment.vertex_areas * (corners[0][0] - problem.position[:, 0])
 
 
 def report(frames: int) -> np.ndarray:

@@ -49,10 +49,10 @@ from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import Stiffness, stiffness_inverse, stretched_stiffness
-from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import Garment
 
 RESULTS = Path(__file__).parent / "results"

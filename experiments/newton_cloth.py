@@ -37,8 +37,7 @@ from jaxtyping import Float, Int
 from eslr_jax.errors import EslrError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.extras import require
-from eslr_jax.terms.problem import vertex_masses
-from eslr_jax.terms.problem import contact_thickness
+from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other

@@ -33,7 +33,8 @@ from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import Air, Scene
+from eslr_jax.terms.air import Air
+from eslr_jax.types import Scene
 
 RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"

@@ -47,11 +47,11 @@ from eslr_jax.physics.preconditioner import (
     stiffness,
     stretched_stiffness,
 )
-from eslr_jax.terms.problem import FrameProblem, push_out, pushed_out_guess
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.problem import FrameProblem, push_out, pushed_out_guess
 from eslr_jax.types import ClothState, Scene
 
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -9,10 +9,10 @@ from eslr_jax.assets import prepare_stored
 from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import beyond_training, garment_material, parse_fabric
 from eslr_jax.numerics import gather_corners
-from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.physics.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
-from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains
 from eslr_jax.physics.validate import validate_material
+from eslr_jax.terms.problem import vertex_masses
+from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains
 
 
 @pytest.fixture(scope="module")

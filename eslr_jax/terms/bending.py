@@ -137,6 +137,13 @@ def _corner_angles_jvp(primals, tangents):
     return _corner_angles(*primals), change
 
 
+def bending_energy(
+    position: Float[Array, "vertices 3"] | Vector3, garment: Garment, material: Material
+) -> Float[Array, ""]:
+    """Return the bending energy [J], the sum of `angle_energies` at positions [m], shape [vertices, 3]."""
+    return jnp.sum(angle_energies(dihedral_angles(position, garment)[0], garment, material))
+
+
 def hinge_energies(
     corners: tuple[Vector3, ...],
     garment: Garment,

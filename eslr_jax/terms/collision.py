@@ -58,16 +58,13 @@ class SkinCollision(Term):
     def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
         """Return stiffness a_p max(thickness - d_p, 0)^3 of places p of the body under the cloth [J]."""
         skin, constants = _skin(problem), problem.constants
-        depth = skin_depths(x, skin, constants.collision_thickness)
-        (areas,) = in_memory(constants.collision_stiffness * skin.areas)
-        return (Elements(areas * depth * depth * depth, skin.corners),)
+        distances = constants.collision_stiffness, constants.collision_thickness
+        return (Elements(skin_energies(x, skin, *distances), skin.corners),)
 
     def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
         """Return a third of the curvature along the normal [N/m]."""
         skin, constants = _skin(problem), problem.constants
-        depth = skin_depths(x, skin, constants.collision_thickness)
-        values = skin.weights**2 * (2.0 * constants.collision_stiffness * skin.areas * depth)[:, None]
-        return segment_sum(values.T.ravel(), skin.corners.T.ravel(), x[0].shape[0])
+        return skin_diagonal(x, skin, constants.collision_stiffness, constants.collision_thickness)
 
     def describe(self, garment: Garment) -> str:
         """Return what touches what."""
@@ -117,6 +114,41 @@ def skin_depths(
 ) -> Float[Array, " rows"]:
     """Return max(thickness - d, 0) [m], d the height of the cloth's face over the skin; zero where far."""
     return jnp.where(skin.is_near, jnp.maximum(thickness - skin_heights(position, skin), 0.0), 0.0)
+
+
+def skin_energies(
+    position: Float[Array, "vertices 3"] | Vector3,
+    skin: SkinContacts,
+    stiffness: Float[Array, ""] | float,
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, " rows"]:
+    """Return stiffness a_p max(thickness - d_p, 0)^3 of every place p of the body under the cloth [J].
+
+    Args:
+        position: Vertex positions at t + 1 [m].
+        skin: Places of the body, the places of the cloth over them, and the areas a_p.
+        stiffness: [J/m^5].
+        thickness: Distance kept from the body [m].
+
+    Source: the barrier is `collision_energies`'.
+    """
+    depth = skin_depths(position, skin, thickness)
+    (areas,) = in_memory(stiffness * skin.areas)
+    return areas * depth * depth * depth
+
+
+def skin_diagonal(
+    position: Float[Array, "vertices 3"] | Vector3,
+    skin: SkinContacts,
+    stiffness: Float[Array, ""] | float,
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, " vertices"]:
+    """Return an estimate of the curvature per vertex [N/m], a third of that along the normal."""
+    values = (
+        skin.weights**2 * (2.0 * stiffness * skin.areas * skin_depths(position, skin, thickness))[:, None]
+    )
+    num_vertices = components(position)[0].shape[0]
+    return segment_sum(values.T.ravel(), skin.corners.T.ravel(), num_vertices)
 
 
 def contact_forces(

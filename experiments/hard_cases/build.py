@@ -15,7 +15,7 @@ from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
 from eslr_jax.physics.materials import COTTON, constants_for
-from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.build import initial_state, scene_terms
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, SceneBody
 
 FRAME = 1.0 / 30.0  # [s]
@@ -245,6 +245,7 @@ def make_scene(
         initial_state=initial_state(position, jnp.zeros_like(position)),
         body=obstacle,
         pin_targets=pins,
+        terms=scene_terms(obstacle, has_ground=False, has_layers=self_contact),
         num_frames=num_frames,
         self_contact=starting_capacity(len(start)) if self_contact else None,
     )

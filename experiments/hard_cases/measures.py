@@ -11,14 +11,15 @@ from jaxtyping import Array, Float
 
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.referee import judge
-from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.guess import initial_guess
-from eslr_jax.terms.problem import vertex_masses
-from eslr_jax.terms.stretch import principal_stretches, stretch_energy
 from eslr_jax.physics.potential import potential
-from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_problem
+from eslr_jax.terms.bending import Bending, bending_energy
+from eslr_jax.terms.gravity import Gravity
+from eslr_jax.terms.inertia import Inertia
+from eslr_jax.terms.problem import FrameProblem, pin, vertex_masses, with_terms
+from eslr_jax.terms.stretch import Stretch, principal_stretches, stretch_energy
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Run
 from hard_cases.colliders import triangle_distances
@@ -148,6 +149,7 @@ def settle(
         inertial_guess=position,
         pin_targets=pin_targets,
     )
+    problem = with_terms(problem, (Stretch(), Bending(), Inertia(), Gravity()))
     start = Start(position, jnp.float32(0.0))
     return pin(problem, solve(problem, start, iterations=_SETTLE_ITERATIONS, memory=16).position)
 

@@ -55,7 +55,7 @@ def losses(
     moved = scene.replace(material=stiffer, body=body.replace(positions=body.positions + shift))
     trajectory = rollout_scene(None, moved, config, iterations)
     return jnp.stack(
-        [jnp.mean(trajectory.positions[-1, :, 0]), jnp.sum(trajectory.terms.stretch)]
+        [jnp.mean(trajectory.positions[-1, :, 0]), jnp.sum(trajectory.energies["stretch"])]
     ), trajectory
 
 

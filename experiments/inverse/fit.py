@@ -23,11 +23,11 @@ from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.render.pictures import render_frame
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Body, Scene
 
 BAR = 1.08  # largest principal stretch

@@ -18,7 +18,7 @@ from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state
+from eslr_jax.scene.build import initial_state, scene_terms
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene
 
 RESULTS = Path(__file__).parent.parent / "results" / "inverse"
@@ -63,6 +63,7 @@ def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) 
         initial_state=initial_state(rest, jnp.zeros_like(rest)),
         body=None,
         pin_targets=rest + shift,
+        terms=scene_terms(None, has_ground=False, has_layers=False),
         num_frames=shift.shape[0],
     )
 

@@ -64,7 +64,7 @@ def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
         if is_detached:
             state = jax.lax.stop_gradient(state)
         state, report = step(frame_problem(scene, state, inputs), state)
-        return state, sum(report.terms)
+        return state, sum(report.energies.values())
 
     return jax.lax.scan(advance, scene.initial_state, frame_inputs(scene))[1]
 
@@ -113,7 +113,7 @@ def judge(params, scene: Scene, solved: jax.Array) -> dict:
     return {
         "rms_mm": np.round(1e3 * np.asarray(apart, float), 3),
         "gap_mj": round(float(jnp.median(gap.reached - gap.optimum)) * 1e3, 4),
-        "stretch_mj": round(float(jnp.mean(trajectory.terms.stretch)) * 1e3, 4),
+        "stretch_mj": round(float(jnp.mean(trajectory.energies["stretch"])) * 1e3, 4),
     }
 
 

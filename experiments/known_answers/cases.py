@@ -8,21 +8,24 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from hard_cases import Simulator
 from hard_cases.build import icosphere, make_cloth, make_scene, plane, sheet
-from jax.tree_util import Partial
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 from eslr_jax.config import SimConfig
 from eslr_jax.fabric import Described, on_threads
 from eslr_jax.geometry.weave import warp_directions
+from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.physics import hessian
-from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.physics.materials import COTTON, Weave, stretch_stiffness
-from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Air, Garment, Material, PhysicsConstants, Scene, Trajectory
+from eslr_jax.terms.air import Air
+from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
+from eslr_jax.terms.stretch import stretch_energy
+from eslr_jax.terms.term import Term
+from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, Trajectory
 from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 from known_answers.strip import LENGTH, kept_in, strip
 
@@ -71,7 +74,7 @@ def terminal_velocity(simulator: Simulator) -> list[Answer]:
     """A level strip that falls in air until its weight is its drag."""
     air = Air(jnp.zeros(3))
     known = float(np.sqrt(2 * float(COTTON.density) * GRAVITY / (air.density * air.normal_drag)))
-    scene = strip("euler", frames=40, is_pinned=False, tilt=np.pi / 2, air=air)
+    scene = strip("euler", air, frames=40, is_pinned=False, tilt=np.pi / 2)
     fall = -float(_simulate(simulator, scene).velocities[-1, :, 1].mean())
     return [Answer("terminal velocity", simulator.name, "m/s", fall, known, 0.005)]
 
@@ -117,8 +120,7 @@ def buckling(simulator: Simulator) -> list[Answer]:
     start[:, 1] += 0.02 * np.sin(np.pi * positions[:, 0] / length)
     weightless = PhysicsConstants(gravity=1e-3)
     scene = make_scene(garment, start, 121, timestep=0.1, material=material, constants=weightless)
-    brake = Partial(_brake, jnp.float32(2.0))
-    end = _simulate(simulator, scene.replace(energies=(brake,))).positions[-1]
+    end = _simulate(simulator, scene.replace(terms=(*scene.terms, Brake(2.0)))).positions[-1]
 
     def elastic(position):
         return bending_energy(position, garment, material) + stretch_energy(position, garment, material)
@@ -210,15 +212,14 @@ def sphere(simulator: Simulator) -> list[Answer]:
     count = 17
     mesh = sheet(count, count, (0.4, 0.4))
     garment, ball = make_cloth(mesh, {}), icosphere(3, 0.1)
-    brake = Partial(_brake, jnp.float32(2.0))
     scene = make_scene(
         garment,
         mesh[0] + [0, 0.105, 0],
         121,
         body=ball,
         constants=PhysicsConstants(friction_coefficient=0.1),
-    ).replace(energies=(brake,))
-    trajectory = _simulate(simulator, scene)
+    )
+    trajectory = _simulate(simulator, scene.replace(terms=(*scene.terms, Brake(2.0))))
     last, loads = np.asarray(trajectory.positions[-1]), np.asarray(trajectory.friction_loads[-1])
     upward = last[:, 1] / np.linalg.norm(last, axis=1)
     weight = float(COTTON.density) * GRAVITY * 0.16
@@ -235,10 +236,19 @@ def _solve(scene: Scene) -> Trajectory:
     return rollout_scene(None, scene, SimConfig(iterations=_ITERATIONS))
 
 
-def _brake(rate, position, problem):
-    """Slow every vertex down at a rate [1/s], so that the sheet comes to rest."""
-    moved = position - problem.position
-    return 0.5 * rate / problem.timestep * jnp.sum(problem.masses[:, None] * moved * moved)
+@struct.dataclass
+class Brake(Term):
+    """Slows every vertex down, so that a sheet comes to rest."""
+
+    name = "brake"
+    on = "vertices"
+
+    rate: float  # [1/s]
+
+    def corner_energies(self, corners, problem, data):
+        """Return the energy of every vertex [J]."""
+        moved = sub3(corners[0], components(problem.position))
+        return 0.5 * self.rate / problem.timestep * problem.masses * dot3(moved, moved)
 
 
 OURS = tuple(Simulator(name, _solve, integrator=name) for name in ("euler", "bdf2"))

@@ -7,15 +7,18 @@ import numpy as np
 from eslr_jax.config import SimConfig
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state, start_integrator
+from eslr_jax.scene.build import initial_state, scene_terms, start_integrator
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import PhysicsConstants, Scene
 
 LENGTH = 0.5  # [m]
 
 
-def strip(integrator="euler", *, frames, is_pinned, timestep=1 / 30, tilt=0.35, **modelled):
-    """A strip that is released at an angle [rad] from the vertical; pinned at its upper end, or nowhere."""
+def strip(integrator="euler", *terms, frames, is_pinned, timestep=1 / 30, tilt=0.35, gravity=9.81):
+    """A strip that is released at an angle [rad] from the vertical; pinned at its upper end, or nowhere.
+
+    Terms beyond those of every scene, such as air, are given after the integrator.
+    """
     x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
     index = np.arange(22).reshape(2, 11)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
@@ -31,11 +34,12 @@ def strip(integrator="euler", *, frames, is_pinned, timestep=1 / 30, tilt=0.35, 
     return Scene(
         garment=garment,
         material=COTTON,
-        **{"constants": PhysicsConstants(), **modelled},
+        constants=PhysicsConstants(gravity=gravity),
         initial_state=start_integrator(initial_state(start, jnp.zeros_like(start)), integrator),
         timestep=dt,
         body=None,
         pin_targets=jnp.broadcast_to(start, (frames, *start.shape)) if is_pinned else None,
+        terms=(*scene_terms(None, has_ground=False, has_layers=False), *terms),
         num_frames=frames,
     )
 

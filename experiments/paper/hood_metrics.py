@@ -17,7 +17,7 @@ from eslr_jax.terms.hood import (
     HoodProblem,
     hood_terms,
 )
-from eslr_jax.types import PotentialTerms, Scene
+from eslr_jax.types import Scene
 
 _ORIGIN = np.zeros(3, np.float32)
 
@@ -30,7 +30,7 @@ def hood_metrics(
     origin: Float[np.ndarray, " 3"] = _ORIGIN,
     parameters: HoodParameters = METRIC_PARAMETERS,
     criterion: Criterion = "metric",
-) -> PotentialTerms:
+) -> dict[str, Float[Array, " frames"]]:
     """Return the terms [J] of every frame from the third on, each with the two frames before it: [frames - 2].
 
     The paper's Total is the mean over frames of the sum of the terms. Its collision column most likely uses the

@@ -233,8 +233,9 @@ def _loss_and_gradient(
 
         def loss(position):
             terms = potential_terms(position, problem)
-            inertia = 0.0 if network.system == "pbns" else jnp.where(is_last, terms.inertia, 0.0)
-            return (terms.stretch + terms.bending + terms.gravity + terms.collision + inertia) / _UNIT
+            inertia = 0.0 if network.system == "pbns" else jnp.where(is_last, terms["inertia"], 0.0)
+            still = sum(terms[name] for name in ("stretch", "bending", "gravity", "collision"))
+            return (still + inertia) / _UNIT
 
         return jax.value_and_grad(loss)(position)
 

@@ -27,10 +27,10 @@ from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajector
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
-from eslr_jax.terms.hood import HoodParameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.hood import HoodParameters
 from eslr_jax.types import Scene, Trajectory
 
 RESULTS = Path(__file__).parents[1] / "results" / "paper"
@@ -236,7 +236,7 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     found = hood_metrics(
         trajectory.positions, scene, origin=origin, parameters=HoodParameters(), criterion="postcvpr"
     )
-    terms = {name: float(np.mean(getattr(found, name))) for name in TERMS}
+    terms = {name: float(np.mean(found[name])) for name in TERMS}
     frames = measure_frames(trajectory.positions, scene)
     return {**terms, "total": sum(terms.values()), **extremes(frames, np.asarray(scene.garment.vertex_mask))}
 

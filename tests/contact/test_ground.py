@@ -46,7 +46,7 @@ def test_a_falling_sheet_rests_on_the_ground_at_contact_thickness():
     assert heights.min() > FLOOR
     np.testing.assert_allclose(heights[-1], resting_height(scene), atol=2e-5)
     assert np.abs(np.asarray(trajectory.velocities[-1])).max() < 1e-3
-    assert float(trajectory.terms.collision[-1]) > 0
+    assert float(trajectory.energies["collision"][-1]) > 0
 
 
 def test_friction_stops_a_sliding_sheet_after_its_known_way():

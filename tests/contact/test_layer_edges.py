@@ -8,7 +8,7 @@ from cloth import make_garment
 
 from eslr_jax.contact.layer_edges import with_edges
 from eslr_jax.contact.self_contact import find_self_contacts
-from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
+from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energies
 from eslr_jax.types import PairCapacity, tree_cast
 
 HALF = 0.03  # [m] of a ridge along x, and of a valley along z over it
@@ -58,7 +58,7 @@ def test_folds_that_have_passed_through_each_other_are_asked_back():
     (row,) = crossing(edges)
     heights, _ = pair_heights(position, edges)
     np.testing.assert_allclose(heights[row], -0.001, atol=1e-6)
-    force = -jax.grad(lambda x: repulsion_energy(x, edges, STIFFNESS, THICKNESS))(position)
+    force = -jax.grad(lambda x: repulsion_energies(x, edges, STIFFNESS, THICKNESS).sum())(position)
     assert np.all(np.asarray(force)[4:6, 1] > 0)
     assert np.all(np.asarray(force)[:2, 1] < 0)
     apart = push_apart(position, edges, THICKNESS)
@@ -85,7 +85,7 @@ def test_gradient_equals_central_differences_and_has_no_resultant_and_no_moment(
         )
 
         def energy(x):
-            return repulsion_energy(x, edges, STIFFNESS, 0.01)
+            return repulsion_energies(x, edges, STIFFNESS, 0.01).sum()
 
         gradient = np.asarray(jax.grad(energy)(x))
         step = 1e-6
@@ -104,8 +104,8 @@ def test_energy_is_finite_on_cloth_without_extent():
     garment, position = layers(0.001)
     for x in (jnp.zeros_like(position), position * jnp.array([[1.0, 0.0, 0.0]])):
         edges = edges_of(x, garment)
-        value, gradient = jax.value_and_grad(lambda x, e=edges: repulsion_energy(x, e, STIFFNESS, THICKNESS))(
-            x
-        )
+        value, gradient = jax.value_and_grad(
+            lambda x, e=edges: repulsion_energies(x, e, STIFFNESS, THICKNESS).sum()
+        )(x)
         assert np.isfinite(value)
         assert np.isfinite(gradient).all()

@@ -12,14 +12,14 @@ from eslr_jax.contact.self_contact import TipPairs
 from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energy
+from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energies
 from eslr_jax.types import PairCapacity, tree_cast
 
 NEAR, RADIUS, COSINE = 0.02, 0.04, 0.8
 STIFFNESS, THICKNESS = 3.5e7, 3e-3
 AMPLE = PairCapacity(pairs=8000)
 find_self_contacts = jax.jit(self_contact.find_self_contacts, static_argnames="capacity")
-repulsion = jax.jit(jax.value_and_grad(repulsion_energy))
+repulsion = jax.jit(jax.value_and_grad(lambda *given: repulsion_energies(*given).sum()))
 push = jax.jit(push_apart)
 
 
@@ -237,7 +237,7 @@ def test_gradient_equals_central_differences_and_closed_form():
         garment, position, contacts = pair_of(0.001, dtype=jnp.float64)
 
         def energy(x):
-            return repulsion_energy(x, contacts, STIFFNESS, THICKNESS)
+            return repulsion_energies(x, contacts, STIFFNESS, THICKNESS).sum()
 
         gradient = np.asarray(jax.grad(energy)(position))
         step = 1e-6

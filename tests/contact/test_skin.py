@@ -13,10 +13,10 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.terms.collision import skin_diagonal, skin_energy
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.collision import skin_diagonal, skin_energies
 
 STIFFNESS, THICKNESS = 3.5e7, 2e-3  # [J/m^5], [m]
 
@@ -100,7 +100,7 @@ def test_energy_pushes_the_faces_off_and_needs_no_other_force(contacts):
     assert float(jnp.min(jnp.where(skin.is_near, skin_heights(pressed, skin), 1.0))) < THICKNESS
 
     def energy(x):
-        return skin_energy(x, skin, STIFFNESS, THICKNESS)
+        return skin_energies(x, skin, STIFFNESS, THICKNESS).sum()
 
     gradient = jax.grad(energy)(pressed)
     direction = gradient / jnp.linalg.norm(gradient)
@@ -124,7 +124,9 @@ def test_a_place_stands_for_the_coarser_of_both_meshes(contacts):
     coarse = find_skin_contacts((position,) * 2, (body,) * 2, nearest, surface, scene.garment)
     assert float(jnp.min(coarse.areas)) >= 2.0 * cloth
     pressed = position - jnp.array([[0.0, 0.003, 0.0]])
-    heavier, own = (float(skin_energy(pressed, rows, STIFFNESS, THICKNESS)) for rows in (coarse, skin))
+    heavier, own = (
+        float(skin_energies(pressed, rows, STIFFNESS, THICKNESS).sum()) for rows in (coarse, skin)
+    )
     assert heavier > 2.0 * own > 0
 
 

@@ -34,8 +34,8 @@ def test_what_positions_alone_tell_is_what_the_simulation_said(task):
     speed = np.abs(np.asarray(own.velocities)).max()
     np.testing.assert_allclose(told.velocities, own.velocities, atol=2e-4 * speed)
     np.testing.assert_allclose(told.friction_loads, own.friction_loads, atol=1e-4)
-    for name, values in told.terms._asdict().items():
-        np.testing.assert_allclose(values, getattr(own.terms, name), rtol=2e-2, atol=1e-7, err_msg=name)
+    for name, values in told.energies.items():
+        np.testing.assert_allclose(values, own.energies[name], rtol=2e-2, atol=1e-7, err_msg=name)
     np.testing.assert_allclose(told.residuals[2:], own.residuals[2:], rtol=0.5, atol=5e-3)
 
 
@@ -96,7 +96,7 @@ def test_what_is_no_trajectory_of_the_scene_is_refused(small_scene, small_trajec
 def test_a_trajectory_is_plain_arrays_by_name(tmp_path, small_trajectory):
     arrays = small_trajectory.to_dict()
     assert {type(array) for array in arrays.values()} == {np.ndarray}
-    np.testing.assert_array_equal(arrays["stretch_energy"], small_trajectory.terms.stretch)
+    np.testing.assert_array_equal(arrays["stretch_energy"], small_trajectory.energies["stretch"])
     np.testing.assert_array_equal(arrays["positions"], small_trajectory.positions)
     assert "terms" not in arrays
     assert "pair_demand" not in arrays  # no self-contact

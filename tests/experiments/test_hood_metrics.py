@@ -8,10 +8,10 @@ from hood_metrics import hood_metrics
 
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
-from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
+from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
+from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.types import PhysicsConstants, Scene, SceneBody
 
 TIMESTEP = 1 / 30
@@ -51,6 +51,7 @@ def worn():
         initial_state=initial_state(positions[0], jnp.zeros_like(positions[0])),
         body=SceneBody(surface, body),
         pin_targets=None,
+        terms=(),
         num_frames=FRAMES,
     )
     return positions, scene

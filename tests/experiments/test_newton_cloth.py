@@ -20,11 +20,11 @@ from newton_cloth import (
 )
 
 from eslr_jax.config import SimConfig
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.collision import contact_forces
-from eslr_jax.physics.materials import COTTON
 from eslr_jax.terms.problem import contact_thickness
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Contacts
 
 SOLVERS = [Setting("vbd", 2, 10), Setting("style3d", 2, 10), Setting("xpbd", None, 1)]

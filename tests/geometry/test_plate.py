@@ -12,8 +12,8 @@ from eslr_jax.geometry.plate import prepare_plate, rest_corners
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
-from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 
 RIGIDITY = 2e-5  # [N m]
 

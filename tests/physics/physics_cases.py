@@ -12,7 +12,13 @@ from cloth import make_garment, make_sheet
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.terms.problem import BodyContact, FrameProblem
+from eslr_jax.terms.bending import Bending
+from eslr_jax.terms.collision import Collision
+from eslr_jax.terms.friction import Friction
+from eslr_jax.terms.gravity import Gravity
+from eslr_jax.terms.inertia import Inertia
+from eslr_jax.terms.problem import BodyContact, FrameProblem, with_terms
+from eslr_jax.terms.stretch import Stretch
 from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
 
 TIMESTEP = 1 / 30
@@ -105,6 +111,7 @@ def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
         ),
         pin_targets=None if is_pinned is None else start + 0.01,
     )
+    problem = with_terms(problem, (Stretch(), Bending(), Inertia(), Gravity(), Collision(), Friction()))
     return to_numpy(Case(problem, start + BODY_MOTION + noise(0.001, 3)), dtype)
 
 

@@ -13,12 +13,12 @@ from scipy.optimize import brentq
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.terms.air import air_flow, blowing, gusts
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Air
+from eslr_jax.terms.air import Air, blowing, gusts
 
 GRAVITY = 9.81  # [m/s^2]
 WEIGHT = float(COTTON.density) * GRAVITY  # [N/m^2]
@@ -28,7 +28,7 @@ CONFIG = SimConfig(iterations=30)
 @pytest.mark.parametrize("integrator", ["euler", "bdf2"])
 def test_a_flat_strip_falls_as_fast_as_its_drag_lets_it(integrator):
     air = Air(jnp.zeros(3))
-    scene = strip(integrator, frames=40, is_pinned=False, tilt=np.pi / 2, air=air)
+    scene = strip(integrator, air, frames=40, is_pinned=False, tilt=np.pi / 2)
     # The quick tier's compiler options, and no others, make this gradient NaN on some processors (jaxlib 0.10.2).
     option = "xla_cpu_use_fusion_emitters"
     options = {option: True} if option in os.environ.get("XLA_FLAGS", "") else None
@@ -43,7 +43,7 @@ def test_a_wind_lifts_a_hanging_strip_to_the_angle_of_balance():
     air = Air(jnp.array([0.0, 0.0, speed]), tangential_drag=0.0)
     pressure = 0.5 * air.density * air.normal_drag * speed**2
     expected = brentq(lambda a: WEIGHT * np.sin(a) - pressure * np.cos(a) ** 2, 0.0, np.pi / 2)
-    scene = strip("euler", frames=121, is_pinned=True, tilt=expected + 0.1, air=air)
+    scene = strip("euler", air, frames=121, is_pinned=True, tilt=expected + 0.1)
     end = np.asarray(rollout_scene(None, scene, CONFIG).positions[-1]).reshape(2, 11, 3)
     along = (end[:, -1] - end[:, 0]).mean(axis=0)
     assert np.arctan2(along[2], -along[1]) == pytest.approx(expected, abs=0.01)
@@ -59,7 +59,7 @@ def test_gusts_have_the_mean_and_the_strength_asked_for():
 def test_a_function_blows_where_and_when_it_is_asked():
     scene = strip(frames=2, is_pinned=True)
     shear = Air(Partial(lambda rate, points, time: rate * time * points, jnp.float32(3.0)))
-    flow = air_flow(shear, scene.initial_state.position, scene.garment, jnp.float32(2.0))
+    flow = shear.prepare(first_problem(scene).replace(time=jnp.float32(2.0)))
     real = np.asarray(scene.garment.rest_areas) > 0
     corners = np.asarray(scene.initial_state.position)[np.asarray(scene.garment.faces)]
     np.testing.assert_allclose(flow.wind[real], 6.0 * corners.mean(axis=1)[real], rtol=1e-5, atol=1e-6)
@@ -70,8 +70,9 @@ def test_a_plain_function_is_a_wind():
     scene = prepare_scene(
         square(3, 0.1), drifting_ball(2), options=SceneOptions(air=Air(lambda points, time: 2.0 * points))
     )
-    assert len(jax.tree.leaves(scene.air)) == 3, "its numbers"
-    np.testing.assert_array_equal(scene.air.wind(jnp.ones((1, 3)), 0.0), 2.0)
+    air = scene.terms[-1]
+    assert len(jax.tree.leaves(air)) == 3, "its numbers"
+    np.testing.assert_array_equal(air.wind(jnp.ones((1, 3)), 0.0), 2.0)
     gusty = validate_air(blowing((3.0, 0.0, 0.0), 0.3))
     assert len(jax.tree.leaves(gusty)) > 3, "mean, strength and phases of gusts are traced"
 

@@ -10,7 +10,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.physics.validate import validate_damping
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import PhysicsConstants
+from eslr_jax.terms.damping import Damping
 
 
 def test_a_stretched_strip_loses_the_share_per_period_that_theory_says():
@@ -18,12 +18,12 @@ def test_a_stretched_strip_loses_the_share_per_period_that_theory_says():
     damping, timestep = 4e-3, 1e-3  # [s]
     scene = strip(
         "bdf2",
+        Damping(jnp.float32(damping)),
         frames=500,
         is_pinned=True,
         timestep=timestep,
         tilt=0.0,
-        damping=jnp.float32(damping),
-        constants=PhysicsConstants(gravity=0.01),
+        gravity=0.01,
     )
     rest = scene.garment.rest_positions
     pulled = rest.at[:, 1].add(-0.005 * jnp.sin(jnp.pi / 2 * -rest[:, 1] / LENGTH))  # the first mode

@@ -16,10 +16,10 @@ from eslr_jax.physics import lbfgs
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
-from eslr_jax.terms.problem import weight_norm
 from eslr_jax.physics.solve import lower_point
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms.problem import weight_norm
 
 
 def diagonal_of(values):

@@ -12,17 +12,17 @@ from physics_cases import make_case
 from eslr_jax.contact.layer_edges import LayerPairs
 from eslr_jax.contact.self_contact import TipPairs, default_capacity
 from eslr_jax.physics import hessian
-from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.physics.newton import minimize_newton, potential_float64
 from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.preconditioner import stiffness
-from eslr_jax.terms.problem import SelfContact
-from eslr_jax.terms.repulsion import pair_heights, repulsion_energy
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_problem
+from eslr_jax.terms.bending import bending_energy
+from eslr_jax.terms.problem import SelfContact
+from eslr_jax.terms.repulsion import pair_heights, repulsion_energies
+from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.types import PhysicsConstants, Scene
 
 
@@ -139,7 +139,11 @@ def test_blocks_of_layers_are_the_outer_product_of_the_gradient(case64):
     for row, block in enumerate(blocks):
         one = jax.tree.map(lambda leaf, row=row: leaf[row : row + 1] if leaf.ndim else leaf, pairs)
         with jax.enable_x64(True):
-            force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, one, stiffness, thickness))
+            force = np.asarray(
+                jax.jit(jax.grad(lambda *given: repulsion_energies(*given).sum()))(
+                    position, one, stiffness, thickness
+                )
+            )
             height = float(jax.jit(pair_heights)(position, one)[0][0])
         (table,) = hessian.pair_table(one, 4)
         slope = force[table].ravel()
@@ -177,7 +181,11 @@ def test_blocks_of_tips_are_the_outer_product_of_the_gradient(case64):
     """E = k a d^3: 6 k a d g g^T, and the energy's own gradient is -3 k a d^2 g. Unused rows give no block."""
     pairs, position, thickness = one_pair(case64), case64.position, 0.5  # [m]; any depth will do
     with jax.enable_x64(True):
-        force = np.asarray(jax.jit(jax.grad(repulsion_energy))(position, pairs, 3.5e7, thickness))
+        force = np.asarray(
+            jax.jit(jax.grad(lambda *given: repulsion_energies(*given).sum()))(
+                position, pairs, 3.5e7, thickness
+            )
+        )
         height = float(jax.jit(pair_heights)(position, pairs)[0][0])
     depth = thickness - height
     table = hessian.pair_table(pairs, 3)

@@ -16,7 +16,8 @@ from eslr_jax.physics.validate import (
     validate_material,
     validate_timestep,
 )
-from eslr_jax.types import Air, Material, PhysicsConstants
+from eslr_jax.terms.air import Air
+from eslr_jax.types import Material, PhysicsConstants
 
 
 def test_defaults_and_the_ends_of_the_training_ranges_are_accepted():

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.physics.potential import Point
 from eslr_jax.physics.subspace import combine_directions
+from eslr_jax.terms.stretch import stretch_energy
 
 
 @partial(jax.jit, static_argnums=0)

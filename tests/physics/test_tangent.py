@@ -16,7 +16,7 @@ from eslr_jax.physics.potential import potential
 from eslr_jax.physics.tangent import apply, inverse_diagonal, precondition, tangent
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.types import Air
+from eslr_jax.terms.air import Air
 
 
 class Crumpled(NamedTuple):

@@ -13,10 +13,8 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import Described, describe_fabric, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.physics import hessian
-from eslr_jax.terms.bending import bending_energy
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON, Weave
-from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.physics.newton import _plate_couples, minimize_newton, potential_float64, to_float64
 from eslr_jax.physics.potential import evaluate, potential
 from eslr_jax.physics.preconditioner import stiffness
@@ -24,6 +22,8 @@ from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.physics.tangent import apply, tangent
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import first_problem
+from eslr_jax.terms.bending import bending_energy
+from eslr_jax.terms.stretch import stretch_energy
 
 WARP, WEFT, COUPLING, SHEAR = 900.0, 200.0, 60.0, 25.0  # [N/m]
 STRETCH = jax.jit(jax.value_and_grad(stretch_energy))

@@ -22,7 +22,11 @@ from eslr_jax.physics.solve import Start, solve, solve_hessian
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout, rollout_scene
-from eslr_jax.types import Air, tree_cast
+from eslr_jax.terms.air import Air
+from eslr_jax.terms.collision import Collision
+from eslr_jax.terms.damping import Damping
+from eslr_jax.terms.friction import Friction
+from eslr_jax.types import tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends
 STEP = 1e-2  # of differences; positive numbers change by that share, places by ten micrometres
@@ -64,13 +68,15 @@ def grounded_scene(num_frames):
     velocity = start.velocity + jnp.array([[0.5, -0.1, 0.2]])
     ground = jnp.mean(start.position[:, 1]) - 4e-3
     start = start.replace(velocity=velocity)
-    return scene.replace(initial_state=start, ground=ground, pin_targets=None)
+    terms = (*scene.terms, Collision(), Friction())
+    return scene.replace(initial_state=start, ground=ground, terms=terms, pin_targets=None)
 
 
 def windy_scene(num_frames):
     """A hanging sheet of a fabric with damping, in the wind."""
     scene = small_scene(num_frames, has_body=False)
-    return wide(scene.replace(air=Air(wind=jnp.array([1.0, 0.2, 3.0])), damping=jnp.asarray(0.01)))
+    air = Air(wind=jnp.array([1.0, 0.2, 3.0]))
+    return wide(scene.replace(terms=(*scene.terms, air, Damping(jnp.asarray(0.01)))))
 
 
 def layered_scene(num_frames):
@@ -115,7 +121,7 @@ def directions(scene, seed=0):
         shapes["body"] = scene.body.positions.shape
     if scene.ground is not None:
         shapes["ground"] = ()
-    if scene.air is not None:
+    if any(term.name == "air" for term in scene.terms):
         shapes |= {"wind": (3,), "air_density": (), "normal_drag": (), "tangential_drag": (), "damping": ()}
     if scene.self_contact is not None:
         shapes |= dict.fromkeys(OF_LAYERS, ())
@@ -152,14 +158,15 @@ def changed(scene, change):
     if "ground" in change:
         scene = scene.replace(ground=scene.ground + 1e-3 * change["ground"])
     if "wind" in change:
-        air = scene.air
+        *others, air, damping = scene.terms
         air = air.replace(
             wind=air.wind + change["wind"],
             density=air.density * (1 + change["air_density"]),
             normal_drag=air.normal_drag * (1 + change["normal_drag"]),
             tangential_drag=air.tangential_drag * (1 + change["tangential_drag"]),
         )
-        scene = scene.replace(air=air, damping=scene.damping * (1 + change["damping"]))
+        damping = damping.replace(time=damping.time * (1 + change["damping"]))
+        scene = scene.replace(terms=(*others, air, damping))
     if "pins" in change:
         scene = scene.replace(pin_targets=scene.pin_targets + 1e-3 * change["pins"])
     return scene
@@ -172,7 +179,7 @@ def loss_by_frames(scene):
     def losses(change):
         trajectory = rollout_scene(None, changed(scene, change), TIGHT)
         places = jnp.sum(weights[None] * trajectory.positions, axis=(1, 2))
-        return (places + jnp.cumsum(trajectory.terms.stretch))[1:]
+        return (places + jnp.cumsum(trajectory.energies["stretch"]))[1:]
 
     return losses
 
@@ -373,7 +380,7 @@ def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshir
         )
         trajectory = rollout_scene(None, moved, SimConfig(iterations=3000))
         # Of the whole shirt: single vertices in a fold leave the linear range at once.
-        return jnp.mean(trajectory.positions[-1, :, 0]) + jnp.sum(trajectory.terms.stretch)
+        return jnp.mean(trajectory.positions[-1, :, 0]) + jnp.sum(trajectory.energies["stretch"])
 
     zeros = dict.fromkeys(("fabric", "body", "rest"), jnp.zeros(()))
     gradient = jax.jit(jax.grad(loss))(zeros)

@@ -6,21 +6,40 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 from flax import linen as nn
-from jax.tree_util import Partial
+from flax import struct
 
 from eslr_jax import SceneOptions, SimConfig, plan_scene, prepare_scene, rollout, simulate
 from eslr_jax.errors import ConfigError, NonFiniteError
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.simulation.frame import first_problem
+from eslr_jax.terms.term import Term
 
 DENSITY = 0.20022  # [kg/m2] of cotton
 
 
-def wind_energy(pressure, position, problem):
-    """A steady push along x [J]."""
-    moved = position[:, 0] - problem.position[:, 0]
-    return -pressure * jnp.sum(problem.garment.vertex_areas * moved)
+@struct.dataclass
+class Push(Term):
+    """A steady push along x."""
+
+    name = "push"
+    on = "vertices"
+
+    pressure: float  # [N/m^2]
+
+    def corner_energies(self, corners, problem, data):
+        return -self.pressure * problem.garment.vertex_areas * (corners[0][0] - problem.position[:, 0])
+
+
+@struct.dataclass
+class Root(Term):
+    """An energy without a finite gradient."""
+
+    name = "root"
+    on = "vertices"
+
+    def corner_energies(self, corners, problem, data):
+        return jnp.sqrt(jnp.maximum(0.0 * corners[0][0], 0.0))
 
 
 class Nudge(nn.Module):
@@ -35,11 +54,11 @@ class Nudge(nn.Module):
 def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiated():
     garment, poses = square(), drifting_ball(4, speed=0.0)
 
-    options = SceneOptions(energies=(Partial(wind_energy, 1.0),), has_body=False)
+    options = SceneOptions(terms=(Push(1.0),), has_body=False)
     plan = plan_scene(garment, poses, options=options)
 
     def last(pressure):
-        windy = plan.replace(energies=(Partial(wind_energy, pressure),))
+        windy = plan.replace(terms=(Push(pressure),))
         trajectory = rollout(None, garment, poses, config=SimConfig(iterations=30), plan=windy)
         return trajectory.positions[-1, :, 0].mean(), trajectory
 
@@ -50,7 +69,7 @@ def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiate
     np.testing.assert_allclose(way - way[0], 5.0 * known, rtol=1e-3, atol=1e-6)
     assert float(slope) == pytest.approx(known[-1], rel=1e-2)
     scene = prepare_scene(garment, poses, options=SceneOptions(has_body=False))
-    own = trajectory_report(trajectory, scene)["terms"]["own"]
+    own = trajectory_report(trajectory, scene)["terms"]["push"]
     area = float(garment.vertex_areas.sum())
     assert own == pytest.approx(-5.0 * area * 5.0 * known[-1] / 3, rel=1e-3)
 
@@ -58,10 +77,7 @@ def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiate
 def test_an_own_energy_without_a_finite_gradient_is_refused():
     """The solver would stay at its guess, at positions that are finite."""
 
-    def root(position, problem):
-        return jnp.sqrt(jnp.sum(jnp.maximum(0.0 * position, 0.0)))
-
-    options = SceneOptions(energies=(root,), has_body=False)
+    options = SceneOptions(terms=(Root(),), has_body=False)
     scene = prepare_scene(square(), drifting_ball(3, speed=0.0), options=options)
     with pytest.raises(NonFiniteError, match="forces"):
         simulate(None, scene, config=SimConfig(iterations=5))

@@ -137,7 +137,7 @@ def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved
     trajectory = rollout_scene(None, scene, SOLVER)
     states, inputs = trajectory_states(trajectory, scene)
     found = reached_potentials(trajectory.positions[1:], states, inputs, scene)
-    np.testing.assert_allclose(sum(trajectory.terms)[1:], found, rtol=1e-4)
+    np.testing.assert_allclose(sum(trajectory.energies.values())[1:], found, rtol=1e-4)
     loads = find_friction_loads(trajectory.positions, trajectory.velocities, scene)
     np.testing.assert_allclose(loads, trajectory.friction_loads, rtol=1e-3, atol=1e-6)
     assert float(trajectory.friction_loads[-1].sum()) > 0.1 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"

@@ -12,7 +12,7 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import Air
+from eslr_jax.terms.air import Air
 
 GRAVITY = 9.81  # [m/s^2]
 FRAMES = 13

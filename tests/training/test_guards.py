@@ -20,7 +20,6 @@ from eslr_jax.training.loop import train, window_metrics
 from eslr_jax.training.loss import LossReport
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import _advance, _Horizon, init_train_state, make_train_step, slot_problem
-from eslr_jax.types import PotentialTerms
 
 
 @pytest.fixture(scope="module")
@@ -144,12 +143,11 @@ def advance(config, small_data):
     index = jnp.int32(0)
     slot = jax.jit(lambda key: start_trajectory(key, small_data, index, config))(jax.random.key(0))
     problem = jax.jit(lambda slot: slot_problem(slot, small_data, index, config))(slot)
-    terms = PotentialTerms(*jnp.zeros(len(PotentialTerms._fields)))
 
     @jax.jit
     def at(onward, frames, state):
         horizon = _Horizon(frames, config.reset_stretch, config.reset_displacement)
-        report = LossReport(onward, terms, jnp.float32(0.0))
+        report = LossReport(onward, {}, jnp.float32(0.0))
         return _advance(slot.replace(state=state), problem, report, small_data, horizon)
 
     return slot, lambda onward, frames, state=slot.state: at(
