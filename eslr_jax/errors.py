@@ -49,6 +49,7 @@ class Status(enum.IntFlag):
     TIP_OVERFLOW = 2
     SELF_CONTACT_OVERFLOW = 4
     BODY_TOO_FAST = 8
+    DERIVATIVE_REFUSED = 16
 
     def describe(self) -> str:
         """One line per set bit, with what to do about it."""
@@ -61,5 +62,7 @@ class Status(enum.IntFlag):
             "prepare the scene with a larger PairCapacity",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
             "slow the motion down, or pose it with more frames a second",
+            Status.DERIVATIVE_REFUSED: "the frame did not come to rest in a minimum, so its derivative is NaN; "
+            "give SimConfig more iterations, or a fabric that bends less",
         }
         return "; ".join(text for bit, text in texts.items() if bit in self)

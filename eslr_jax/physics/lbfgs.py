@@ -28,6 +28,7 @@ class Minimum(NamedTuple):
     gradient: Float[Array, "vertices 3"]  # [N]
     iterations: Int[Array, ""]
     gap_bound: Float[Array, ""]  # share of the initial gap that is left at most, see `Stop.tolerance`
+    status: Int[Array, ""] | int = 0  # errors.Status bits
 
 
 class Stop(NamedTuple):
@@ -40,6 +41,7 @@ class Stop(NamedTuple):
     # the frames (`_CAUTION`; experiments/speed.md).
     tolerance: Float[Array, ""] | float = 0.0
     reference: Float[Array, ""] | float = 0.0  # energy [J] from which the gain counts
+    force: Float[Array, ""] | float = 0.0  # norm of the gradient [N] at which to stop
 
 
 class _State(NamedTuple):
@@ -137,7 +139,7 @@ def minimize(
         return jnp.isfinite(state.value) & (most <= _rounding(state.value))
 
     def is_running(state: _State) -> Array:
-        is_above = product(state.gradient, state.gradient) > 0
+        is_above = product(state.gradient, state.gradient) > jnp.square(stop.force)
         is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
         is_far = is_far & ~((stop.tolerance > 0) & is_at_rest(state))
         is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
@@ -180,7 +182,8 @@ def minimize(
     share = _CAUTION * final.decrement / jnp.where(gain > 0, gain, 1.0)
     gap_bound = jnp.where(gain > 0, jnp.sqrt(share), jnp.inf)
     gap_bound = jnp.where(is_at_rest(final), 0.0, gap_bound)
-    return Minimum(_vectors(final.x), final.value, _vectors(final.gradient), final.iterations, gap_bound)
+    position, gradient = _vectors(final.x), _vectors(final.gradient)
+    return Minimum(position, final.value, gradient, final.iterations, gap_bound, jnp.int32(0))
 
 
 def unknown_point(position: Float[Array, "vertices 3"]) -> Point:

@@ -98,7 +98,7 @@ def make_stepper(
             gap_bound=minimum.gap_bound,
             pair_demand=None if problem.layers is None else problem.layers.pairs.count,
         )
-        return next_state(position, problem, state, status, residual), report
+        return next_state(position, problem, state, status | minimum.status, residual), report
 
     return step
 

@@ -57,7 +57,8 @@ def step(case64):
 @partial(jax.jit, static_argnames="criterion")
 def terms_and_gradients(position, problem, criterion):
     def stacked(position):
-        return jnp.stack(hood_terms(position, problem, criterion=criterion)[:6])
+        losses = hood_terms(position, problem, criterion=criterion)
+        return jnp.stack([losses[name] for name in TERMS])
 
     return stacked(position), jax.jacrev(stacked)(position)
 
