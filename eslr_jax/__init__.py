@@ -30,6 +30,7 @@ _PUBLIC = {
     "rollout": "eslr_jax.simulation.rollout",
     "score_trajectory": "eslr_jax.evaluation.score",
     "simulate": "eslr_jax.simulation.simulate",
+    "step": "eslr_jax.simulation.rollout",
     "simulate_batch": "eslr_jax.simulation.batch",
 }
 
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from eslr_jax.geometry.prepare import prepare_garment
     from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch
-    from eslr_jax.simulation.rollout import rollout
+    from eslr_jax.simulation.rollout import rollout, step
     from eslr_jax.simulation.simulate import simulate
     from eslr_jax.types import Material, PhysicsConstants, Trajectory
 

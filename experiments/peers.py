@@ -207,7 +207,7 @@ def measure_scene(
         covered = scene.replace(body=scene.body.replace(has_skin=True))
         methods += [our_method(covered, *effort, "ours, skin covered") for effort in covering]
     methods += newton_methods(scene, settings)
-    truth = rollout_scene(None, scene, SimConfig())
+    truth = rollout_scene(None, scene, SimConfig(iterations=500))
     positions, wall, processor = take_turns(methods, scene, scene.num_frames)
     gap, initial = teach(methods, scene, truth, every)
     rows = [
@@ -266,7 +266,7 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
     methods += [newton_methods(scene, settings) for scene in scenes[1:]]
     _, wall, _ = take_turns(methods[0], scenes[0], min(TIMED_FRAMES, scenes[0].num_frames))
     for scene, of_scene in zip(scenes, methods, strict=True):
-        truth = rollout_scene(None, scene, SimConfig())
+        truth = rollout_scene(None, scene, SimConfig(iterations=500))
         gap, initial = teach(of_scene, scene, truth, EVERY)
         relative.append([np.maximum(values, 0.0) / initial for values in gap])
     points: dict[str, list[dict[str, Any]]] = {}

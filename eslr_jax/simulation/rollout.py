@@ -128,6 +128,36 @@ def scan_frames(
     return jax.lax.scan(advance, state, inputs, length=None if has_tracks else scene.num_frames - 1)
 
 
+def step(
+    params: Any,
+    scene: Scene,
+    state: ClothState,
+    frame: Int[Array, ""] | int,
+    *,
+    config: SimConfig | None = None,
+) -> tuple[ClothState, FrameReport]:
+    """Simulate one frame of a scene; pure, as `rollout`, which repeats it.
+
+    Args:
+        params: Weights of the network, of `load_model`; None without one.
+        scene: Of `prepare_scene`.
+        state: Cloth at that frame; `scene.initial_state` at the first one.
+        frame: Frame of the scene's motion at which the cloth is; the body moves from it to the next one.
+        config: Network, iterations and tolerance; the solver alone by default.
+
+    Returns:
+        The cloth at the next frame, and how the frame went.
+
+    Raises:
+        ConfigError: A network is asked for without weights.
+        CheckpointError: The weights are for another architecture.
+    """
+    config = config or SimConfig()
+    check_network(params, config)
+    moving = jax.tree.map(lambda leaf: leaf[frame], frame_inputs(scene))
+    return step_frame(make_stepper(params, config), scene, state, moving)
+
+
 def step_frame(
     stepper: Stepper, scene: Scene, state: ClothState, frame: FrameInput
 ) -> tuple[ClothState, FrameReport]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import CapacityError, EslrError, MotionError, NonFiniteError, Status
+from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
 from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
@@ -330,6 +330,7 @@ def raise_for_status(trajectory: Trajectory, *, settle: int = 0) -> None:
         NonFiniteError: Positions became NaN or infinite.
         CapacityError: A buffer was too small.
         MotionError: The body moved too fast to follow.
+        ConfigError: A frame that was differentiated did not come to rest.
     """
     status = Status(int(jax.device_get(trajectory.status)))
     if status == Status.OK:
@@ -344,4 +345,6 @@ def raise_for_status(trajectory: Trajectory, *, settle: int = 0) -> None:
         error = NonFiniteError
     elif Status.BODY_TOO_FAST in status:
         error = MotionError
+    elif Status.DERIVATIVE_REFUSED in status:
+        error = ConfigError
     raise error(message)

@@ -20,6 +20,8 @@ STIFFNESS, THICKNESS = 3.5e7, 3e-3
 
 def energy(position, edges, thickness):
     return repulsion_energies(position, edges, STIFFNESS, thickness).sum()
+
+
 SIXTEEN = PairCapacity(pairs=16)
 
 

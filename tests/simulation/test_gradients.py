@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
+from flax import struct
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
+from eslr_jax.errors import ConfigError, Status
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
@@ -22,10 +24,12 @@ from eslr_jax.physics.solve import Start, solve, solve_hessian
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout, rollout_scene
+from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.terms.air import Air
 from eslr_jax.terms.collision import Collision
 from eslr_jax.terms.damping import Damping
 from eslr_jax.terms.friction import Friction
+from eslr_jax.terms.term import Term
 from eslr_jax.types import tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends
@@ -292,6 +296,36 @@ def test_a_gradient_is_refused_where_the_linear_system_stalls(is_stalled, monkey
     assert np.isnan(gradient) if is_stalled else np.isfinite(gradient)
 
 
+@struct.dataclass
+class Kink(Term):
+    """Pulls every vertex to where it was, as hard from near as from far: no point has a force of zero."""
+
+    name = "kink"
+    on = "vertices"
+
+    def corner_energies(self, corners, problem, data):
+        return sum(jnp.abs(part - was) for part, was in zip(corners[0], problem.position.T, strict=True))
+
+
+@pytest.mark.parametrize("terms", [(), (Kink(),)], ids=["rests", "kinks"])
+def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so(terms):
+    scene = small_scene(3, has_body=False, terms=terms)
+
+    @jax.jit
+    def height(density):
+        moved = scene.replace(material=scene.material.replace(density=density))
+        trajectory = rollout_scene(None, moved, SimConfig())
+        return trajectory.positions[-1, :, 1].mean(), trajectory
+
+    assert int(height(0.2)[1].status) == Status.OK, "motion alone needs no point of rest"
+    gradient, trajectory = jax.grad(height, has_aux=True)(0.2)
+    assert bool(np.isnan(gradient)) is bool(terms)
+    assert int(trajectory.status) == (Status.DERIVATIVE_REFUSED if terms else Status.OK)
+    if terms:
+        with pytest.raises(ConfigError, match="frame 1: the frame did not come to rest"):
+            raise_for_status(trajectory)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("output", ["subspace", "descent"])
 def test_a_refined_prediction_has_right_gradients(output):
@@ -392,6 +426,7 @@ def test_a_walking_shirt_has_right_gradients_by_fabric_body_and_rest_shape(tshir
 BY_A_COUNT = """
 import jax
 from draped_ball import drifting_ball, square
+from flax import struct
 from eslr_jax import SimConfig, prepare_scene
 from eslr_jax.errors import ConfigError
 from eslr_jax.simulation.rollout import rollout_scene

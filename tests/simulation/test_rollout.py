@@ -15,7 +15,7 @@ from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
-from eslr_jax.simulation.rollout import rollout, rollout_scene
+from eslr_jax.simulation.rollout import rollout, rollout_scene, step
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
 
@@ -70,6 +70,15 @@ def test_jit_equals_the_plain_call(cloth, poses, params, solved, learned):
     for weights, config, plain in ((None, SOLVER, solved), (params, NETWORK, learned)):
         found = jitted(weights, cloth, poses, config=config)
         np.testing.assert_allclose(found.positions, plain.positions, atol=ROUNDING)
+
+
+def test_steps_one_by_one_are_the_rollout(cloth, poses, solved):
+    scene = prepare_scene(cloth, poses)
+    state, advance = scene.initial_state, jax.jit(partial(step, None, scene, config=SOLVER))
+    for frame in range(scene.num_frames - 1):
+        state, report = advance(state, frame)
+        np.testing.assert_allclose(state.position, solved.positions[frame + 1], atol=ROUNDING)
+        assert int(report.iterations) == int(solved.iterations[frame + 1])
 
 
 def test_vmap_over_fabrics_equals_one_by_one(cloth, poses):
