@@ -36,7 +36,7 @@ from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import MODELS, init_model
-from eslr_jax.physics.guess import initial_guess
+from eslr_jax.physics.guess import initial_guess, push_out, pushed_out_guess
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.newton import minimize_newton, potential_float64
 from eslr_jax.physics.potential import potential
@@ -51,7 +51,7 @@ from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms.problem import FrameProblem, push_out, pushed_out_guess
+from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Scene
 
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -18,8 +18,9 @@ from jaxtyping import Float
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from eslr_jax.physics import hessian
+from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential
-from eslr_jax.terms.problem import FrameProblem, pushed_out_guess
+from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import tree_cast
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)

@@ -29,8 +29,8 @@ from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
-# A frame that is differentiated ends where its force is below this share of the cloth's weight; by default after
-# at most so many iterations. Float32 leaves 0.002 weights at 1k vertices: the rounding of positions strains edges.
+# A frame that is differentiated ends where its force is below this share of the cloth's weight, after at most so
+# many iterations. Float32 leaves 0.002 weights at 1k vertices: the rounding of positions strains edges.
 _AT_REST = {"float32": 1e-2, "float64": 1e-11}
 _MOST_ITERATIONS = 2000
 _REFUSED = 10.0  # times that force: above it, the frame has no derivative
@@ -66,8 +66,8 @@ def solve(
 
     Forward and reverse mode solve the frame on until it rests, whatever the tolerance, and then one linear system
     (see the module). Where the frame does not come to rest, its status says so, and the derivative is NaN rather
-    than wrong. It is NaN too where the linear system stalls; `solve_hessian` tells why. `gradient`, `iterations` and `gap_bound` of the result have no
-    derivative.
+    than wrong. It is NaN too where the linear system stalls; `solve_hessian` tells why. `gradient`, `iterations`
+    and `gap_bound` of the result have no derivative.
 
     Args:
         problem: The frame's problem.

@@ -21,10 +21,10 @@ from eslr_jax.config import TrainConfig, from_dict, to_dict
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.graph.normalizer import WARMUP_UPDATES
 from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential
 from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.network import refine
-from eslr_jax.terms.problem import pushed_out_guess
 from eslr_jax.training.checkpoint import Checkpoints, read_earlier, read_run_config, write_run_config
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loop import export, train
