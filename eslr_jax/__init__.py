@@ -31,6 +31,8 @@ _PUBLIC = {
     "score_trajectory": "eslr_jax.evaluation.score",
     "simulate": "eslr_jax.simulation.simulate",
     "step": "eslr_jax.simulation.rollout",
+    "load_scene": "eslr_jax.scene.archive",
+    "save_scene": "eslr_jax.scene.archive",
     "simulate_batch": "eslr_jax.simulation.batch",
 }
 
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from eslr_jax.errors import EslrError
     from eslr_jax.evaluation.score import score_trajectory
     from eslr_jax.geometry.prepare import prepare_garment
+    from eslr_jax.scene.archive import load_scene, save_scene
     from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch
     from eslr_jax.simulation.rollout import rollout, step

@@ -1,0 +1,107 @@
+"""A scene as a file: its arrays as an npz archive, and around them its types as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.tree_util import Partial
+
+from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.terms.term import Term
+from eslr_jax.types import Scene
+
+_OWN = "eslr_jax."  # package whose types and functions a file may name
+_TREE = "tree"  # the archive's entry that holds the JSON
+
+
+def save_scene(path: str | Path, scene: Scene) -> None:
+    """Write a scene, whole: whoever loads it simulates, scores or resumes the same scene.
+
+    Args:
+        path: Path of the npz archive.
+        scene: Of `prepare_scene`.
+
+    Raises:
+        ConfigError: The scene holds a function that no file can name, such as a wind of one's own.
+        AssetError: The file can't be written.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    tree = _describe(jax.device_get(scene), "scene", arrays)
+    write_arrays(path, {_TREE: np.array(json.dumps(tree)), **arrays})
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene that `save_scene` wrote.
+
+    A term of one's own is found where its module has been imported before.
+
+    Raises:
+        AssetError: The file is missing, damaged, or of another version, or a term's module is not imported.
+    """
+    arrays = read_arrays(path, content="scene")
+    try:
+        scene = _build(json.loads(str(arrays[_TREE])), arrays)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise AssetError(f"{path} holds no scene of this version; simulate it again") from error
+    if not isinstance(scene, Scene):
+        raise AssetError(f"{path} holds no scene; give the scene.npz of a run")
+    return scene
+
+
+def _describe(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Return a part of a scene as values of JSON; its arrays go to `arrays`, by their place in the scene."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        arrays[place] = np.asarray(value)
+        return {"array": place}
+    if isinstance(value, Partial):
+        function = value.func
+        if not function.__module__.startswith(_OWN) or value.keywords:
+            raise ConfigError(
+                f"{place} is a function of your own, which no file can hold; write it as a term, see the guide"
+            )
+        values = [_describe(part, f"{place}.{row}", arrays) for row, part in enumerate(value.args)]
+        return {"partial": f"{function.__module__}:{function.__qualname__}", "arguments": values}
+    if dataclasses.is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif isinstance(value, tuple):
+        parts = getattr(value, "_asdict", lambda: dict(enumerate(value)))()  # type: ignore[attr-defined]
+    else:
+        raise ConfigError(f"{place} is a {type(value).__name__}, which no file of a scene can hold")
+    kind = type(value)
+    name = "tuple" if kind is tuple else f"{kind.__module__}:{kind.__qualname__}"
+    return {"type": name, "parts": {k: _describe(v, f"{place}.{k}", arrays) for k, v in parts.items()}}
+
+
+def _build(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Return the part of a scene that `_describe` described."""
+    if not isinstance(tree, dict):
+        return tree
+    if "array" in tree:
+        return arrays[tree["array"]]
+    if "partial" in tree:
+        return Partial(_find(tree["partial"]), *(_build(part, arrays) for part in tree["arguments"]))
+    parts = {name: _build(part, arrays) for name, part in tree["parts"].items()}
+    return tuple(parts.values()) if tree["type"] == "tuple" else _find(tree["type"])(**parts)
+
+
+def _find(name: str) -> Any:
+    """Return a type or a function of this package by its name, or a term of anybody's."""
+    module, _, qualified = name.partition(":")
+    if module.startswith(_OWN):
+        found = getattr(importlib.import_module(module), qualified)
+        if getattr(found, "__module__", "") == module:
+            return found
+    found = getattr(sys.modules.get(module), qualified, None)
+    if not (isinstance(found, type) and issubclass(found, Term)):
+        raise AssetError(f"the scene has a term {name}, which is not known; import {module} first")
+    return found

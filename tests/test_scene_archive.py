@@ -1,0 +1,68 @@
+"""A scene in a file is the scene itself."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from draped_ball import drifting_ball, square
+from flax import struct
+
+from eslr_jax import SceneOptions, load_scene, prepare_scene, save_scene, simulate
+from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax.terms.air import Air, blowing
+from eslr_jax.terms.term import Term
+
+
+@struct.dataclass
+class Push(Term):
+    """A steady push along x."""
+
+    name = "push"
+    on = "vertices"
+
+    pressure: float
+
+    def corner_energies(self, corners, problem, data):
+        return -self.pressure * problem.garment.vertex_areas * corners[0][0]
+
+
+def all_of_a_scene(**options):
+    garment = square(5, 0.12, is_pinned=np.array([0, 3]))
+    options = {"self_contact": True, "has_skin": True, "ground": "on", "integrator": "bdf2"} | options
+    return prepare_scene(garment, drifting_ball(3), options=SceneOptions(**options))
+
+
+def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
+    scene = all_of_a_scene(air=blowing((3.0, 0.0, 0.0), 0.3), damping=0.01, substeps=2, terms=(Push(0.5),))
+    save_scene(tmp_path / "scene.npz", scene)
+    again = load_scene(tmp_path / "scene.npz")
+    assert jax.tree.structure(again) == jax.tree.structure(scene)
+    jax.tree.map(np.testing.assert_array_equal, again, scene)
+    one, other = (simulate(None, each).trajectory for each in (scene, again))
+    np.testing.assert_array_equal(one.positions, other.positions)
+
+
+def test_a_term_is_found_where_its_module_is_imported(tmp_path):
+    save_scene(tmp_path / "scene.npz", all_of_a_scene(terms=(Push(0.5),)))
+    code = "import sys, eslr_jax\ntry: eslr_jax.load_scene(sys.argv[1])\nexcept eslr_jax.EslrError as e: print(e)"
+    command = [sys.executable, "-c", code, str(tmp_path / "scene.npz")]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout.strip().endswith(f"which is not known; import {__name__} first")
+
+
+def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path):
+    scene = all_of_a_scene(air=Air(lambda points, time: 2.0 * points))
+    with pytest.raises(ConfigError, match=r"scene\.terms\.\d+\.wind is a function of your own"):
+        save_scene(tmp_path / "scene.npz", scene)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("tree", ['{"type": "os:system", "parts": {}}', "{", '{"array": "nothing"}', "3"])
+def test_a_file_that_holds_no_scene_is_refused_in_one_line(tmp_path, tree):
+    np.savez(tmp_path / "scene.npz", tree=np.array(tree), x=jnp.zeros(2))
+    with pytest.raises(AssetError) as caught:
+        load_scene(tmp_path / "scene.npz")
+    assert "\n" not in str(caught.value)
