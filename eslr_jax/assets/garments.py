@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from eslr_jax.assets.bodies import load_body
-from eslr_jax.assets.cache import cached_arrays, content_key
+from eslr_jax.assets.cache import cached_arrays, cached_struct, content_key
 from eslr_jax.assets.catalog import find_asset
 from eslr_jax.assets.names import is_path
 from eslr_jax.errors import ConfigError
@@ -216,8 +216,8 @@ def prepare_stored(
     """
     options.setdefault("allow_components", not stored.metadata.keys().isdisjoint(("fit", "outfit")))
 
-    def make() -> dict[str, np.ndarray]:
-        garment = prepare_garment(
+    def make() -> Garment:
+        return prepare_garment(
             stored.rest_positions,
             stored.faces,
             skin_weights=stored.skin_weights,
@@ -228,12 +228,10 @@ def prepare_stored(
             name=name,
             **options,
         )
-        leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
-        return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
     key = content_key("prepare", pad, sorted(options.items()), *own)
-    garment = Garment(**(cached_arrays(key, make) if cache else make()))
+    garment = cached_struct(key, Garment, make) if cache else make()
     return to_device(add_coarse_edges(garment) if has_coarse_edges else garment)
 
 
