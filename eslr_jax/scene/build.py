@@ -13,7 +13,7 @@ from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
-from eslr_jax.physics.materials import constants_for
+from eslr_jax.physics.materials import COTTON, constants_for
 from eslr_jax.types import (
     Air,
     BodyMotion,
@@ -79,7 +79,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
     if plan.starts_at_rest:
         velocity = jnp.zeros_like(velocity)
     return Scene(
-        garment=garment,
+        garment=garment.replace(material=None),
         material=material,
         constants=plan.constants or constants_for(material),
         initial_state=start_integrator(initial_state(position, velocity), plan.integrator),
@@ -95,6 +95,13 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         energies=plan.energies,
         substeps=plan.substeps,
     )
+
+
+def worn_material(garment: Garment, material: Material | None) -> Material:
+    """Return the fabric that a garment is simulated with: one that is given, or its own, or cotton."""
+    if material is not None:
+        return material
+    return COTTON if garment.material is None else garment.material
 
 
 def slice_tracks(scene: Scene, frames: slice) -> Scene:
