@@ -75,6 +75,7 @@ class Garment:
     skin_indices: Int[Array, "vertices influences"]
     is_pinned: Bool[Array, " vertices"]  # follows its skinned position
     coarse: tuple[CoarseEdges, ...] | None = None  # finest first; only hierarchical networks read them
+    material: Material | None = None  # of its file's fabrics; None: cotton. A scene has it beside it
     # Made by `with_rest_positions`: what the host prepared for the former shape, such as a `Plate`, is refused.
     is_recut: bool = struct.field(pytree_node=False, default=False)
 

@@ -5,6 +5,7 @@ import contextlib
 import importlib
 import io
 import json
+import os
 import re
 import shlex
 import shutil
@@ -13,6 +14,7 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import jax
 import pytest
 from formats import write_walker
 from garment_files import scanned_tshirt
@@ -142,17 +144,20 @@ def test_documented_commands_run(workplace, page, words):
     assert result.returncode == 0, f"{page.name}: {' '.join(words)}\n{result.stderr}"
 
 
+def simulate_missing(folder, runs):
+    """Simulate the runs that a snippet reads, whatever was simulated before it."""
+    simulate = [sys.executable, "-m", "eslr_jax.cli", "simulate", "--frames", "3", "--no-pictures", "--out"]
+    for run in runs:
+        if not (folder / run).exists():
+            subprocess.run([*simulate, run], cwd=folder, capture_output=True, timeout=900, check=True)
+
+
 @pytest.mark.slow
 @pytest.mark.example
 @pytest.mark.parametrize(("page", "words"), VIEWS, ids=name)
 def test_documented_views_serve_a_page(workplace, page, words):
     pytest.importorskip("viser")
-    for run in words[2:]:  # whatever was simulated before this test
-        if not (workplace / run).exists():
-            simulate = [sys.executable, "-m", "eslr_jax.cli", "simulate", "--frames", "3", "--no-pictures"]
-            subprocess.run(
-                [*simulate, "--out", run], cwd=workplace, capture_output=True, timeout=900, check=True
-            )
+    simulate_missing(workplace, words[2:])
     command = [sys.executable, "-m", "eslr_jax.cli", *words[1:]]
     with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
@@ -200,7 +205,7 @@ def complaints(tmp_path_factory):
 
 @pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
 def test_documented_python_calls_what_exists(page, complaints):
-    # The slow test below runs it; this one finds at once an argument or a name that is gone.
+    # `.ci/run` runs it by the test below; this one finds at once an argument or a name that is gone.
     assert complaints[page] == []
     for statement in ast.walk(ast.parse(CHECKED[page])):
         if isinstance(statement, ast.ImportFrom):
@@ -210,13 +215,21 @@ def test_documented_python_calls_what_exists(page, complaints):
 
 @pytest.mark.slow
 @pytest.mark.example
-@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
-def test_documented_python_runs(page):
-    code = PYTHON[page]
+@pytest.mark.documented
+@pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
+def test_documented_python_runs(page, tmp_path):
+    code = CHECKED[page]
+    simulate_missing(tmp_path, sorted(set(re.findall(r"\bout/\w+", code))))
+    # What one page compiled, another takes from the cache.
+    environment = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir, **os.environ}
+    command = [sys.executable, "-c", code]
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=False
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900, check=False
     )
     assert result.returncode == 0, result.stderr
+    if page == NOTEBOOK:
+        factor = float(re.search(r"recovered factor ([\d.]+)", result.stdout)[1])
+        assert factor == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.slow
@@ -228,17 +241,3 @@ def test_site_builds_strictly(tmp_path):
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stderr
     assert "fit_garment" in (tmp_path / "site" / "api" / "reference" / "index.html").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.example
-def test_notebook_runs_top_to_bottom(tmp_path):
-    nbclient = pytest.importorskip("nbclient")
-    pytest.importorskip("ipykernel")
-    nbformat = pytest.importorskip("nbformat")
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    client = nbclient.NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}})
-    client.execute()
-    text = "".join(out.get("text", "") for cell in notebook.cells for out in cell.get("outputs", []))
-    factor = float(re.search(r"recovered factor ([\d.]+)", text)[1])
-    assert factor == pytest.approx(1.0, abs=0.02)

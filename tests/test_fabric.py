@@ -1,24 +1,27 @@
 """Fabrics by name, by numbers, per part; and what they do in the energies."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from garment_files import bundled
 
 from eslr_jax.assets import prepare_stored
+from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import beyond_training, garment_material, parse_fabric
 from eslr_jax.numerics import gather_corners
 from eslr_jax.physics.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
 from eslr_jax.physics.validate import validate_material
+from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains
 
 
 @pytest.fixture(scope="module")
 def two_fabrics():
-    import dataclasses
-
     stored = bundled("tshirt_1k")
     side = (stored.rest_positions[stored.faces].mean(axis=1)[:, 0] > 0).astype(int)
     stored = dataclasses.replace(stored, face_parts=side, part_names=("right", "left"))
@@ -50,6 +53,25 @@ def test_fabric_by_numbers():
     assert material.density == np.float32(0.3)
     assert material.bending_stiffness == np.float32(1e-5)
     assert material.lame_mu == COTTON.lame_mu
+
+
+def test_a_scene_has_the_fabrics_of_the_garments_file(two_fabrics, body):
+    stored, plain = two_fabrics
+    texts = ["silk", "left:denim"]
+    garment = prepare_stored(dataclasses.replace(stored, metadata={"fabrics": texts}))
+    poses, options = pose_body(body, still_motion(body, 2)), SceneOptions(has_body=False)
+    scene = prepare_scene(garment, poses, options=options)
+    jax.tree.map(np.testing.assert_array_equal, scene.material, garment_material(texts, plain, stored))
+    assert scene.garment.material is None  # gradients with respect to a fabric have one place
+    given = prepare_scene(garment, poses, material=COTTON, options=options)
+    assert given.material.density == COTTON.density
+    assert prepare_scene(plain, poses, options=options).material.density == COTTON.density
+    whole = prepare_stored(dataclasses.replace(stored, metadata={"fabrics": ["denim"]}))
+    scenes = prepare_scenes([whole, plain], [poses] * 2, [None, None], options=options)
+    assert [one.material.density for one in scenes] == [fabric_material("denim").density, COTTON.density]
+    assert jax.tree.structure(scenes[0]) == jax.tree.structure(scenes[1])
+    with pytest.raises(ConfigError, match="one isotropic fabric for each garment"):
+        prepare_scenes([garment], [poses], [None], options=options)
 
 
 def test_fabric_per_part(two_fabrics):
@@ -92,8 +114,6 @@ def test_fabrics_beyond_the_networks_are_told():
 
 
 def test_fabric_of_the_file_is_the_default(two_fabrics):
-    import dataclasses
-
     stored, garment = two_fabrics
     stored = dataclasses.replace(stored, metadata={"fabrics": ["satin"]})
     assert garment_material((), garment, stored).density == fabric_material("satin").density
@@ -148,8 +168,6 @@ def test_woven_fabric_lies_on_the_garment_with_its_warp_up(two_fabrics):
 
 
 def test_texture_coordinates_turn_the_warp(two_fabrics):
-    import dataclasses
-
     stored, garment = two_fabrics
     corners = stored.rest_positions[stored.faces]
     stored = dataclasses.replace(stored, corner_uvs=corners[:, :, [1, 0]])  # v along x

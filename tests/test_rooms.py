@@ -11,8 +11,8 @@ PACKAGE = Path(__file__).parents[1] / "eslr_jax"
 
 # From the top of the house down; a room may import itself and what stands before it.
 ROOMS = [
-    "errors", "extras", "types", "config", "numerics", "io", "geometry", "body", "fit", "assets", "contact",
-    "terms", "physics", "graph", "models", "fabric", "scene", "simulation", "training", "render", "evaluation",
+    "errors", "extras", "types", "config", "numerics", "io", "geometry", "body", "fit", "contact", "terms",
+    "physics", "graph", "models", "fabric", "assets", "scene", "simulation", "training", "render", "evaluation",
     "viewer", "cli",
 ]  # fmt: skip
 KERNELS = {

@@ -7,13 +7,15 @@ can't be read or written costs time and nothing else.
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
 import hashlib
 import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import platformdirs
@@ -26,6 +28,8 @@ MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for
 _CODE = (
     "geometry",
     "fit",
+    "assets/cache.py",
+    "assets/garments.py",
     "body/alignment.py",
     "body/joints.py",
     "body/lbs.py",
@@ -40,6 +44,9 @@ _CODE = (
     "numerics.py",
     "types.py",
 )
+
+Struct = TypeVar("Struct")
+_STATIC = "static"  # the array that holds the static fields of a pytree, as a Python literal
 
 
 def user_cache() -> Path:
@@ -97,6 +104,32 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
         write_arrays(path, arrays)
         _remove_oldest(path.parent)
     return arrays
+
+
+def cached_struct(key: str, kind: type[Struct], make: Callable[[], Struct]) -> Struct:
+    """Return the pytree of an entry; compute and store it if the entry is missing.
+
+    Args:
+        key: Name of the entry, from `content_key`.
+        kind: Its class, a `flax.struct.dataclass`. A field of leaves holds one array, or None where that is its
+            default. A static field (`pytree_node=False`) holds numbers, text, booleans, None or tuples of these.
+        make: Computes the pytree.
+
+    Returns:
+        The pytree with NumPy leaves. Static fields keep their types, which JAX hashes to find compiled programs.
+    """
+    fields = dataclasses.fields(kind)  # type: ignore[arg-type]
+    static = [field.name for field in fields if not field.metadata.get("pytree_node", True)]
+
+    def make_arrays() -> dict[str, np.ndarray]:
+        made = make()
+        values = {field.name: getattr(made, field.name) for field in fields}
+        text = repr({name: values.pop(name) for name in static})
+        arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
+        return arrays | {_STATIC: np.array(text)}
+
+    arrays = dict(cached_arrays(key, make_arrays))
+    return kind(**ast.literal_eval(str(arrays.pop(_STATIC))), **arrays)
 
 
 def _remove_oldest(folder: Path) -> None:

@@ -11,10 +11,11 @@ from typing import Any, Literal
 import numpy as np
 
 from eslr_jax.assets.bodies import load_body
-from eslr_jax.assets.cache import cached_arrays, content_key
+from eslr_jax.assets.cache import cached_arrays, cached_struct, content_key
 from eslr_jax.assets.catalog import find_asset
 from eslr_jax.assets.names import is_path
 from eslr_jax.errors import ConfigError
+from eslr_jax.fabric import garment_material
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions, Scale
 from eslr_jax.fit.transfer import transfer_garment
@@ -52,8 +53,8 @@ def load_garment(
     """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation; warn of a doubtful fit.
 
     Args:
-        name: Name of a bundled garment, or path of a file that `eslr fit` wrote. A mesh (obj, ply, stl, glb, npz)
-            or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
+        name: Name of a bundled garment, or path of a fitted one: of `eslr fit`, or `garment.npz` of a run.
+            A mesh (obj, ply, stl, glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
         vertices: Resolution of a bundled garment; 50k and 200k are subdivisions of its 4k mesh.
         body: Body that wears it, by default the bundled one. A mesh is fitted to this body, and a bundled garment
             is transferred to it.
@@ -62,6 +63,11 @@ def load_garment(
         cache: Keep the result for the next time.
         options: Arguments of `prepare_stored` and of `prepare_garment`; those that a network asks for are its
             `ModelConfig.garment_options`.
+
+    Returns:
+        The garment on the body's rest pose. The origin of its `rest_positions` is the body's: that of the bundled
+        body is at the hips, 0.82 m above the soles, while the poses of `pose_body` stand on a floor at y = 0. Its
+        `material` has the file's fabrics, or is None, for cotton.
 
     Raises:
         AssetError: There is no such garment, or the file can't be read.
@@ -211,13 +217,17 @@ def prepare_stored(
         has_coarse_edges: Add the coarse edges that a hierarchical network reads.
         options: Arguments of `prepare_garment`.
 
+    Returns:
+        The garment, with the material of the file's fabrics if it has some.
+
     Raises:
         MeshError: The mesh can't be simulated.
+        ConfigError: The file has a fabric that is unknown.
     """
     options.setdefault("allow_components", not stored.metadata.keys().isdisjoint(("fit", "outfit")))
 
-    def make() -> dict[str, np.ndarray]:
-        garment = prepare_garment(
+    def make() -> Garment:
+        return prepare_garment(
             stored.rest_positions,
             stored.faces,
             skin_weights=stored.skin_weights,
@@ -228,13 +238,15 @@ def prepare_stored(
             name=name,
             **options,
         )
-        leaves = {field.name: getattr(garment, field.name) for field in dataclasses.fields(Garment)}
-        return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
     key = content_key("prepare", pad, sorted(options.items()), *own)
-    garment = Garment(**(cached_arrays(key, make) if cache else make()))
-    return to_device(add_coarse_edges(garment) if has_coarse_edges else garment)
+    garment = cached_struct(key, Garment, make) if cache else make()
+    if has_coarse_edges:
+        garment = add_coarse_edges(garment)
+    if stored.metadata.get("fabrics"):
+        garment = garment.replace(material=garment_material((), garment, stored))
+    return to_device(garment)
 
 
 def _body_arrays(body: Body) -> list[np.ndarray]:

@@ -97,6 +97,11 @@ def pose_body(
             by default the motion's own, which is 0 if it was made on this body.
         num_frames: Number of frames to keep; None keeps all.
 
+    Returns:
+        The body in motion. Its `positions` stand on the motion's floor, at y = 0 for bundled and loaded motions.
+        Its `rest_positions` have the origin of the body's rest pose, like those of garments: the bundled body's
+        is at the hips, 0.82 m above the soles. `joint_transforms` lead from there to the poses.
+
     Raises:
         MotionError: The motion is for another skeleton or has fewer frames than asked for, or the angle
             is too large.

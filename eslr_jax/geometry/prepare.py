@@ -113,13 +113,14 @@ def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list
     """Pad garments to one bucket, so that they share compiled functions and can be stacked.
 
     Args:
-        garments: Unpadded garments; those with coarse edges get them anew, padded too.
+        garments: Unpadded garments; those with coarse edges get them anew, padded too. Their materials are left
+            out.
         bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
     """
     if bucket is None:
         bucket = common_bucket([garment_bucket(garment) for garment in garments])
         bucket = bucket._replace(vertices=bucket.vertices + 1)
-    padded = [pad_garment(garment, bucket) for garment in garments]
+    padded = [pad_garment(garment.replace(material=None), bucket) for garment in garments]
     return [to_device(add_coarse_edges(one) if one.coarse is not None else one) for one in padded]
 
 

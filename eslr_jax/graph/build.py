@@ -12,6 +12,10 @@ World edge w joins body row w to garment vertex w, so layers pair the rows and g
 beyond `ModelConfig.world_edge_radius` have rows of zeros, and `globals["world_mask"]` leaves them out.
 Messages along mesh edges follow `senders["mesh"]`, `receivers["mesh"]` and the two tables in `globals` that
 go with them: `Topology` names all entries of `globals`.
+
+Garment and body have as many rows: `n_node` holds that number, shape [1], and `n_edge` one such array for every
+set of edges. jraph's own functions, such as `jraph.batch`, know one set of edges and no tables: `edge_set` gives
+them a graph of one set. Networks map over scenes with `jax.vmap` in the place of a batch.
 """
 
 from __future__ import annotations
@@ -125,8 +129,24 @@ def build_frame_graph(
         senders=senders,
         receivers=receivers,
         globals=topology,
-        n_node=None,
-        n_edge=None,
+        n_node=jnp.array([garment.vertex_mask.shape[0]]),
+        n_edge={name: jnp.array([rows.shape[0]]) for name, rows in edges.items()},
+    )
+
+
+def edge_set(graph: jraph.GraphsTuple, name: str) -> jraph.GraphsTuple:
+    """Return one set of edges as a graph for jraph's own functions: `jraph.batch`, `jraph.unbatch` and others.
+
+    Args:
+        graph: Of `build_graph`, `build_frame_graph` or `build_refinement_graph`.
+        name: Set of edges, such as "mesh". Its senders and receivers are rows of the nodes that it joins.
+    """
+    return graph._replace(
+        edges=graph.edges[name],
+        senders=graph.senders[name],
+        receivers=graph.receivers[name],
+        n_edge=graph.n_edge[name],
+        globals=None,
     )
 
 

@@ -144,6 +144,21 @@ def is_run(path: str | Path) -> bool:
     )
 
 
+def load_trajectory(path: str | Path) -> TrajectoryFile:
+    """Load the trajectory of a run: garment and body in motion, and the fabric.
+
+    Args:
+        path: Folder that `eslr simulate` wrote, or its `trajectory.npz`. Its `garment.npz` is for `load_garment`.
+
+    Returns:
+        The trajectory, with NumPy arrays in metres and seconds; the floor of the bundled motions is at y = 0.
+
+    Raises:
+        AssetError: There is no trajectory, a file is damaged, or the garment is not the trajectory's.
+    """
+    return read_run(path).trajectory
+
+
 def read_run(path: str | Path) -> Run:
     """Read the folder of a run, or a trajectory and what lies beside it.
 

@@ -12,7 +12,7 @@ from eslr_jax.body import lbs
 from eslr_jax.contact.ground import clear_of_ground
 from eslr_jax.contact.nearest import clear_of_body
 from eslr_jax.contact.skin import lift_off_skin
-from eslr_jax.physics.materials import constants_for
+from eslr_jax.physics.materials import COTTON, constants_for
 from eslr_jax.terms.bending import Bending
 from eslr_jax.terms.collision import Collision, SkinCollision
 from eslr_jax.terms.friction import Friction
@@ -84,7 +84,7 @@ def build_scene(garment: Garment, poses: BodyMotion, material: Material, plan: S
         velocity = jnp.zeros_like(velocity)
     met = scene_terms(body, has_ground=plan.ground is not None, has_layers=plan.self_contact is not None)
     return Scene(
-        garment=garment,
+        garment=garment.replace(material=None),
         material=material,
         constants=plan.constants or constants_for(material),
         initial_state=start_integrator(initial_state(position, velocity), plan.integrator),
@@ -118,6 +118,13 @@ def scene_terms(body: SceneBody | None, *, has_ground: bool, has_layers: bool) -
     if has_layers:
         terms.append(Repulsion())
     return tuple(terms)
+
+
+def worn_material(garment: Garment, material: Material | None) -> Material:
+    """Return the fabric that a garment is simulated with: one that is given, or its own, or cotton."""
+    if material is not None:
+        return material
+    return COTTON if garment.material is None else garment.material
 
 
 def slice_tracks(scene: Scene, frames: slice) -> Scene:

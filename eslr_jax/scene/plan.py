@@ -20,9 +20,15 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import vertex_components
-from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.validate import validate_air, validate_damping, validate_substeps
-from eslr_jax.scene.build import Integrator, ScenePlan, build_scene, skin_garment, slice_tracks
+from eslr_jax.scene.build import (
+    Integrator,
+    ScenePlan,
+    build_scene,
+    skin_garment,
+    slice_tracks,
+    worn_material,
+)
 from eslr_jax.terms.air import Air
 from eslr_jax.terms.damping import Damping
 from eslr_jax.terms.term import Term
@@ -142,7 +148,7 @@ def prepare_scene(
     garment: Garment,
     poses: BodyMotion,
     *,
-    material: Material = COTTON,
+    material: Material | None = None,
     constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
     surface: BodySurface | None = None,
@@ -155,7 +161,7 @@ def prepare_scene(
     Args:
         garment: A prepared garment.
         poses: The body in motion.
-        material: Fabric.
+        material: Fabric; by default the garment's own, of its file, or else cotton.
         constants: Physical constants; by default those for the fabric, see `physics.materials.constants_for`.
         options: What to leave out or add.
         surface: Body faces to search, see `plan_scene`.
@@ -167,6 +173,7 @@ def prepare_scene(
         MeshError: The garment hangs on joints that the body does not have.
         ConfigError: An option has a value that it can't have.
     """
+    material = worn_material(garment, material)
     plan = plan_scene(garment, poses, constants=constants, options=options, surface=surface)
     on_shapes(_build.eval_shape(garment, poses, material, plan))
     return _build(garment, poses, material, plan)
@@ -175,7 +182,7 @@ def prepare_scene(
 def prepare_scenes(
     garments: Sequence[Garment],
     poses: Sequence[BodyMotion],
-    materials: Sequence[Material],
+    materials: Sequence[Material | None],
     *,
     constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
@@ -189,7 +196,7 @@ def prepare_scenes(
     Args:
         garments: Unpadded garments of like sizes.
         poses: As many motions of bodies with the same faces and rest pose, and of the same length.
-        materials: As many fabrics, isotropic and the same all over a garment.
+        materials: As many fabrics, isotropic and the same all over a garment; see `prepare_scene` for None.
         constants: Physical constants of all; by default those for each fabric.
         options: What to leave out or add.
 
@@ -199,7 +206,10 @@ def prepare_scenes(
         ConfigError: An option has a value that it can't have.
     """
     options = options or SceneOptions()
-    if any(np.ndim(leaf) for material in materials for leaf in jax.tree.leaves(material)):
+    fabrics = [
+        worn_material(garment, material) for garment, material in zip(garments, materials, strict=True)
+    ]
+    if any(np.ndim(leaf) for material in fabrics for leaf in jax.tree.leaves(material)):
         raise ConfigError(
             "a batch takes one isotropic fabric for each garment, with bending_stiffness; simulate garments with "
             "fabrics by part, threads or bending in N m one by one"
@@ -226,7 +236,7 @@ def prepare_scenes(
     ]
     return [
         _build(garment, motion, material, plan)
-        for garment, motion, plan, material in zip(padded, poses, plans, materials, strict=True)
+        for garment, motion, plan, material in zip(padded, poses, plans, fabrics, strict=True)
     ]
 
 

@@ -14,7 +14,6 @@ from jax.sharding import Mesh, PartitionSpec
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.padding import choose_bucket
-from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, prepare_scenes
 from eslr_jax.simulation.rollout import check_network, rollout_scene
 from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, hold_last, simulate
@@ -29,7 +28,7 @@ def simulate_batch(
     poses: Sequence[BodyMotion],
     *,
     config: SimConfig | None = None,
-    material: Material | Sequence[Material] = COTTON,
+    material: Material | Sequence[Material] | None = None,
     constants: PhysicsConstants | None = None,
     options: SceneOptions | None = None,
     batch_size: int = 1,
@@ -45,7 +44,8 @@ def simulate_batch(
         garments: Of `load_garment` or `prepare_garment`; any sizes.
         poses: As many motions, of `pose_body`.
         config: Network, iterations and tolerance; the solver alone by default.
-        material: Fabric of all, or one for each; isotropic and the same all over a garment.
+        material: Fabric of all, or one for each; isotropic and the same all over a garment. By default each
+            garment has its own, of its file, or else cotton.
         constants: Physical constants of all.
         options: What the scenes leave out or add.
         batch_size: Scenes per step on a device, see `rollout_scenes`.
@@ -63,7 +63,7 @@ def simulate_batch(
     """
     config = config or SimConfig()
     check_network(params, config)
-    materials = [material] * len(garments) if isinstance(material, Material) else list(material)
+    materials = list(material) if isinstance(material, Sequence) else [material] * len(garments)
     if not len(garments) == len(poses) == len(materials):
         raise ConfigError(
             f"{len(garments)} garments, {len(poses)} motions and {len(materials)} fabrics; give one motion for "

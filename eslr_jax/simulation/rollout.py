@@ -12,9 +12,8 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import check_params
-from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.solve import SOLUTION
-from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan
+from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan, worn_material
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, part_of_frame
 from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper, past_state
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
@@ -26,7 +25,7 @@ def rollout(
     poses: BodyMotion,
     *,
     config: SimConfig | None = None,
-    material: Material = COTTON,
+    material: Material | None = None,
     plan: ScenePlan | None = None,
 ) -> Trajectory:
     """Simulate a garment on a moving body.
@@ -40,7 +39,7 @@ def rollout(
         garment: Of `load_garment` or `prepare_garment`.
         poses: Of `pose_body`.
         config: Network, iterations and tolerance; the solver alone by default.
-        material: Fabric.
+        material: Fabric; by default the garment's own, of its file, or else cotton.
         plan: What is modelled, of `plan_scene`, which looks at values and leaves out what they don't need. By
             default the whole body is searched, pins are modelled, and layers of cloth pass through each other.
 
@@ -53,7 +52,8 @@ def rollout(
     """
     config = config or SimConfig()
     check_network(params, config)
-    return rollout_scene(params, build_scene(garment, poses, material, plan or safe_plan(poses)), config)
+    scene = build_scene(garment, poses, worn_material(garment, material), plan or safe_plan(poses))
+    return rollout_scene(params, scene, config)
 
 
 def check_network(params: Any, config: SimConfig) -> None:

@@ -1,18 +1,22 @@
 """Garments of a user through the front door: fitted once, kept by content, safe with two processes."""
 
+import dataclasses
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from flax import struct
 from garment_files import bundled, scanned_tshirt
 
 from eslr_jax.assets import cache, garments, load_garment, load_garment_file
-from eslr_jax.assets.cache import cache_folder, cached_arrays, content_key
+from eslr_jax.assets.cache import cache_folder, cached_arrays, cached_struct, content_key
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.io.garment import write_garment_npz
+from eslr_jax.types import Garment
 
 
 @pytest.fixture
@@ -38,6 +42,43 @@ def test_second_load_computes_nothing(empty_cache, scan, body, monkeypatch):
         load_garment(scan, body=body, fit=FitOptions(pin=("loop:top",)))  # other options, another entry
     with pytest.raises(TypeError):
         load_garment(scan, body=body.replace(rest_positions=body.rest_positions * 1.01))  # another body
+
+
+@struct.dataclass
+class Labelled:
+    """A pytree with a static field of every kind."""
+
+    values: np.ndarray
+    absent: np.ndarray | None = None
+    is_marked: bool = struct.field(pytree_node=False, default=False)
+    count: int = struct.field(pytree_node=False, default=0)
+    scale: float = struct.field(pytree_node=False, default=1.0)
+    name: str | None = struct.field(pytree_node=False, default=None)
+    parts: tuple = struct.field(pytree_node=False, default=())
+
+
+def test_static_fields_keep_their_types(empty_cache):
+    made = Labelled(np.ones(2), None, True, 3, 0.1, "it's", ("a", (2, None)))
+    for make in (lambda: made, None):  # stored, then read
+        kept = cached_struct("key", Labelled, make)
+        assert jax.tree.structure(kept) == jax.tree.structure(made)
+        assert hash(jax.tree.structure(kept)) == hash(jax.tree.structure(made))
+        for field in dataclasses.fields(Labelled)[2:]:
+            assert type(getattr(kept, field.name)) is type(getattr(made, field.name))
+
+
+def test_a_garment_from_the_cache_has_the_structure_of_one_that_is_new(empty_cache):
+    new = load_garment("tshirt", cache=False)
+    static = [
+        field.name for field in dataclasses.fields(Garment) if not field.metadata.get("pytree_node", True)
+    ]
+    assert static
+    for _ in range(2):  # stored, then read
+        kept = load_garment("tshirt")
+        assert jax.tree.structure(kept) == jax.tree.structure(new)
+        assert hash(jax.tree.structure(kept)) == hash(jax.tree.structure(new))
+        for name in static:
+            assert type(getattr(kept, name)) is type(getattr(new, name))
 
 
 def test_changed_file_and_damaged_entry_are_made_again(empty_cache, tmp_path, body):

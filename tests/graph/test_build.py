@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import jraph
 import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit, to_float64
 
 from eslr_jax.config import ModelConfig
-from eslr_jax.graph.build import build_graph, feature_sizes, incoming_edges
+from eslr_jax.graph.build import build_graph, edge_set, feature_sizes, incoming_edges
 from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.inputs import next_refinement
 
@@ -161,6 +162,20 @@ def test_feature_sizes_are_those_of_the_graph(config, scene):
     sizes = {name: rows.shape[1] for name, rows in {**graph.nodes, **graph.edges}.items()}
     sizes.pop("world_reverse", None)
     assert sizes == feature_sizes(config)
+
+
+@pytest.mark.parametrize("name", ["mesh", "world", "world_reverse"])
+def test_jraph_batches_and_unbatches_a_set_of_edges(name, hood_graph):
+    parts = [edge_set(graph, name) for graph in (hood_graph, build(HOOD, make_scene(6, 5)))]
+    sizes = [len(part.nodes["garment"]) for part in parts]
+    batch = jraph.batch(parts)
+    np.testing.assert_array_equal(batch.n_node, sizes)
+    np.testing.assert_array_equal(batch.n_edge, [len(part.edges) for part in parts])
+    assert [len(rows) for rows in batch.nodes.values()] == [sum(sizes)] * 2
+    np.testing.assert_array_equal(batch.senders[len(parts[0].senders) :], parts[1].senders + sizes[0])
+    for part, again in zip(parts, jraph.unbatch(batch), strict=True):
+        assert jax.tree.structure(part) == jax.tree.structure(again)
+        jax.tree.map(np.testing.assert_array_equal, part, again)
 
 
 def test_the_first_refinement_step_has_no_correction(scene):

@@ -12,7 +12,7 @@ from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
-from eslr_jax.io.run import ClothTrack, read_run, write_run
+from eslr_jax.io.run import ClothTrack, load_trajectory, read_run, write_run
 from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.scene.plan import prepare_scene
@@ -82,6 +82,14 @@ def test_trajectory_round_trip_is_exact(tmp_path, trajectory):
     found = read_trajectory(tmp_path / "run.npz")
     assert_equal(found, trajectory)
     assert found.num_frames == FRAMES
+
+
+def test_load_trajectory_takes_the_folder_of_a_run_or_its_file(tmp_path):
+    write_trajectory(tmp_path / "trajectory.npz", WHOLE)
+    for path in (tmp_path, str(tmp_path / "trajectory.npz")):
+        assert_equal(load_trajectory(path), WHOLE)
+    with pytest.raises(AssetError, match="give a folder that `eslr simulate` wrote"):
+        load_trajectory(tmp_path / "none")
 
 
 @pytest.mark.parametrize("has_contacts", [False, True])
