@@ -80,7 +80,7 @@ def main() -> None:
             append_images=images[1:] + images[-2:0:-1],  # forth and back: a loop without a jump
             duration=round(1000 * _EVERY * float(poses.timestep)),
             loop=0,
-            quality=70,
+            quality=50,
         )
 
 

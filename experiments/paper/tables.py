@@ -62,10 +62,9 @@ from eslr_jax.training.checkpoint import has_checkpoint
 
 WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
 # Applied once a frame. They were trained by configs/paper/1k.toml, and then for as many steps again at half its
-# learning rate. hood-5 and mgn-16 have a fifth of the steps. The other networks have recipes of their own.
+# learning rate. hood-5 has a fifth of the steps. The other networks have recipes of their own.
 DEEP = (
     f"mgn-5=mgn-5-correction,{WEIGHTS / 'mgn-5_60k_s1.npz'}",
-    f"mgn-16, 12,000 steps={WEIGHTS / 'mgn-16_12k.npz'}",
     "hood-5=hood-5-correction",
     "gsa-5=gsa-5-correction",
     "lsdmp-5=lsdmp-5-correction",
