@@ -9,10 +9,8 @@ Writes animation.webp.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
+from harness import parser
 from PIL import Image
 
 from eslr_jax.assets import load_body, load_garment, load_motion
@@ -41,10 +39,8 @@ _CONFIG = SimConfig(iterations=300, tolerance=1e-2)
 
 def main() -> None:
     """Simulate, render and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="one garment at 1k, three frames")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    chosen = parser.parse_args()
+    options = parser(__doc__, "one garment at 1k, three frames")
+    chosen = options.parse_args()
     worn, frames, vertices = (WORN[:1], 5, "1k") if chosen.smoke else (WORN, _FRAMES, "4k")
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
@@ -71,7 +67,6 @@ def main() -> None:
         strips.append(list(pictures))
     labels = [f"{name}, {fabric}" for name, fabric, _ in worn]
     images = [Image.fromarray(side_by_side(row, labels)) for row in zip(*strips, strict=True)]
-    chosen.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(chosen.out / "animation.webp") as temporary:
         images[0].save(
             temporary,

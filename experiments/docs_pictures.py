@@ -8,7 +8,6 @@ picture of `eslr play` needs Chromium and the package playwright; without them i
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import shutil
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from harness import EXPERIMENTS, RESULTS, parser
 from jax.tree_util import Partial
 from known_answers.drape import hang
 from other_bodies import child
@@ -49,7 +49,6 @@ from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.simulate import last_frames, simulate
 
-RESULTS = Path(__file__).parent / "results"
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",
     "train": RESULTS / "hood_5_curves.png",  # `eslr train` wrote it
@@ -77,12 +76,9 @@ class Shot:
 
 def main() -> None:
     """Make what was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="two pictures of few frames")
-    parser.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
-    chosen = parser.parse_args()
-    chosen.out.mkdir(parents=True, exist_ok=True)
+    options = parser(__doc__, "two pictures of few frames", EXPERIMENTS.parent / "docs" / "images")
+    options.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
+    chosen = options.parse_args()
     frames = _SMOKE_FRAMES if chosen.smoke else _FRAMES
     names = chosen.only or (["install", "first-cloth"] if chosen.smoke else [*COPIED, *PICTURES])
     for name in names:

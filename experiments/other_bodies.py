@@ -8,16 +8,14 @@ proportions and on other rigs, in T-poses, and a figure of capsules with a surfa
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from harness import keep, kept, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.joints import find_parts
@@ -33,11 +31,9 @@ from eslr_jax.fit.clearance import body_heights
 from eslr_jax.fit.postures import find_arms, rest_posture
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import last_frames, simulate
 from eslr_jax.types import Body
 
@@ -291,7 +287,6 @@ BODIES = {
 }
 
 
-RESULTS = Path(__file__).parent / "results"
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip
@@ -380,36 +375,27 @@ def _picture(body: Body, panels: list[tuple[str, np.ndarray, np.ndarray, np.ndar
 
 def main() -> None:
     """Measure every garment on every body; write a table and pictures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="one garment, one body, few frames")
-    parser.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the table and the pictures")
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    names, garments = (["mixamo"], GARMENTS[:1]) if arguments.smoke else (arguments.bodies, GARMENTS)
-    path = arguments.out / "other_bodies.json"
-    table: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    table |= {
-        "clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, "device": device_name(), **environment(),
-    }  # fmt: skip
+    options = parser(__doc__, "one garment, one body, few frames")
+    options.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
+    chosen = options.parse_args()
+    names, garments = (["mixamo"], GARMENTS[:1]) if chosen.smoke else (chosen.bodies, GARMENTS)
+    path = chosen.out / "other_bodies.json"
+    about = {"clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, **environment()}
+    table: dict[str, Any] = {**kept(path), **about}
     for name in names:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnitsWarning)  # Mixamo's is in centimetres, on purpose
             body = load_body() if name == "bundled" else make_body(BODIES[name]())
         rows, panels = [], []
         for row, (moving, positions, faces) in measure(
-            body, garments, frames=SMOKE_FRAMES if arguments.smoke else FRAMES
+            body, garments, frames=SMOKE_FRAMES if chosen.smoke else FRAMES
         ):
-            print(
-                name,
-                {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()},
-            )
+            print(name, row, flush=True)
             rows.append(row)
             panels.append((row["garment"], moving[-1], positions[-1], faces))
         table[name] = rows
-        write_png(arguments.out / f"other_bodies_{name}.png", _picture(body, panels))
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(table, indent=1) + "\n")
+        write_png(chosen.out / f"other_bodies_{name}.png", _picture(body, panels))
+        keep(path, table)
 
 
 if __name__ == "__main__":

@@ -20,15 +20,12 @@ Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a P
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import importlib.metadata
-import json
 import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -36,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
 from hard_cases import drop_scene
+from harness import keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
 from eslr_jax.config import SimConfig
@@ -44,14 +42,12 @@ from eslr_jax.evaluation.calibrate import example_scene
 from eslr_jax.evaluation.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.score import score_trajectory
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import rollout_scene, step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import ClothState, Scene, Trajectory
 
-RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
 SETTINGS = (
     Setting("vbd", 1, 20),
@@ -133,12 +129,7 @@ def make_scene(name: str, num_frames: int) -> Scene:
 def take_turns(
     methods: list[Method], scene: Scene, num_frames: int
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Roll all methods out, frame by frame in turns.
-
-    Args:
-        methods: On the scene.
-        scene: The scene.
-        num_frames: The start included.
+    """Roll all methods out, frame by frame in turns, to a number of frames with the start.
 
     Returns:
         Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
@@ -254,12 +245,7 @@ def summarize_gap(gap: np.ndarray, initial: np.ndarray) -> dict[str, float | Non
 
 
 def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str, list[dict[str, Any]]]:
-    """Return what every peer takes and leaves, in the form of `speed_vs_error`; empty without Newton.
-
-    Args:
-        scenes: Of one size; the first is timed.
-        settings: Of Newton's solvers.
-    """
+    """Return what Newton's solvers take and leave as `speed_vs_error` does; the first of the scenes is timed."""
     methods, relative = [newton_methods(scenes[0], settings)], []
     if not methods[0]:
         return {}
@@ -298,22 +284,6 @@ COLUMNS = {
 }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows as a Markdown table."""
-
-    def cell(name: str, value: Any) -> str:
-        if value is None:
-            return "-"
-        if not isinstance(value, float):
-            return str(value)
-        scaled = 100 * value if name.startswith("gap_relative") else value
-        return f"{scaled:.3g}" if abs(scaled) < 1e3 else f"{scaled:.0f}"
-
-    lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]
-    lines += [[cell(name, row.get(name)) for name in COLUMNS] for row in rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def peer_versions() -> dict[str, str]:
     """Return the versions of the peers' packages that are installed."""
     versions = {}
@@ -327,41 +297,35 @@ def peer_versions() -> dict[str, str]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
-    parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
-    arguments = parser.parse_args()
+    options = parser(__doc__, "one scene, one setting per solver, few frames")
+    options.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
+    options.add_argument("--frames", type=int, default=40)
+    chosen = options.parse_args()
     efforts, covering, settings, blender = OURS, OUR_SKIN, SETTINGS, BLENDER
-    if arguments.smoke:
-        arguments.scenes, arguments.frames = ["tshirt_1k"], 8
+    if chosen.smoke:
+        chosen.scenes, chosen.frames = ["tshirt_1k"], 8
         efforts, covering, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
         "clip": CLIP,
-        "frames": arguments.frames,
+        "frames": chosen.frames,
         "processor": device_name(),
         "cores": cores,
         "date": time.strftime("%Y-%m-%d"),
         **environment(),
-        "scenes": {},
+        "scenes": kept(chosen.out / "peers.json").get("scenes", {}),
     }
     result["versions"] |= peer_versions()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "peers.json"
-    if path.exists():
-        result["scenes"] = json.loads(path.read_text())["scenes"]
-    for name in arguments.scenes:
-        scene = make_scene(name, arguments.frames)
+    for name in chosen.scenes:
+        scene = make_scene(name, chosen.frames)
         rows = measure_scene(scene, efforts, covering, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
-        with atomic_write(path) as temporary:  # after every scene: they take minutes
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
-        print(f"\n{name}\n\n{table(rows)}", flush=True)
+        keep(chosen.out / "peers.json", result)
+        percent = [
+            {k: 100 * v if v and k.startswith("gap_relative") else v for k, v in row.items()} for row in rows
+        ]
+        print(f"\n{name}\n\n{markdown(COLUMNS, percent)}", flush=True)
         jax.clear_caches()
 
 

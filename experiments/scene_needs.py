@@ -7,16 +7,14 @@ The same solver steps two scenes that differ in one part, and they are timed alt
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from harness import keep, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body, still_motion
@@ -24,18 +22,14 @@ from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import starting_capacity
-from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Air, Scene
 
-RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"
 ITERATIONS = 20  # of the solver
 Pair = dict[str, Scene]  # two scenes by their labels; the first has more parts
@@ -94,26 +88,22 @@ def ratio_of(times: dict[str, float]) -> dict[str, float]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vertices", default="4k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="1k, three frames, one pair, one turn")
-    arguments = parser.parse_args()
-    frames, turns = (3, 1) if arguments.smoke else (12, 7)
-    if arguments.smoke:
-        arguments.vertices = "1k"
+    options = parser(__doc__, "1k, three frames, one pair, one turn")
+    options.add_argument("--vertices", default="4k", choices=["1k", "4k", "10k"])
+    chosen = options.parse_args()
+    frames, turns = (3, 1) if chosen.smoke else (12, 7)
+    if chosen.smoke:
+        chosen.vertices = "1k"
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
-    shirt = load_garment("tshirt", vertices=arguments.vertices)
+    shirt = load_garment("tshirt", vertices=chosen.vertices)
     whole = poses.surface
     by_face = COTTON.replace(
         **{name: jnp.full(shirt.faces.shape[0], getattr(COTTON, name)) for name in ("lame_mu", "lame_lambda")}
     )
     scene = prepare_scene(shirt, poses)
     still = pose_body(body, still_motion(body, frames, arm_angle=ARM_ABDUCTION), num_frames=frames)
-    dress = partial(prepare_scene, load_garment("dress", vertices=arguments.vertices), poses)
+    dress = partial(prepare_scene, load_garment("dress", vertices=chosen.vertices), poses)
     # Each pair is built when its turn comes; the smoke run takes the first.
     pairs: dict[str, Callable[[], Pair]] = {
         "T-shirt: with a body against without": lambda: {
@@ -158,7 +148,7 @@ def main() -> None:
             "needed": scene,
         },
     }
-    if arguments.smoke:
+    if chosen.smoke:
         pairs = dict(list(pairs.items())[:1])
     everything = prepare_scene(shirt, poses, surface=whole)
     result: dict[str, Any] = {
@@ -172,10 +162,8 @@ def main() -> None:
     for name, build in pairs.items():
         result[name] = compare_steps(build(), turns)
         print(f"{name}: {result[name]['ratio']:.2f}x", flush=True)
-    result |= {"device": device_name(), "environment": environment()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / "scene_needs.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    result |= {**machine()}
+    keep(chosen.out / "scene_needs.json", result)
 
 
 if __name__ == "__main__":

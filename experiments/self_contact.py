@@ -10,26 +10,21 @@ starts that differ by 1e-5 m. Writes self_contact_1k.json.
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import keep, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import judge
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 FRAMES = 61  # two seconds
 EVERY = 5  # frames between those that are judged
 CONFIG = SimConfig(iterations=300, tolerance=0.01)
@@ -80,29 +75,23 @@ def moved(scene: Scene, number: int) -> Scene:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])
-    parser.add_argument("--starts", type=int, default=3, help="of the rollouts with self-contact")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="T-shirt at 1k, one clip, six frames")
-    arguments = parser.parse_args()
-    clips, garments, frames = load_splits()["motions"]["test"], arguments.garments, FRAMES
-    if arguments.smoke:
-        clips, garments, frames, arguments.vertices = clips[:1], ["tshirt"], 6, "1k"
-        arguments.starts = 1
+    options = parser(__doc__, "T-shirt at 1k, one clip, six frames")
+    options.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
+    options.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])
+    options.add_argument("--starts", type=int, default=3, help="of the rollouts with self-contact")
+    chosen = options.parse_args()
+    clips, garments, frames = load_splits()["motions"]["test"], chosen.garments, FRAMES
+    if chosen.smoke:
+        clips, garments, frames, chosen.vertices = clips[:1], ["tshirt"], 6, "1k"
+        chosen.starts = 1
     rows = []
     for garment in garments:
         for clip in clips:
-            rows += (found := measure(garment, clip, arguments.vertices, frames, arguments.starts))
+            rows += (found := measure(garment, clip, chosen.vertices, frames, chosen.starts))
             print(*map(json.dumps, found), sep="\n", flush=True)
     result = {"rows": rows, "frames": frames, "settle": SETTLE_FRAMES, "every": EVERY}
-    result |= {"device": device_name(), "environment": environment()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / f"self_contact_{arguments.vertices}.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    result |= {**machine()}
+    keep(chosen.out / f"self_contact_{chosen.vertices}.json", result)
 
 
 if __name__ == "__main__":

@@ -16,14 +16,13 @@ Rows of time_and_skin.json stay until they are measured again.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import keep, kept, parser
 from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
@@ -35,14 +34,12 @@ from eslr_jax.evaluation.referee import intersecting_pairs, judge
 from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import Integrator, start_integrator
 from eslr_jax.scene.plan import SceneOptions, prepare_scenes
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 PARTS = ("skin", "time")
 GARMENTS = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
 INTEGRATORS: tuple[Integrator, ...] = ("bdf2", "euler")
@@ -179,45 +176,38 @@ def measure_time(
                 }  # fmt: skip
 
 
-def keep(path: Path, part: str, row: dict[str, Any]) -> None:
-    """Put a row in the place of the one that was measured before."""
+def put(path: Path, part: str, row: dict[str, Any]) -> None:
+    """Keep a row, in the place of the one that was measured before."""
     names = ("garment", "vertices", "clip", "integrator", "steps")
 
-    def key(one: dict[str, Any]) -> tuple:
-        return tuple(one.get(name) for name in names)
+    def key(one: dict[str, Any]) -> list:
+        return [one.get(name) for name in names]
 
-    result = json.loads(path.read_text()) if path.exists() else {}
+    result = kept(path)
     others = [one for one in result.get(part, []) if key(one) != key(row)]
-    result = {**result, part: [*others, row], **environment()}
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    keep(path, {**result, part: [*others, row], **environment()})
 
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
-    parser.add_argument("--garment", nargs="*", choices=GARMENTS)
-    parser.add_argument("--vertices", default="1k")
-    arguments = parser.parse_args()
+    options = parser(__doc__, "one garment, one clip, few frames")
+    options.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    options.add_argument("--garment", nargs="*", choices=GARMENTS)
+    options.add_argument("--vertices", default="1k")
+    chosen = options.parse_args()
 
     use_compile_cache()
-    clips, is_smoke = list(load_splits()["motions"]["test"]), arguments.smoke
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "time_and_skin.json"
-    for part in arguments.part:
-        garments = list(arguments.garment or (GARMENTS if part == "skin" else TIMED))[
-            : 1 if is_smoke else None
-        ]
+    clips, is_smoke = list(load_splits()["motions"]["test"]), chosen.smoke
+    path = chosen.out / "time_and_skin.json"
+    for part in chosen.part:
+        garments = list(chosen.garment or (GARMENTS if part == "skin" else TIMED))[: 1 if is_smoke else None]
         if part == "skin":
             frames, some = (6, clips[:1]) if is_smoke else (FRAMES, clips)
-            rows = measure_skin(garments, arguments.vertices, some, frames)
+            rows = measure_skin(garments, chosen.vertices, some, frames)
         else:
-            rows = measure_time(garments, arguments.vertices, clips[: 1 if is_smoke else 3], is_smoke)
+            rows = measure_time(garments, chosen.vertices, clips[: 1 if is_smoke else 3], is_smoke)
         for row in rows:
-            keep(path, part, row)
+            put(path, part, row)
             print(part, row, flush=True)
 
 

@@ -1,27 +1,18 @@
-"""The scene of these experiments, a square sheet in the air, and how they keep what they find."""
+"""The scene of these experiments: a square sheet in the air."""
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-
+import harness
 import jax
 import jax.numpy as jnp
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
-from matplotlib.figure import Figure
 
-from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene
 
-RESULTS = Path(__file__).parent.parent / "results" / "inverse"
+RESULTS = harness.RESULTS / "inverse"
 TIMESTEP = 1 / 30  # [s]
 
 
@@ -65,23 +56,3 @@ def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) 
         pin_targets=rest + shift,
         num_frames=shift.shape[0],
     )
-
-
-def parse_options(description: str | None) -> argparse.Namespace:
-    """Return the options that all these scripts share."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="a few steps, to see that it runs")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    return parser.parse_args()
-
-
-def keep(out: Path, name: str, result: dict, figure: Figure) -> None:
-    """Write a result with its environment as JSON, and its picture; print the result."""
-    out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(result | environment(), indent=1, default=lambda value: np.asarray(value).tolist())
-    with atomic_write(out / f"{name}.json") as path:
-        path.write_text(text + "\n")
-    figure.savefig(out / f"{name}.png", dpi=110)
-    print(json.dumps(result, default=lambda value: np.asarray(value).tolist())[:3000])

@@ -1,6 +1,6 @@
 """MAT on our own data: a transformer over a garment's faces that steps the cloth, frame after frame.
 
-    python experiments/paper/mat.py GARMENT --out FOLDER [--steps 2000] [--smoke]
+    python experiments/paper mat GARMENT [--out FOLDER] [--steps 2000] [--smoke]
 
 It keeps faces as tokens with the published features of two frames, one token for the whole, heads that average
 along geodesics, the change of every face's frame as output, the Poisson solve that joins faces, and the
@@ -16,7 +16,6 @@ Source: Li et al. 2024 (MAT), whose published run names no flags; weights of los
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from functools import partial
@@ -27,16 +26,24 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float
-from mat_space import Change, Space, change_between, face_frames, heading, prepare_space, rebuild, step_off
-from supervised import Truth, fit, load_truth
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
 from eslr_jax.physics.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
+from paper.mat_space import (
+    Change,
+    Space,
+    change_between,
+    face_frames,
+    heading,
+    prepare_space,
+    rebuild,
+    step_off,
+)
+from paper.supervised import Truth, fit, load_truth, options, read_archive, write_archive
 
 _WIDTH, _LAYERS, _HEADS = 64, 3, 4  # MAT: 512, 6, 8
 _GEODESIC_HEADS = 1  # of the heads; MAT: 2 of 8
@@ -274,19 +281,9 @@ def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
 
 def main() -> None:
     """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("garment")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="two steps on one short clip")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, 2000).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, 2 if chosen.smoke else chosen.steps, chosen.seed)
     path = chosen.out / f"mat_{chosen.garment}.npz"
     write_network(network, path, training)
     print(path, training)
-
-
-if __name__ == "__main__":
-    main()

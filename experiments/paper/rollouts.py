@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
+import harness
 import jax
-import mat
 import numpy as np
-import posed
-import ssch
-from hood_metrics import hood_metrics
-from mat_space import prepare_space
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, wear
 
 from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
@@ -25,15 +18,18 @@ from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_ga
 from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
 from eslr_jax.physics.hood import HoodParameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene, Trajectory
+from paper import mat, posed, ssch
+from paper.hood_metrics import hood_metrics
+from paper.mat_space import prepare_space
+from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, wear
 
-RESULTS = Path(__file__).parents[1] / "results" / "paper"
+RESULTS = harness.RESULTS / "paper"
 OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
 CONTROLS: tuple[Control, ...] = get_args(Control)
 CONTROLS_OF_WEIGHTS = tuple(name for name in CONTROLS if name not in EMBEDDING_CONTROLS)
@@ -42,15 +38,6 @@ TERMS = ("stretch", "bending", "inertia", "collision", "friction", "gravity")
 _ORIGIN_ABOVE_ROOT = 0.22  # [m]; SMPL's origin, from which HOOD counts heights, is this far above the pelvis
 _GAP_FRAMES = 10  # of every rollout, from whose states the gap is measured
 _GAPS = ("gap_mj", "gap_share", "own_gap_mj", "own_gap_share")
-
-
-def arguments(description: str | None) -> argparse.ArgumentParser:
-    """Return the parser of the options that every script of this folder has."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="few frames of one garment on one clip")
-    return parser
 
 
 class System(NamedTuple):
@@ -239,10 +226,3 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     terms = {name: float(np.mean(getattr(found, name))) for name in TERMS}
     frames = measure_frames(trajectory.positions, scene)
     return {**terms, "total": sum(terms.values()), **extremes(frames, np.asarray(scene.garment.vertex_mask))}
-
-
-def write(result: dict[str, Any], path: Path) -> None:
-    """Write a result, or nothing of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")

@@ -1,6 +1,6 @@
 """SSCH on our own data: one network a garment, from the body's motion to a latent shape, and on to the cloth.
 
-    python experiments/paper/ssch.py GARMENT --out FOLDER [--steps 2000 400] [--smoke]
+    python experiments/paper ssch GARMENT [--out FOLDER] [--steps 2000 400] [--smoke]
 
 It keeps a garment space without the pose, a variational auto-encoder of 25 latents whose random shapes are kept
 off the body at rest, and GRUs that turn the body's motion into latents; supervised by simulated rollouts, here
@@ -13,7 +13,6 @@ Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; o
 
 from __future__ import annotations
 
-import argparse
 import time
 from functools import partial
 from pathlib import Path
@@ -23,17 +22,16 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float, Int
-from posed import carried_joints, carry, pose_features
-from supervised import Truth, fit, load_truth
 
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body import lbs
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.physics.collision import penetration
 from eslr_jax.types import BodySurface, Garment
+from paper.posed import carried_joints, carry, pose_features
+from paper.supervised import Truth, fit, load_truth, options, read_archive, write_archive
 
 _LATENTS = 25  # SSCH
 _CODE = 10  # numbers for a pose (SSCH)
@@ -351,19 +349,9 @@ def read_network(path: Path) -> tuple[Ssch, dict[str, Any]]:
 
 def main() -> None:
     """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("garment")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs=2, default=(2000, 400), metavar=("SHAPE", "MOTION"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="two steps on one short clip")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, (2000, 400), nargs=2, metavar=("SHAPE", "MOTION")).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, (2, 2) if chosen.smoke else tuple(chosen.steps), chosen.seed)
     path = chosen.out / f"ssch_{chosen.garment}.npz"
     write_network(network, path, training)
     print(path, training)
-
-
-if __name__ == "__main__":
-    main()

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import harness
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 from eslr_jax.assets import split_clips
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.io.npz import read_arrays, write_arrays
 from eslr_jax.simulation.rollout import rollout_scene
+from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 _FRAMES = 100  # of a clip, as in the tables
 _RATE = 1e-3  # of Adam (PBNS, GAPS, MAT), falling to zero along a cosine
+
+
+def options(description: str | None, steps: Any, **settings: Any) -> argparse.ArgumentParser:
+    """Return the parser of a script that trains a network for one garment, with settings of --steps."""
+    parser = harness.parser(description, "two steps on one short clip", "out/one_garment")
+    parser.add_argument("garment")
+    parser.add_argument("--steps", type=int, default=steps, **settings)
+    parser.add_argument("--seed", type=int, default=0)
+    return parser
 
 
 class Truth(NamedTuple):
@@ -65,6 +79,29 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
     if tuple(kept["clips"]) != clips or kept["positions"].shape[1] != frames:
         raise ValueError(f"{path} holds rollouts of other clips or lengths; remove it")
     return Truth(worn, kept["positions"], float(kept["core_hours"]))
+
+
+def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
+    """Write nested arrays, and a record of plain values beside them.
+
+    Args:
+        path: Path of the archive; the record's has the suffix .json.
+        arrays: Dictionaries of arrays, nested as deep as wanted; no key holds a slash.
+        record: What JSON can hold.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
+    write_arrays(path, leaves, is_compressed=True)
+    path.with_suffix(".json").write_text(json.dumps(record, indent=1))
+
+
+def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the arrays and the record that `write_archive` wrote."""
+    arrays = {
+        tuple(name.split("/")): jnp.asarray(leaf)
+        for name, leaf in read_arrays(path, content="network").items()
+    }
+    return unflatten_dict(arrays), json.loads(path.with_suffix(".json").read_text())
 
 
 def fit(

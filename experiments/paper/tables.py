@@ -1,6 +1,6 @@
 """The paper's tables: every system beside its controls, the solver and the optimum.
 
-    python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
+    python experiments/paper tables [--tables native_garments unseen_garments new_motion model_cost]
         [--models LABEL=NAME,NAME ...] [--train] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
@@ -25,27 +25,13 @@ with the versions and the device that made it, so that several runs can fill a t
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import harness
 import jax
 import numpy as np
-from rollouts import (
-    CONTROLS,
-    CONTROLS_OF_WEIGHTS,
-    GUESS,
-    OPTIMUM,
-    Reference,
-    Setting,
-    System,
-    arguments,
-    find_references,
-    measure_system,
-    read_system,
-    write,
-)
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
@@ -59,8 +45,21 @@ from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.training.checkpoint import has_checkpoint
+from paper.rollouts import (
+    CONTROLS,
+    CONTROLS_OF_WEIGHTS,
+    GUESS,
+    OPTIMUM,
+    RESULTS,
+    Reference,
+    Setting,
+    System,
+    find_references,
+    measure_system,
+    read_system,
+)
 
-WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
+WEIGHTS = RESULTS / "weights"  # seeds that are not bundled
 # Applied once a frame. They were trained by configs/paper/1k.toml, and then for as many steps again at half its
 # learning rate. hood-5 has a fifth of the steps. The other networks have recipes of their own.
 DEEP = (
@@ -70,7 +69,7 @@ DEEP = (
     "lsdmp-5=lsdmp-5-correction",
     f"eslr-5=eslr-5-correction,{WEIGHTS / 'eslr-5_60k_s1.npz'}",
 )
-CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
+CONFIGS = harness.EXPERIMENTS / "configs" / "paper"
 RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
 BUNDLED = (
     f"eslr-small={DEFAULT_MODEL}",
@@ -104,7 +103,8 @@ class Training(NamedTuple):
 
 def main() -> None:
     """Measure and write."""
-    parser = arguments(__doc__)
+    parser = harness.parser(__doc__, "few frames of one garment on one clip", RESULTS)
+    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--tables", nargs="+", default=TABLES, choices=TABLES)
     parser.add_argument("--models", nargs="+", metavar="LABEL=NAME,NAME", help="rows")
     parser.add_argument(
@@ -133,7 +133,7 @@ def main() -> None:
     for name in chosen.tables:
         if name == "model_cost":
             costs = cost_table(rows, chosen.vertices, chosen.smoke)
-            write(with_totals(costs, chosen.out / f"{TABLES[0]}.json"), cost_file(chosen))
+            harness.keep(cost_file(chosen), with_totals(costs, chosen.out / f"{TABLES[0]}.json"))
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
             if not (setting.garments and setting.clips):
@@ -152,7 +152,7 @@ def main() -> None:
             for label, networks in missing.items():
                 row = measure_row(networks, setting, references)
                 parts = with_row(rows_of_setting(file, setting), label, row)  # another run may have written
-                write({**setting._asdict(), **parts}, file)
+                harness.keep(file, {**setting._asdict(), **parts})
 
 
 def plan_trainings(rows: Rows, out: Path) -> tuple[Rows, list[Training]]:
@@ -269,7 +269,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
         SystemExit: It is of other garments, clips, frames or vertices and may not be written over. Says which
             differ, and what to give.
     """
-    found = json.loads(file.read_text()) if file.exists() else {}
+    found = harness.kept(file)
     parts = {name: found.get(name, {}) for name in PARTS}
     asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
     differs = [name for name, value in asked.items() if found.get(name, value) != value]
@@ -319,7 +319,7 @@ def check_costs(file: Path, names: Sequence[str]) -> None:
     Raises:
         SystemExit: Names them.
     """
-    found = json.loads(file.read_text())["mean"] if file.exists() else {}
+    found = harness.kept(file).get("mean", {})
     if lost := [name for name in found if name not in names]:
         raise SystemExit(f"{file} has rows for {', '.join(lost)}; measure them too, or give another --out")
 
@@ -367,12 +367,8 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
 
 def with_totals(costs: dict[str, Any], energies: Path) -> dict[str, Any]:
     """Return the table of costs with the Total [J] of the rows that a table of energies at its size has."""
-    found = json.loads(energies.read_text()) if energies.exists() else {}
+    found = harness.kept(energies)
     if found.get("vertices") == costs["vertices"]:
         for label in costs["mean"].keys() & found["mean"].keys():
             costs["mean"][label]["total"] = found["mean"][label]["total"]
     return costs
-
-
-if __name__ == "__main__":
-    main()

@@ -1,28 +1,46 @@
 """Time a step of the networks: the package's build against a plain one, reduced precision, and PyTorch.
 
-    python experiments/benchmarks/step_time.py --json out.json
+    python experiments/step_time.py
 
 All builds of a comparison run alternately (A B A B ...) in one process and are compared as ratios of medians.
 Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a process
 of its own on one core; without PyTorch it is left out. `floor_share` is the share of the exact forward pass that
 its matrix products would take at the rate of one large product, which is measured in the same turns.
+
+Writes step_time.json.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(Path(__file__).resolve().parent)]
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from harness import EXPERIMENTS, keep, parser
 
-from eslr_jax.training.memory import keep_memory  # noqa: E402
+from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
+from eslr_jax.models.registry import (
+    MODELS,
+    apply_model,
+    apply_refinement,
+    encode_frame,
+    init_model,
+    measure_statistics,
+    merge_statistics,
+)
+from eslr_jax.training.memory import keep_memory
+
+sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models
 
 SIZES = {"1k": (32, 32), "4k": (64, 64), "12k": (110, 110), "50k": (224, 224)}
 MODEL = "eslr-15"
@@ -30,17 +48,11 @@ MODEL = "eslr-15"
 
 def take_turns(functions: dict, turns: int) -> dict[str, float]:
     """Return the median seconds of compiled functions, called in turns after one warm-up."""
-    import numpy as np
-
-    from eslr_jax.evaluation.scene_parts import time_in_turns
-
     return {name: 1e-3 * float(np.median(times)) for name, times in time_in_turns(functions, turns).items()}
 
 
 def compile_timed(function, args) -> tuple:
     """Return the compiled function, and its seconds of compilation and MB of temporary memory."""
-    import jax
-
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     seconds = time.perf_counter() - start
@@ -53,11 +65,7 @@ def compile_timed(function, args) -> tuple:
 
 def load(model: str, size: str) -> tuple:
     """Return config, weights, graph and garment of a tube of that size."""
-    import jax
     from reference_models import make_scene
-
-    from eslr_jax.graph.build import build_graph
-    from eslr_jax.models.registry import MODELS, init_model, measure_statistics, merge_statistics
 
     config = MODELS[model]
     scene = make_scene(*SIZES[size])
@@ -70,10 +78,7 @@ def load(model: str, size: str) -> tuple:
 
 def networks(config) -> dict:
     """Return the three builds of a network, each a function of (params, graph, garment)."""
-    import jax.numpy as jnp
     from reference_models import plain_network
-
-    from eslr_jax.models.registry import apply_model
 
     reduced = dataclasses.replace(config, precision="bfloat16")
     return {
@@ -85,10 +90,6 @@ def networks(config) -> dict:
 
 def training_step(network):
     """Return a step of Adam on a quadratic loss: forward, backward, update."""
-    import jax
-    import jax.numpy as jnp
-    import optax
-
     optimizer = optax.adam(1e-4)
 
     def step(params, graph, garment, state):
@@ -104,8 +105,6 @@ def training_step(network):
 
 def measure_size(size: str, turns: int, training: bool) -> dict:
     """Return times, compile times and memory of every build at one size."""
-    import jax.numpy as jnp
-
     config, params, graph, garment = load(MODEL, size)
     result: dict = {
         "vertices": int(garment.vertex_areas.shape[0]),
@@ -174,11 +173,7 @@ def matmul_flops(config, vertices: int, edges: int) -> float:
 
 def measure_refinement_steps(size: str, turns: int) -> dict:
     """Return the milliseconds of a refinement step of the small models, and of what they do once per frame."""
-    import jax
     from reference_models import make_scene
-
-    from eslr_jax.graph.build import build_frame_graph, build_refinement_graph
-    from eslr_jax.models.registry import MODELS, apply_refinement, encode_frame, init_model
 
     functions = {}
     for name in ("eslr-small", "lsdmp-small", "gsa-small", "mgn-small"):
@@ -201,7 +196,6 @@ def measure_refinement_steps(size: str, turns: int) -> dict:
 
 def measure_torch(size: str, turns: int) -> dict:
     """Return ratios to PyTorch; to be called in a process bound to one core."""
-    import numpy as np
     import torch
     import torch_meshgraphnet
 
@@ -231,14 +225,12 @@ def measure_torch(size: str, turns: int) -> dict:
 
 def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None:
     """Run `measure_torch` on one core, or return None where that is not possible."""
-    import importlib.util
-
     if importlib.util.find_spec("torch") is None or not hasattr(os, "sched_setaffinity"):
         return None
     core = max(os.sched_getaffinity(0))
     code = (
         f"import json, os, sys; os.sched_setaffinity(0, {{{core}}})\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        f"sys.path.insert(0, {str(EXPERIMENTS)!r})\n"
         f"import step_time; {keeps_memory} and step_time.keep_memory()\n"
         f"print(json.dumps(step_time.measure_torch({size!r}, {turns})))"
     )
@@ -254,23 +246,19 @@ def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"], choices=SIZES, help="vertices")
-    parser.add_argument("--turns", type=int, default=10, help="turns per comparison")
-    parser.add_argument("--no-training", action="store_true", help="leave the training steps out")
-    parser.add_argument("--no-torch", action="store_true", help="leave the comparison with PyTorch out")
-    parser.add_argument(
+    parsed = parser(__doc__, "1k, one turn, neither training nor PyTorch")
+    parsed.add_argument("--sizes", nargs="+", default=["1k", "4k"], choices=SIZES, help="vertices")
+    parsed.add_argument("--turns", type=int, default=10, help="turns per comparison")
+    parsed.add_argument("--no-training", action="store_true", help="leave the training steps out")
+    parsed.add_argument("--no-torch", action="store_true", help="leave the comparison with PyTorch out")
+    parsed.add_argument(
         "--keep-memory", action="store_true", help="keep freed memory, for both sides (glibc)"
     )
-    parser.add_argument("--smoke", action="store_true", help="1k, one turn, neither training nor PyTorch")
-    parser.add_argument("--json", nargs="?", const="-", help="write JSON to this file, or to the screen")
-    options = parser.parse_args()
+    options = parsed.parse_args()
     if options.smoke:
         options.sizes, options.turns, options.no_training, options.no_torch = ["1k"], 1, True, True
     if options.keep_memory:
         keep_memory()
-
-    from eslr_jax.evaluation.report import environment
 
     sizes = {}
     for size in options.sizes:
@@ -295,33 +283,8 @@ def main() -> None:
         "load": round(os.getloadavg()[0], 1),
         **environment(),
     }
-    if options.json == "-":
-        print(json.dumps(report, indent=2))
-        return
-    if options.json:
-        Path(options.json).write_text(json.dumps(report, indent=2) + "\n")
-    print_table(report)
-
-
-def print_table(report: dict) -> None:
-    """Print the report as tables."""
-    for size, result in report["sizes"].items():
-        print(f"\n{size}: {result['vertices']} vertices, {result['edges']} directed edges")
-        print(f"{'':18}{'run ms':>11}{'us/vertex':>11}{'compile s':>11}{'memory MB':>11}")
-        for name, facts in result["builds"].items():
-            columns = (facts[key] for key in ("run_ms", "us_per_vertex", "compile_s", "temporary_mb"))
-            print(
-                f"{name:18}"
-                + "".join(f"{value:>{width}}" for value, width in zip(columns, (10, 11, 11, 11), strict=True))
-            )
-        for name, milliseconds in result["refinement_ms"].items():
-            print(f"{name:18}{milliseconds:>11}")
-        for name, milliseconds in ((result.get("torch") or {}).get("run_ms") or {}).items():
-            print(f"{name:18}{milliseconds:>11}  (one thread)")
-    print()
-    for key, value in report.items():
-        if isinstance(value, float | str) or value is None:
-            print(f"{key}: {value}")
+    keep(options.out / "step_time.json", report)
+    print(json.dumps(report, indent=1))
 
 
 if __name__ == "__main__":

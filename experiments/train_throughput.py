@@ -1,20 +1,18 @@
 """Compare a training step with the forward pass, backward pass and update of the same model alone.
 
-    python experiments/benchmarks/train_throughput.py [--json] [--smoke]
+    python experiments/train_throughput.py [--smoke] [--out DIR]
 
 The whole step also poses the body, searches contacts, states the frame's problem, advances the trajectory and
-keeps the metrics. The bare step is given a problem of the same size. Both are timed alternately.
+keeps the metrics. The bare step is given a problem of the same size. Both are timed alternately. Writes
+train_throughput.json.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import optax
+from harness import EXPERIMENTS, keep, parser
 
 from eslr_jax.assets import load_body, load_motion, split_clips
 from eslr_jax.body.motion import pose_body
@@ -29,19 +27,15 @@ from eslr_jax.training.memory import keep_memory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import init_train_state, make_optimizer, make_train_step
 
-RECIPE = Path(__file__).parents[1] / "configs" / "eslr-small.toml"
+RECIPE = EXPERIMENTS / "configs" / "eslr-small.toml"
 
 
 def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--smoke", action="store_true", help="a small model, one turn")
-    arguments = parser.parse_args()
+    """Measure and write."""
+    options = parser(__doc__, "a small model, one turn")
+    chosen = options.parse_args()
     changes = (
-        {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]} if arguments.smoke else {}
+        {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]} if chosen.smoke else {}
     )
     config = load_recipe(RECIPE, {"split": "validation", **changes})
     data = load_training_data(config, config.vertices[0])
@@ -67,7 +61,7 @@ def main() -> None:
             "whole step": (lambda state: step.__wrapped__(state, data), (state,)),
             "forward, backward, update": (bare, (state.params["params"], state.optimizer, problem)),
         },
-        1 if arguments.smoke else 40,
+        1 if chosen.smoke else 40,
     )
     whole, alone = times.values()
     result = {
@@ -78,11 +72,8 @@ def main() -> None:
         "device": device_name(),
         "environment": environment(),
     }
-    print(
-        json.dumps(result, indent=1)
-        if arguments.json
-        else f"{result['ms']}, overhead {result['overhead']:.1%}"
-    )
+    keep(chosen.out / "train_throughput.json", result)
+    print(f"{times}, overhead {whole / alone - 1:.1%}")
 
 
 if __name__ == "__main__":
