@@ -39,12 +39,12 @@ _CONFIG = SimConfig(iterations=300, tolerance=1e-2)
 
 def main() -> None:
     """Simulate, render and write."""
-    options = parser(__doc__, "one garment at 1k, three frames")
-    chosen = options.parse_args()
+    chosen = parser(__doc__, "one garment at 1k, three frames").parse_args()
     worn, frames, vertices = (WORN[:1], 5, "1k") if chosen.smoke else (WORN, _FRAMES, "4k")
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
     moving, strips = with_settling(poses, SETTLE_FRAMES, body), []
+    look = {"rest_positions": np.asarray(poses.rest_positions), "rig": body, "camera": _CAMERA, "size": _SIZE}
     for name, fabric, color in worn:
         options = SceneOptions(has_skin=True, integrator="bdf2")
         scene = prepare_scene(
@@ -52,19 +52,11 @@ def main() -> None:
         )
         trajectory = simulate(None, scene, config=_CONFIG).trajectory
         print(f"{name}: {float(np.mean(trajectory.iterations[1:])):.0f} iterations a frame", flush=True)
-        pictures = render_frames(
-            np.asarray(poses.positions),
-            np.asarray(poses.faces),
-            np.asarray(trajectory.positions)[SETTLE_FRAMES:],
-            np.asarray(scene.garment.faces),
-            frame_indices=range(0, frames, _EVERY),
-            rest_positions=np.asarray(poses.rest_positions),
-            rig=body,
-            camera=_CAMERA,
-            size=_SIZE,
-            garment_color=color,
+        cloth = np.asarray(trajectory.positions)[SETTLE_FRAMES:], np.asarray(scene.garment.faces)
+        shown = {"frame_indices": range(0, frames, _EVERY), "garment_color": color, **look}
+        strips.append(
+            list(render_frames(np.asarray(poses.positions), np.asarray(poses.faces), *cloth, **shown))
         )
-        strips.append(list(pictures))
     labels = [f"{name}, {fabric}" for name, fabric, _ in worn]
     images = [Image.fromarray(side_by_side(row, labels)) for row in zip(*strips, strict=True)]
     with atomic_write(chosen.out / "animation.webp") as temporary:

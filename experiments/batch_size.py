@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 from harness import keep, kept, machine, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
+from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body
+from eslr_jax.assets import split_clips
 from eslr_jax.assets.garments import Resolution
-from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
 from eslr_jax.simulation.budget import device_name
 

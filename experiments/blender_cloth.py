@@ -57,15 +57,10 @@ def blender_python() -> str | None:
 
 
 def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
-    """Simulate a scene in Blender.
-
-    Args:
-        scene: The scene.
-        effort: Steps per frame, and rounds of collision per step.
+    """Simulate a scene in Blender, with so many steps per frame and rounds of collision per step.
 
     Raises:
-        EslrError: The scene can't be carried over, or Blender failed; the message holds the last line that it
-            wrote.
+        EslrError: The scene can't be carried over, or Blender failed; the message holds the last line it wrote.
     """
     constants, cloth = scene.constants, prepare_cloth(scene.garment, scene.material)
     first, rows = scene.initial_state, cloth.vertices
@@ -123,10 +118,7 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
 
 
 def blender_simulator(effort: tuple[int, int]) -> Simulator:
-    """Return Blender's cloth as a simulator of the hard cases.
-
-    Args:
-        effort: Steps per frame, and rounds of collision per step.
+    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`.
 
     Raises:
         MissingExtraError: BLENDER_PYTHON names no Python.

@@ -17,23 +17,16 @@ from typing import Any
 
 import jax
 import numpy as np
-from harness import keep, kept, machine, parser
+from harness import kept, machine, parser, put
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
+from eslr_jax import load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax.assets import load_splits
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import prepare_scene, prepare_scenes
-from eslr_jax.simulation.budget import (
-    Calibration,
-    choose,
-    keep_budget,
-    methods_at,
-    read_calibration,
-)
+from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.simulation.budget import Calibration, choose, keep_budget, methods_at, read_calibration
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress", "pants")
@@ -104,14 +97,7 @@ def main() -> None:
     motions = [pose_body(body, load_motion(clip), num_frames=frames) for clip in clips]
     calibration = read_calibration(chosen.calibration)
     path = chosen.out / "budget_and_tolerance.json"
-    known = kept(path)
-    rows: dict[str, list[dict[str, Any]]] = {
-        part: [
-            row for row in known.get(part, []) if part not in chosen.parts or row["size"] not in chosen.sizes
-        ]
-        for part in PARTS
-    }
-    about = dict(known.get("environments", {})) | dict.fromkeys(chosen.parts, machine())
+    about = {"clips": clips, "calibrated_on": calibration.device, **machine()}
     for size in chosen.sizes:
         cloths = {garment: load_garment(garment, vertices=size) for garment in garments}
         tasks = tolerances if "tolerance" in chosen.parts else ()
@@ -120,27 +106,19 @@ def main() -> None:
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
         for tolerance in tasks:
             row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
-            rows["tolerance"].append(row)
+            put(path, "tolerance", row, ("size", "tolerance"), about)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
         for garment, cloth in cloths.items() if "budget" in chosen.parts else ():
             scene = prepare_scene(cloth, motions[0])  # not padded to a common size
             for factor in budgets:
-                row = {"size": size, "garment": garment, **measure_budget(calibration, scene, factor)}
-                rows["budget"].append(row)
+                row = {"size": size, "garment": garment, "factor": factor}
+                row |= measure_budget(calibration, scene, factor)
+                put(path, "budget", row, ("size", "garment", "factor"), about)
                 text = f"budget {row['budget_ms']:.1f} ms, took {row['frame_ms']:.1f} ms"
                 print(f"{size} {garment}: {text}", flush=True)
         jax.clear_caches()
-    ratios = [row["frame_ms"] / row["budget_ms"] for row in rows["budget"]]
-    result = {
-        "clips": clips,
-        **rows,
-        "budget_ratio_median": float(np.median(ratios)) if ratios else None,
-        "calibrated_on": calibration.device,
-        "environments": about,
-    }
-    if ratios:
+    if ratios := [row["frame_ms"] / row["budget_ms"] for row in kept(path).get("budget", [])]:
         print(f"time over budget, median: {np.median(ratios):.2f}")
-    keep(path, result)
 
 
 if __name__ == "__main__":

@@ -23,11 +23,10 @@ from harness import keep, kept, machine, parser
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_both_sides, find_contacts
+from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.numerics import vertex_normals
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.solve import Start, solve
@@ -72,10 +71,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
 
     body = (state.position, step.body.start, step.body.end, surface, blocks)
     parts = {
-        "body normals": (jax.jit(vertex_normals), (step.body.end, surface.faces, surface.face_incidence)),
-        "nearest contact": (jax.jit(find_contacts), body),
         "both contacts": (jax.jit(find_both_sides), body),
-        "frame problem": (jax.jit(frame_problem), (scene, state, step)),
         "guess": (jax.jit(initial_guess), (problem,)),
         "preconditioner": (jax.jit(stretched_stiffness), (problem, start.position)),
         "all before the first iteration": (before, (scene, state, step)),

@@ -66,6 +66,23 @@ def keep(path: Path, result: Mapping[str, Any]) -> None:
         temporary.write_text(text + "\n")
 
 
+def put(
+    path: Path, part: str, row: Mapping[str, Any], names: Sequence[str], about: Mapping[str, Any]
+) -> None:
+    """Keep a row of a part, in the place of the one that had the same values under some names.
+
+    Args:
+        path: File of the result.
+        part: Key of the rows.
+        row: What was measured.
+        names: Keys that tell rows apart.
+        about: What else the result says, such as versions.
+    """
+    result = kept(path)
+    others = [one for one in result.get(part, []) if any(one.get(name) != row.get(name) for name in names)]
+    keep(path, {**result, part: [*others, row], **about})
+
+
 def save(figure: Any, path: Path) -> None:
     """Write a figure of matplotlib as PNG."""
     with atomic_write(path) as temporary:

@@ -190,10 +190,6 @@ class NewtonCloth:
     def __init__(self, scene: Scene, setting: Setting) -> None:
         """Build the model.
 
-        Args:
-            scene: The scene.
-            setting: Solver and effort.
-
         Raises:
             MissingExtraError: Newton is not installed.
         """
@@ -298,25 +294,12 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
         "xpbd": cloth.bending / cloth.hinge_areas,
     }[solver]
     zeros = [0.0] * len(cloth.faces)
-    builder.add_triangles(
-        *cloth.faces.T,
-        tri_ke=cloth.shear.tolist(),
-        tri_ka=cloth.area_stiffness.tolist(),
-        tri_kd=zeros,
-        tri_drag=zeros,
-        tri_lift=zeros,
-        custom_attributes=triangles,
-    )
-    builder.add_edges(
-        left,
-        right,
-        start,
-        end,
-        rest=[0.0] * len(start),  # fabric is flat
-        edge_ke=bending.tolist(),
-        edge_kd=[0.0] * len(start),
-        custom_attributes=hinges,
-    )
+    stiffness = {"tri_ke": cloth.shear.tolist(), "tri_ka": cloth.area_stiffness.tolist()}
+    stiffness |= dict.fromkeys(("tri_kd", "tri_drag", "tri_lift"), zeros)
+    builder.add_triangles(*cloth.faces.T, custom_attributes=triangles, **stiffness)
+    zeros = [0.0] * len(start)
+    bent = {"rest": zeros, "edge_ke": bending.tolist(), "edge_kd": zeros}  # fabric is flat at rest
+    builder.add_edges(left, right, start, end, custom_attributes=hinges, **bent)
     if solver == "xpbd":
         for (i, j), stiffness in zip(*springs(cloth), strict=True):
             builder.add_spring(int(i), int(j), float(stiffness), 0.0, control=0.0)
@@ -358,9 +341,6 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
 
 def newton_simulator(setting: Setting) -> Simulator:
     """Return a solver of Newton as a simulator of the hard cases.
-
-    Args:
-        setting: Solver and effort.
 
     Raises:
         MissingExtraError: Newton is not installed.

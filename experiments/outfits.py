@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 from harness import keep, machine, parser
 
-from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
-from eslr_jax.body.motion import pose_body
+from eslr_jax import SceneOptions, SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.fit.outfit import combine_garments
 from eslr_jax.geometry.topology import is_on_boundary
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.simulate import simulate
 
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
 CLIP = "cmu_016_32"  # of the test split
@@ -86,8 +83,7 @@ def main() -> None:
         for count in substeps:
             rows.append(row := count_pairs(names, frames, count))
             print(json.dumps(row), flush=True)
-    result = {"clip": CLIP, "frames": frames, "every": EVERY, "rows": rows}
-    result |= {**machine()}
+    result = {"clip": CLIP, "frames": frames, "every": EVERY, "rows": rows, **machine()}
     keep(chosen.out / "outfits.json", result)
 
 

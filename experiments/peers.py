@@ -32,32 +32,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
-from hard_cases import drop_scene
 from harness import keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, Trajectory, score_trajectory
 from eslr_jax.errors import MissingExtraError, NonFiniteError
 from eslr_jax.evaluation.calibrate import example_scene
 from eslr_jax.evaluation.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.score import score_trajectory
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import rollout_scene, step_frame
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.types import ClothState, Scene, Trajectory
+from eslr_jax.types import ClothState, Scene
 
 CLIP = "cmu_016_32"  # of the test split
 SETTINGS = (
-    Setting("vbd", 1, 20),
-    Setting("vbd", 5, 5),
-    Setting("vbd", 5, 10),
-    Setting("vbd", 5, 20),
-    Setting("style3d", 1, 20),
-    Setting("style3d", 2, 5),
-    Setting("style3d", 2, 10),
-    Setting("style3d", 2, 20),
+    *(Setting("vbd", *effort) for effort in ((1, 20), (5, 5), (5, 10), (5, 20))),
+    *(Setting("style3d", *effort) for effort in ((1, 20), (2, 5), (2, 10), (2, 20))),
     Setting("xpbd", None, 1),
 )
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
@@ -71,6 +63,7 @@ SCORE = {  # measure of `score_trajectory` -> column
     "intersections_cloth": "intersections_cloth",
     "intersections_body": "intersections_body",
 }
+GAPS = ("gap_relative_median", "gap_relative_max", "gap_j_median")
 EVERY = 6  # frames between those whose gap is measured
 TIMED_FRAMES = 20  # of `peer_points`
 
@@ -118,14 +111,6 @@ def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
     return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
 
 
-def make_scene(name: str, num_frames: int) -> Scene:
-    """Return a scene by name: a garment on the clip, or the sheet dropped on a ball, and its resolution."""
-    what, size = name.split("_")
-    if what == "ball":
-        return drop_scene({}, columns={"1k": 33, "4k": 65}[size], seconds=(num_frames - 1) / 30).scene
-    return example_scene(what, size, CLIP, num_frames)
-
-
 def take_turns(
     methods: list[Method], scene: Scene, num_frames: int
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
@@ -152,14 +137,7 @@ def take_turns(
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return every method's gap [J] after one frame from states of a rollout, and the frames' initial gaps [J].
-
-    Args:
-        methods: On the scene.
-        scene: The scene.
-        truth: Its near-optimal rollout.
-        every: Frames between the states.
-    """
+    """Return every method's gap [J] a frame after every so many states of `truth`, and the initial gaps [J]."""
     ends = trajectory_gap(truth, scene, every=every)
     states, inputs = trajectory_states(truth, scene)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
@@ -236,11 +214,8 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int)
 def summarize_gap(gap: np.ndarray, initial: np.ndarray) -> dict[str, float | None]:
     """Return medians and largest values; None where a position was not finite."""
     gap = np.maximum(gap, 0.0)
-    values = {
-        "gap_relative_median": np.median(gap / initial),
-        "gap_relative_max": np.max(gap / initial),
-        "gap_j_median": np.median(gap),
-    }
+    share = gap / initial
+    values = dict(zip(GAPS, (np.median(share), np.max(share), np.median(gap)), strict=True))
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 
@@ -317,7 +292,7 @@ def main() -> None:
     }
     result["versions"] |= peer_versions()
     for name in chosen.scenes:
-        scene = make_scene(name, chosen.frames)
+        scene = example_scene(*name.split("_"), CLIP, chosen.frames)
         rows = measure_scene(scene, efforts, covering, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hard_cases import find_case
 from harness import keep, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
@@ -35,33 +36,14 @@ ITERATIONS = 20  # of the solver
 Pair = dict[str, Scene]  # two scenes by their labels; the first has more parts
 
 
-def layered_skirt(num_frames: int) -> Scene:
-    """Return the hard case's skirt over trousers, whose layers collide."""
-    from hard_cases import find_case
-
-    scene = find_case("layers").build({})["skirt over trousers"].scene
-    return with_room(first_frames(scene, num_frames))
-
-
 def with_room(scene: Scene) -> Scene:
     """Return a scene whose layers collide with buffers that suffice."""
     return simulate(None, scene, config=SimConfig(iterations=ITERATIONS)).scene
 
 
-def without_layers(scene: Scene) -> Scene:
-    """Return a scene in which layers of cloth pass through each other."""
-    return scene.replace(self_contact=None)
-
-
 def with_layers(scene: Scene) -> Scene:
     """Return a scene in which layers of cloth collide."""
     return with_room(scene.replace(self_contact=starting_capacity(scene.garment.vertex_mask.shape[0])))
-
-
-def compare_steps(pair: Pair, turns: int) -> dict[str, float]:
-    """Return the milliseconds of both scenes' rollouts, and their ratio."""
-    step = partial(rollout_scene, None, config=SimConfig(iterations=ITERATIONS))
-    return ratio_of(take_turns({name: (step, (scene,)) for name, scene in pair.items()}, turns))
 
 
 def compare_searches(pair: Pair, turns: int) -> dict[str, Any]:
@@ -103,54 +85,41 @@ def main() -> None:
     )
     scene = prepare_scene(shirt, poses)
     still = pose_body(body, still_motion(body, frames, arm_angle=ARM_ABDUCTION), num_frames=frames)
-    dress = partial(prepare_scene, load_garment("dress", vertices=chosen.vertices), poses)
+    pinned = partial(prepare_scene, load_garment("dress", vertices=chosen.vertices), poses)
+
+    def modelled(**options: Any) -> Scene:
+        return prepare_scene(shirt, poses, options=SceneOptions(**options))
+
+    skirt = find_case("layers").build({})["skirt over trousers"].scene
     # Each pair is built when its turn comes; the smoke run takes the first.
     pairs: dict[str, Callable[[], Pair]] = {
-        "T-shirt: with a body against without": lambda: {
-            "with": scene,
-            "without": prepare_scene(shirt, poses, options=SceneOptions(has_body=False)),
-        },
+        "T-shirt: with a body against without": lambda: {"with": scene, "without": modelled(has_body=False)},
         "T-shirt: self-contact against none": lambda: {"with": with_layers(scene), "without": scene},
-        "T-shirt: skin contacts against none": lambda: {
-            "with": prepare_scene(shirt, poses, options=SceneOptions(has_skin=True)),
-            "without": scene,
-        },
-        "T-shirt: BDF2 against implicit Euler": lambda: {
-            "bdf2": prepare_scene(shirt, poses, options=SceneOptions(integrator="bdf2")),
-            "euler": scene,
-        },
+        "T-shirt: skin contacts against none": lambda: {"with": modelled(has_skin=True), "without": scene},
+        "T-shirt: BDF2 against implicit Euler": lambda: {"bdf2": modelled(integrator="bdf2"), "euler": scene},
         "T-shirt: air that moves against none": lambda: {
-            "with": prepare_scene(shirt, poses, options=SceneOptions(air=Air((3.0, 0.0, 0.0)))),
-            "without": scene,
+            "with": modelled(air=Air((3.0, 0.0, 0.0))), "without": scene,
         },
-        "T-shirt: whole body against what it reaches": lambda: {
-            "whole body": prepare_scene(shirt, poses, surface=whole),
-            "reached": scene,
-        },
+        "T-shirt: whole body against what it reaches": lambda: {"whole body": everything, "reached": scene},
         "T-shirt: fabric per face against one fabric": lambda: {
-            "per face": prepare_scene(shirt, poses, material=by_face),
-            "one": scene,
+            "per face": prepare_scene(shirt, poses, material=by_face), "one": scene,
         },
         "dress: pins that move against none": lambda: {
-            "pinned": dress(),
-            "free": dress().replace(pin_targets=None),
+            "pinned": pinned(), "free": pinned().replace(pin_targets=None),
         },
         "skirt over trousers: layers that collide against layers that don't": lambda: {
-            "with": (skirt := layered_skirt(frames)),
-            "without": without_layers(skirt),
+            "with": (worn := with_room(first_frames(skirt, frames))), "without": worn.replace(self_contact=None),
         },
         "T-shirt: moving body against a still one": lambda: {
-            "moving": scene,
-            "still": prepare_scene(shirt, still),
+            "moving": scene, "still": prepare_scene(shirt, still),
         },
         "T-shirt: all of that against what it needs": lambda: {
-            "all": with_layers(prepare_scene(shirt, poses, surface=whole, material=by_face)),
-            "needed": scene,
+            "all": with_layers(prepare_scene(shirt, poses, surface=whole, material=by_face)), "needed": scene,
         },
-    }
+    }  # fmt: skip
+    everything = prepare_scene(shirt, poses, surface=whole)
     if chosen.smoke:
         pairs = dict(list(pairs.items())[:1])
-    everything = prepare_scene(shirt, poses, surface=whole)
     result: dict[str, Any] = {
         "vertices": int(np.sum(shirt.vertex_mask)),
         "frames": frames - 1,
@@ -159,11 +128,12 @@ def main() -> None:
             {"whole body": everything, "reached": scene}, turns
         ),
     }
+    step = partial(rollout_scene, None, config=SimConfig(iterations=ITERATIONS))
     for name, build in pairs.items():
-        result[name] = compare_steps(build(), turns)
+        calls = {label: (step, (one,)) for label, one in build().items()}
+        result[name] = ratio_of(take_turns(calls, turns))
         print(f"{name}: {result[name]['ratio']:.2f}x", flush=True)
-    result |= {**machine()}
-    keep(chosen.out / "scene_needs.json", result)
+    keep(chosen.out / "scene_needs.json", {**result, **machine()})
 
 
 if __name__ == "__main__":

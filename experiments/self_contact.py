@@ -11,6 +11,7 @@ starts that differ by 1e-5 m. Writes self_contact_1k.json.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,11 @@ CONFIG = SimConfig(iterations=300, tolerance=0.01)
 _STARTS_APART = 1e-5  # [m] standard deviation
 
 
-def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) -> list[dict[str, Any]]:
-    """Return intersecting pairs of cloth faces over rollouts, and milliseconds a frame."""
+def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) -> Iterator[dict[str, Any]]:
+    """Yield intersecting pairs of cloth faces over rollouts, and milliseconds a frame."""
     cloth, body = load_garment(garment, vertices=vertices), load_body()
     poses = pose_body(body, load_motion(clip), num_frames=frames)
     surface = shared_surface([cloth], poses)  # all clips then share a program
-    rows = []
     kinds = [(True, False, 0), *((True, True, number) for number in range(starts)), (False, False, 0)]
     for is_put_on, has_layers, number in kinds:
         options = SceneOptions(self_contact=has_layers, has_skin=True, integrator="bdf2")
@@ -44,24 +44,22 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
         scene = moved(prepare_scene(cloth, moving, surface=surface, options=options), number)
         run = simulate(None, scene, config=CONFIG)
         positions = np.asarray(run.trajectory.positions)
-        row: dict[str, Any] = {"garment": garment, "clip": clip, "vertices": vertices}
-        row |= {"put_on": is_put_on, "self_contact": has_layers, "number": number}
-        row["start"] = judge(positions[0], np.asarray(cloth.faces)).cloth_cloth
-        counts = [
+        start, *counts = (
             judge(position, np.asarray(cloth.faces)).cloth_cloth
-            for position in positions[SETTLE_FRAMES:][::EVERY]
-        ]
-        row |= {"pairs": counts, "mean": float(np.mean(counts))}
-        row["residual_max"] = float(np.max(run.trajectory.residuals))
-        row["iterations"] = float(np.mean(run.trajectory.iterations))
-        row["frame_ms"] = run.timing.frame_ms
-        if run.trajectory.pair_demand is not None:
-            row |= {
-                "pairs_found": int(np.max(run.trajectory.pair_demand)),
-                "rows": run.scene.self_contact.pairs,
-            }
-        rows.append(row)
-    return rows
+            for position in (positions[0], *positions[SETTLE_FRAMES::EVERY])
+        )
+        trajectory = run.trajectory
+        row = {
+            "garment": garment, "clip": clip, "vertices": vertices,
+            "put_on": is_put_on, "self_contact": has_layers, "number": number,
+            "start": start, "pairs": counts, "mean": float(np.mean(counts)),
+            "residual_max": float(np.max(trajectory.residuals)),
+            "iterations": float(np.mean(trajectory.iterations)),
+            "frame_ms": run.timing.frame_ms,
+        }  # fmt: skip
+        if trajectory.pair_demand is not None:
+            row |= {"pairs_found": int(np.max(trajectory.pair_demand)), "rows": run.scene.self_contact.pairs}
+        yield row
 
 
 def moved(scene: Scene, number: int) -> Scene:
@@ -87,10 +85,10 @@ def main() -> None:
     rows = []
     for garment in garments:
         for clip in clips:
-            rows += (found := measure(garment, clip, chosen.vertices, frames, chosen.starts))
-            print(*map(json.dumps, found), sep="\n", flush=True)
-    result = {"rows": rows, "frames": frames, "settle": SETTLE_FRAMES, "every": EVERY}
-    result |= {**machine()}
+            for row in measure(garment, clip, chosen.vertices, frames, chosen.starts):
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+    result = {"rows": rows, "frames": frames, "settle": SETTLE_FRAMES, "every": EVERY, **machine()}
     keep(chosen.out / f"self_contact_{chosen.vertices}.json", result)
 
 

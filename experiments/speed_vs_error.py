@@ -18,19 +18,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import jax
-import numpy as np
 from harness import keep, kept, parser, save
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.models import START_MODEL
-from eslr_jax.evaluation.calibrate import (
-    example_scene,
-    measure_methods,
-    read_coarse_edges,
-    simulator_of,
-)
+from eslr_jax.evaluation.calibrate import example_scene, measure_methods, read_coarse_edges, simulator_of
 from eslr_jax.evaluation.report import environment, trajectory_report
-from eslr_jax.simulation.budget import SOLVER, Method, device_name, interpolate_gap
+from eslr_jax.simulation.budget import SOLVER, Method, device_name
 from eslr_jax.simulation.rollout import rollout_scene
 
 CLIP = "cmu_016_32"  # of the test split
@@ -63,31 +57,6 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
         reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})
     return reports
-
-
-def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
-    """Return the gap of every method for a range of times per frame.
-
-    Between two measured numbers of iterations our methods are interpolated. A peer's settings are single points;
-    the best of those within the time counts.
-
-    Args:
-        by_name: Measured points of every method.
-        peers: Names of those that are peers.
-    """
-    least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
-    most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
-
-    def within(name: str, budget: float) -> float | None:
-        curve = {entry["frame_ms"]: entry["gap_relative_median"] for entry in by_name[name]}
-        if name in peers:
-            return min((gap for time, gap in curve.items() if time <= budget), default=None)
-        return interpolate_gap(curve, budget) if budget >= min(curve) else None
-
-    return [
-        {"budget_ms": float(budget), **{name: within(name, budget) for name in by_name}}
-        for budget in np.geomspace(least, most, 8)
-    ]
 
 
 def draw(result: dict, path: Path) -> None:
@@ -146,12 +115,8 @@ def main() -> None:
         solver_counts = network_counts = (10,)  # which the calibration has compiled
     path = chosen.out / "speed_vs_error.json"
     older = {} if chosen.smoke else kept(path)
-    result: dict = {
-        "clip": CLIP,
-        "device": device_name(),
-        "peers": older.get("peers", []),
-        "sizes": older.get("sizes", {}),
-    }
+    result: dict = {"clip": CLIP, "device": device_name(), "peers": [], "sizes": {}}
+    result |= {name: older[name] for name in ("peers", "sizes") if name in older}
     names = (SOLVER, *chosen.models)
     reads_edges = read_coarse_edges(names)
     for size in chosen.sizes:
@@ -190,13 +155,11 @@ def main() -> None:
                 {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
                 for method in methods
             ],
-            "budgets": who_wins(measured, result["peers"]),
             "rollouts": rollouts,
             "environment": about,
         }
         draw(result, chosen.out / "speed_vs_error.png")
         keep(path, result)
-        print(size, *result["sizes"][size]["budgets"], sep="\n", flush=True)
         jax.clear_caches()
 
 

@@ -4,8 +4,7 @@
 
 All builds of a comparison run alternately (A B A B ...) in one process and are compared as ratios of medians.
 Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a process
-of its own on one core; without PyTorch it is left out. `floor_share` is the share of the exact forward pass that
-its matrix products would take at the rate of one large product, which is measured in the same turns.
+of its own on one core; without PyTorch it is left out.
 
 Writes step_time.json.
 """
@@ -28,12 +27,10 @@ from harness import EXPERIMENTS, keep, parser
 
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
+from eslr_jax.graph.build import build_graph
 from eslr_jax.models.registry import (
     MODELS,
     apply_model,
-    apply_refinement,
-    encode_frame,
     init_model,
     measure_statistics,
     merge_statistics,
@@ -111,87 +108,32 @@ def measure_size(size: str, turns: int, training: bool) -> dict:
         "edges": int(garment.senders.shape[0]),
         "builds": {},
     }
-    forwards, flops = {}, 0.0
+    forwards = {}
     for name, network in networks(config).items():
         args = (params, graph, garment)
-        compiled, facts = compile_timed(network, args)
+        compiled, result["builds"][f"forward_{name}"] = compile_timed(network, args)
         forwards[f"forward_{name}"] = (compiled, args)
-        result["builds"][f"forward_{name}"] = facts
-        if name == "exact":
-            flops = matmul_flops(config, result["vertices"], result["edges"])
-    rows = jnp.ones((result["edges"], config.latent_size))
-    kernel = jnp.eye(config.latent_size)
-    product, _ = compile_timed(jnp.matmul, (rows, kernel))
-    times = take_turns({**forwards, "product": (product, (rows, kernel))}, turns)
-    rate = 2 * rows.shape[0] * config.latent_size**2 / times.pop("product")
-    result["matmul_gflops_per_s"] = round(rate / 1e9, 1)
-    result["floor_share"] = round(flops / rate / times["forward_exact"], 3)
+    times = take_turns(forwards, turns)
     if training:
         steps = {}
         for name, network in networks(config).items():
             step, init = training_step(network)
             args = (params, graph, garment, init(params["params"]))
-            compiled, facts = compile_timed(step, args)
+            compiled, result["builds"][f"train_{name}"] = compile_timed(step, args)
             steps[f"train_{name}"] = (compiled, args)
-            result["builds"][f"train_{name}"] = facts
         times.update(take_turns(steps, max(3, turns // 2)))
     for name, seconds in times.items():
         result["builds"][name]["run_ms"] = round(1e3 * seconds, 2)
         result["builds"][name]["us_per_vertex"] = round(1e6 * seconds / result["vertices"], 2)
-    result["forward_exact_vs_plain"] = ratio(times, "forward_plain", "forward_exact")
-    result["forward_reduced_vs_plain"] = ratio(times, "forward_plain", "forward_reduced")
-    if training:
-        result["train_exact_vs_plain"] = ratio(times, "train_plain", "train_exact")
-        result["train_reduced_vs_plain"] = ratio(times, "train_plain", "train_reduced")
+    for kind in ("forward", "train")[: 1 + training]:
+        for build in ("exact", "reduced"):
+            result[f"{kind}_{build}_vs_plain"] = ratio(times, f"{kind}_plain", f"{kind}_{build}")
     return result
 
 
 def ratio(times: dict[str, float], slow: str, fast: str) -> float:
     """Return how many times as fast `fast` is."""
     return round(times[slow] / times[fast], 3)
-
-
-def matmul_flops(config, vertices: int, edges: int) -> float:
-    """Return the operations of the matrix products of an exact forward pass, a world edge per vertex.
-
-    Counted in products of a row with a square kernel of the latent size.
-    """
-    hidden = config.hidden_layers
-    per_edge = 1 + hidden  # edge perceptron; its vertex pieces are counted per vertex
-    per_vertex = 2 + (3 + hidden) + (3 + hidden)  # both ends, vertex perceptron, world perceptron
-    if config.update_body:
-        per_vertex += (3 + hidden) + (2 + hidden)
-    if config.smoothing_steps:
-        per_vertex += (1 + hidden) * (2 if config.update_body else 1)
-    rows = config.message_passing_steps * (per_edge * edges + per_vertex * vertices)
-    rows += hidden * (edges + 4 * vertices)  # encoders behind their narrow first layer, decoder
-    square = 2.0 * config.latent_size**2 * rows
-    features = config.attention_features * config.attention_size
-    block = 4 * config.latent_size * config.attention_size + 4 * features
-    return square + 2.0 * config.attention_blocks * vertices * block
-
-
-def measure_refinement_steps(size: str, turns: int) -> dict:
-    """Return the milliseconds of a refinement step of the small models, and of what they do once per frame."""
-    from reference_models import make_scene
-
-    functions = {}
-    for name in ("eslr-small", "lsdmp-small", "gsa-small", "mgn-small"):
-        config = MODELS[name]
-        params, scene = init_model(config), make_scene(*SIZES[size])
-
-        def frame(params, garment, material, inputs, config=config):
-            graph = build_frame_graph(garment, material, inputs, config)
-            return graph, encode_frame(config, params, graph)
-
-        def one_step(params, graph, encoded, garment, material, inputs, config=config):
-            changing = build_refinement_graph(garment, material, inputs, graph)
-            return apply_refinement(config, params, encoded, changing, garment)
-
-        graph, encoded = jax.jit(frame)(params, *scene)
-        functions[f"{name} frame"] = (jax.jit(frame), (params, *scene))
-        functions[f"{name} refinement step"] = (jax.jit(one_step), (params, graph, encoded, *scene))
-    return {name: round(1e3 * seconds, 3) for name, seconds in take_turns(functions, 5 * turns).items()}
 
 
 def measure_torch(size: str, turns: int) -> dict:
@@ -207,19 +149,17 @@ def measure_torch(size: str, turns: int) -> dict:
                 args = (params, graph, garment)
                 functions[f"{model} {name}"] = (compile_timed(network, args)[0], args)
     edges = (np.asarray(garment.senders), np.asarray(garment.receivers))
-    functions["torch mgn-15"] = (
-        torch_meshgraphnet.make_forward(*edges, garment.vertex_areas.shape[0]),
-        (),
-    )
+    functions["torch mgn-15"] = (torch_meshgraphnet.make_forward(*edges, garment.vertex_areas.shape[0]), ())
     times = take_turns(functions, turns)
     return {
         "torch": torch.__version__,
         "threads": 1,
         "run_ms": {name: round(1e3 * seconds, 1) for name, seconds in times.items()},
-        "eslr15_exact_vs_torch_mgn15": ratio(times, "torch mgn-15", "eslr-15 exact"),
-        "eslr15_reduced_vs_torch_mgn15": ratio(times, "torch mgn-15", "eslr-15 reduced"),
-        "mgn15_exact_vs_torch_mgn15": ratio(times, "torch mgn-15", "mgn-15 exact"),
-        "mgn15_reduced_vs_torch_mgn15": ratio(times, "torch mgn-15", "mgn-15 reduced"),
+        **{
+            f"{model}_{build}_vs_torch_mgn15": ratio(times, "torch mgn-15", f"{model[:-2]}-15 {build}")
+            for model in ("eslr15", "mgn15")
+            for build in ("exact", "reduced")
+        },
     }
 
 
@@ -234,10 +174,8 @@ def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None
         f"import step_time; {keeps_memory} and step_time.keep_memory()\n"
         f"print(json.dumps(step_time.measure_torch({size!r}, {turns})))"
     )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
-    )
+    process = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", code], check=False, **process)  # type: ignore[call-overload]
     if done.returncode:
         print(done.stderr[-2000:], file=sys.stderr)
         return None
@@ -264,18 +202,10 @@ def main() -> None:
     for size in options.sizes:
         print(f"{size}: {MODEL} ...", file=sys.stderr)
         sizes[size] = measure_size(size, options.turns, not options.no_training)
-        sizes[size]["refinement_ms"] = measure_refinement_steps(size, options.turns)
         if not options.no_torch:
             print(f"{size}: PyTorch ...", file=sys.stderr)
             sizes[size]["torch"] = torch_in_a_process(size, options.turns, options.keep_memory)
-    main_size = sizes.get("4k") or sizes[options.sizes[-1]]
-    keys = ("forward_exact_vs_plain", "train_exact_vs_plain", "forward_reduced_vs_plain", "floor_share")
     report = {
-        **{key: main_size.get(key) for key in keys},
-        **{
-            key: (main_size.get("torch") or {}).get(key)
-            for key in ("eslr15_exact_vs_torch_mgn15", "eslr15_reduced_vs_torch_mgn15")
-        },
         "model": MODEL,
         "sizes": sizes,
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),

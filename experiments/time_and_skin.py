@@ -18,29 +18,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import keep, kept, parser
+from harness import parser, put
 from scipy.spatial import cKDTree
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
+from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body, simulate
+from eslr_jax.assets import load_splits
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.cli.console import use_compile_cache
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs, judge
 from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import Integrator, start_integrator
-from eslr_jax.scene.plan import SceneOptions, prepare_scenes
-from eslr_jax.simulation.simulate import simulate
+from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.types import Scene
 
 PARTS = ("skin", "time")
+NAMES = ("garment", "vertices", "clip", "integrator", "steps")  # of a row
 GARMENTS = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
 INTEGRATORS: tuple[Integrator, ...] = ("bdf2", "euler")
 FPS, FRAMES = 30.0, 60
@@ -110,11 +108,7 @@ def _body(scene: Scene, frame: int) -> tuple[np.ndarray, np.ndarray]:
 def judge_frame(scene: Scene, positions: np.ndarray, frame: int, crossings: np.ndarray) -> dict[str, Any]:
     """Return the pairs of a frame, its depth for 99.9 % of vertices [mm], and whether the body pinches it.
 
-    Args:
-        scene: Of the frame.
-        positions: Of the cloth [m].
-        frame: Its number.
-        crossings: Where the body intersects itself [m].
+    `crossings` are where the body intersects itself [m].
     """
     cloth, (body, faces) = scene.garment, _body(scene, frame)
     own = np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]
@@ -176,18 +170,6 @@ def measure_time(
                 }  # fmt: skip
 
 
-def put(path: Path, part: str, row: dict[str, Any]) -> None:
-    """Keep a row, in the place of the one that was measured before."""
-    names = ("garment", "vertices", "clip", "integrator", "steps")
-
-    def key(one: dict[str, Any]) -> list:
-        return [one.get(name) for name in names]
-
-    result = kept(path)
-    others = [one for one in result.get(part, []) if key(one) != key(row)]
-    keep(path, {**result, part: [*others, row], **environment()})
-
-
 def main() -> None:
     """Run the command line."""
     options = parser(__doc__, "one garment, one clip, few frames")
@@ -207,7 +189,7 @@ def main() -> None:
         else:
             rows = measure_time(garments, chosen.vertices, clips[: 1 if is_smoke else 3], is_smoke)
         for row in rows:
-            put(path, part, row)
+            put(path, part, row, NAMES, environment())
             print(part, row, flush=True)
 
 

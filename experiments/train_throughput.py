@@ -12,14 +12,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import optax
-from harness import EXPERIMENTS, keep, parser
+from harness import EXPERIMENTS, keep, machine, parser
 
-from eslr_jax.assets import load_body, load_motion, split_clips
-from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.report import environment
+from eslr_jax import load_body, load_motion, pose_body, prepare_scene
+from eslr_jax.assets import split_clips
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
@@ -32,12 +29,9 @@ RECIPE = EXPERIMENTS / "configs" / "eslr-small.toml"
 
 def main() -> None:
     """Measure and write."""
-    options = parser(__doc__, "a small model, one turn")
-    chosen = options.parse_args()
-    changes = (
-        {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]} if chosen.smoke else {}
-    )
-    config = load_recipe(RECIPE, {"split": "validation", **changes})
+    chosen = parser(__doc__, "a small model, one turn").parse_args()
+    small = {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]}
+    config = load_recipe(RECIPE, {"split": "validation", **(small if chosen.smoke else {})})
     data = load_training_data(config, config.vertices[0])
     state = init_train_state(config, (data,))
     poses = pose_body(load_body(), load_motion(split_clips(config.split)[0]), num_frames=2)
@@ -69,8 +63,7 @@ def main() -> None:
         "vertices": config.vertices[0],
         "ms": times,
         "overhead": whole / alone - 1,
-        "device": device_name(),
-        "environment": environment(),
+        **machine(),
     }
     keep(chosen.out / "train_throughput.json", result)
     print(f"{times}, overhead {whole / alone - 1:.1%}")

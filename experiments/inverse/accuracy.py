@@ -18,16 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body, prepare_scene
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.physics import solve
 from eslr_jax.scene.build import slice_tracks
-from eslr_jax.scene.plan import first_frames, prepare_scene
+from eslr_jax.scene.plan import first_frames
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Scene, Trajectory, tree_cast
+from eslr_jax.types import Scene, tree_cast
 from inverse.sheet import RESULTS
 
 STEPS = {"fabric": 1e-4, "density": 1e-4, "body": 1e-6}  # of central differences; a share, a share, [m]
@@ -87,14 +85,10 @@ def loss(change: dict, scene: Scene, weights: jax.Array, iterations: jax.Array, 
 def measure(
     scenes: tuple[Scene, Scene], expected: np.ndarray, config: SimConfig, counts: tuple, turns: int
 ) -> dict:
-    """Return errors of gradients in float32 (None: refused), and their cost, by the number of iterations.
+    """Return errors of gradients in float32 (None: refused) and their cost, by bounds of iterations.
 
-    Args:
-        scenes: The walk, and its next frame.
-        expected: Right gradients, shape [parameters, losses].
-        config: Holds the tolerance of a frame.
-        counts: Bounds of iterations.
-        turns: Of timing; 0 leaves the cost out.
+    `scenes` are the walk and its next frame, `expected` the right gradients, shape [parameters, losses]. Without
+    turns no cost is measured.
     """
     walk, frame = scenes
     value = jax.jit(partial(loss, config=config))

@@ -14,15 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, parser
 
-from eslr_jax.assets import load_body, load_garment
-from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene
+from eslr_jax.body.motion import still_motion
 from eslr_jax.body.retarget import ARM_ABDUCTION
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.membrane import principal_stretches
 from eslr_jax.physics.rest_shape import with_rest_positions
-from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Body, Scene
 from inverse.search import descend, gradient_cost, search_simplex
@@ -62,9 +60,8 @@ def main() -> None:
     scene = make_scene(body, frames)
     garment = scene.garment
     weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
-    normals = jnp.asarray(
-        vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces)), jnp.float32
-    )
+    normals = vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces))
+    normals = jnp.asarray(normals, jnp.float32)
 
     def wear(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the shirt on the body [m], and the larger principal stretch of every face."""
@@ -75,9 +72,7 @@ def main() -> None:
 
     def loss(parameters: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         worn, stretch = wear(parameters)
-        over = jnp.sum(garment.rest_areas * jnp.maximum(stretch - BAR, 0.0) ** 2) / jnp.sum(
-            garment.rest_areas
-        )
+        over = jnp.average(jnp.maximum(stretch - BAR, 0.0) ** 2, weights=garment.rest_areas)
         return over + PRICE * jnp.sum(parameters**2), (worn, stretch)
 
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
@@ -102,7 +97,7 @@ def main() -> None:
         "let_out_mm": {name: np.round(1e3 * UNIT * best, 1) for name, best in shirts.items()},
         "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, (_, stretch) in worn.items()},
         "area_above_bar": {
-            name: float(areas[np.asarray(stretch) > BAR].sum() / areas.sum())
+            name: float(np.average(np.asarray(stretch) > BAR, weights=areas))
             for name, (_, stretch) in worn.items()
         },
         "loss_1e-4": {"lbfgs": min(by_gradient.losses), "nelder_mead": min(simplex.losses)},

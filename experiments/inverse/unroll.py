@@ -51,13 +51,7 @@ def make_scene(seed: int, num_frames: int) -> Scene:
 
 
 def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
-    """Return every frame's potential [J] where the network's own motion ended it.
-
-    Args:
-        params: Weights of the network.
-        scene: The sheet.
-        is_detached: Stop gradients between frames.
-    """
+    """Return every frame's potential [J] where the network ended it; detached: frames hand on no gradient."""
     step = make_stepper(params, ALONE)
 
     def advance(state, inputs):

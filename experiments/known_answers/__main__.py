@@ -56,10 +56,7 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     if drapes:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
     figure, (left, others, right) = plt.subplots(1, 3, figsize=(18, 10), layout="constrained")
-    for axes, part, limit, title in (
-        (left, "answers", 5, "ours"),
-        (others, "peers", 60, "other simulators"),
-    ):
+    for axes, part, limit, title in ((left, "answers", 5, "ours"), (others, "peers", 60, "other simulators")):
         _draw_errors(axes, result.get(part, []), limit)
         axes.set_title(title)
     walk = result.get("walk", [])
@@ -99,14 +96,8 @@ def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
     for place, error in enumerate(errors):
         if abs(error) > limit:
             side = 1 if error > 0 else -1
-            axes.text(
-                0.97 * side * limit,
-                place,
-                f"{error:.0f} %",
-                ha="right" if side > 0 else "left",
-                va="center",
-                size=9,
-            )
+            aligned = {"ha": "right" if side > 0 else "left", "va": "center", "size": 9}
+            axes.text(0.97 * side * limit, place, f"{error:.0f} %", **aligned)
     axes.set_xlim(-limit, limit)
     axes.set_xlabel("error [%]")
     axes.tick_params(axis="y", labelsize=9)

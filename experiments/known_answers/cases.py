@@ -184,14 +184,9 @@ def slope(simulator: Simulator, angles: tuple[float, ...] = (25.0, 35.0, 45.0, 6
         along = np.array([np.cos(tilt), np.sin(tilt), 0.0])
         normal = np.array([-np.sin(tilt), np.cos(tilt), 0.0])
         start = np.outer(mesh[0][:, 0], along) + mesh[0] * [0, 0, 1] + 2.2e-3 * normal
-        scene = make_scene(
-            garment,
-            start + 0.8 * along,
-            49,
-            timestep=1 / 60,
-            body=plane(8.0, 41, tilt),
-            constants=PhysicsConstants(friction_coefficient=friction),
-        )
+        constants = PhysicsConstants(friction_coefficient=friction)
+        body, start = plane(8.0, 41, tilt), start + 0.8 * along
+        scene = make_scene(garment, start, 49, timestep=1 / 60, body=body, constants=constants)
         path = np.asarray(_simulate(simulator, scene).positions).mean(axis=1) @ -along
         # From the second differences, which do not know when it began to slide.
         found = float(np.polyfit(np.arange(24) / 60, path[25:], 2)[0] * 2)
@@ -208,11 +203,7 @@ def sphere(simulator: Simulator) -> list[Answer]:
     garment, ball = make_cloth(mesh, {}), icosphere(3, 0.1)
     brake = Partial(_brake, jnp.float32(2.0))
     scene = make_scene(
-        garment,
-        mesh[0] + [0, 0.105, 0],
-        121,
-        body=ball,
-        constants=PhysicsConstants(friction_coefficient=0.1),
+        garment, mesh[0] + [0, 0.105, 0], 121, body=ball, constants=PhysicsConstants(friction_coefficient=0.1)
     ).replace(energies=(brake,))
     trajectory = _simulate(simulator, scene)
     last, loads = np.asarray(trajectory.positions[-1]), np.asarray(trajectory.friction_loads[-1])

@@ -35,10 +35,15 @@ def irregular(length: float, width: float, spacing: float, *, seed: int = 0) -> 
     sides = [np.stack(np.broadcast_arrays(along, end), 1) for end in (0.0, width)]
     sides += [np.stack(np.broadcast_arrays(end, across[1:-1]), 1) for end in (0.0, length)]
     points = np.concatenate([*sides, inner])
+    return triangulate(points, 1e-3 * spacing**2)
+
+
+def triangulate(points: np.ndarray, sliver: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of the plane [m] as a flat mesh that faces up, without triangles of half a sliver [m^2]."""
     faces = Delaunay(points).simplices
     edges = points[faces[:, 1:]] - points[faces[:, :1]]
     doubled = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    faces = np.where((doubled > 0)[:, None], faces[:, [0, 2, 1]], faces)[np.abs(doubled) > 1e-3 * spacing**2]
+    faces = np.where((doubled > 0)[:, None], faces[:, [0, 2, 1]], faces)[np.abs(doubled) > sliver]
     return np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1), faces
 
 
@@ -86,10 +91,6 @@ def cantilever_rigidity(garment, plate) -> float:
     """Return the rigidity that a strip along x shows under its weight, held over its first fifth [N m].
 
     Where the beam begins is fitted with it: a mesh bends over half an edge behind its last held vertex.
-
-    Args:
-        garment: Flat strip.
-        plate: Its bending, `Material.plate`.
     """
     matrix = stiffness_across(garment, plate)
     x = np.asarray(garment.rest_positions, np.float64)[:, 0]

@@ -125,38 +125,20 @@ def observe(
     space: Space,
     turn: Float[Array, "3 3"],
 ) -> Seen:
-    """Return what the network is told.
-
-    Args:
-        position: At t [m].
-        step: Displacement since t - 1 [m].
-        contacts: Nearest body points at t, and where they go.
-        space: Of the garment.
-        turn: Of `heading`.
-    """
+    """Return what the network is told of positions at t, of the step since t - 1 [m] and of contacts."""
     garment = space.garment
     # Rows of vectors are turned back by a product from the right.
-    x, moved, body, normals, turned = (
-        rows @ turn
-        for rows in (
-            position,
-            step,
-            contacts.next_points - contacts.points,
-            contacts.normals,
-            contacts.next_normals - contacts.normals,
-        )
+    arrows = (
+        contacts.next_points - contacts.points,
+        contacts.normals,
+        contacts.next_normals - contacts.normals,
     )
+    x, moved, body, normals, turned = (rows @ turn for rows in (position, step, *arrows))
     is_real = garment.vertex_mask[:, None]
     now, before = (face_frames(y, garment) @ space.inverse_frames for y in (x, x - moved))
     distance = jnp.clip(contacts.distances, -CONTACT_RADIUS, CONTACT_RADIUS)[:, None]
-    at_vertices = [
-        x - jnp.mean(x, axis=0, where=is_real, keepdims=True),
-        moved,
-        distance,
-        normals,
-        body,
-        turned,
-    ]
+    own = x - jnp.mean(x, axis=0, where=is_real, keepdims=True)
+    at_vertices = [own, moved, distance, normals, body, turned]
     at_faces = jnp.mean(jnp.concatenate(at_vertices, axis=1)[garment.faces], axis=1)
     faces = jnp.concatenate([now.reshape((-1, 9)), (now - before).reshape((-1, 9)), at_faces], axis=1)
     near = is_real & contacts.is_near[:, None]

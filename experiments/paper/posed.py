@@ -114,11 +114,6 @@ def pose_features(
     return jnp.concatenate(parts, axis=1)
 
 
-def fabric_features(garment: Garment, material: Material) -> Float[Array, " 4"]:
-    """Return bending stiffness, mu and lambda over HOOD's ranges, and the logarithm of the density."""
-    return jnp.append(material_inputs(garment, material)[0], jnp.log(material.density / DENSITY_SCALE))
-
-
 def displace(
     network: PosedNetwork, garment: Garment, transforms: Float[Array, "frames joints 3 4"]
 ) -> Float[Array, "frames vertices 3"]:
@@ -155,7 +150,8 @@ def _inputs(
     features = (features - network.mean[None]) / network.deviation[None]
     if network.system != "snug-m":
         return features
-    fabric = fabric_features(garment, material)
+    # Bending stiffness, mu and lambda over HOOD's ranges, and the logarithm of the density.
+    fabric = jnp.append(material_inputs(garment, material)[0], jnp.log(material.density / DENSITY_SCALE))
     return jnp.concatenate([features, jnp.broadcast_to(fabric, (len(features), 4))], axis=1)
 
 
@@ -183,13 +179,11 @@ def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwo
     # Last frames of windows that lie within a clip.
     ends = np.flatnonzero(np.asarray(data.frames_left)[: 1 - WINDOW] >= WINDOW - 1) + WINDOW - 1
     draw = np.random.default_rng(seed)
-    params, losses = fit(
-        partial(_loss_and_gradient, module),
-        params,
-        lambda _: (network, data, draw.choice(ends, _BATCH)),
-        steps,
-        seed,
-    )
+
+    def windows(_: int) -> tuple[PosedNetwork, TrainingData, np.ndarray]:
+        return network, data, draw.choice(ends, _BATCH)
+
+    params, losses = fit(partial(_loss_and_gradient, module), params, windows, steps, seed)
     return network.replace(params=params), losses
 
 

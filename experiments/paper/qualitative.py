@@ -114,12 +114,8 @@ def main() -> None:
         for name in models:
             positions, (_, scene, poses), energies = results[name, garment]
             is_face = np.asarray(scene.garment.rest_areas) > 0
-            mesh = (
-                np.asarray(poses.positions)[-1],
-                np.asarray(poses.faces),
-                positions[-1],
-                np.asarray(scene.garment.faces)[is_face],
-            )
+            cloth = positions[-1], np.asarray(scene.garment.faces)[is_face]
+            mesh = (np.asarray(poses.positions)[-1], np.asarray(poses.faces), *cloth)
             colors = color_scale(at_vertices(energies[-1], scene), 0.0, limit)
             plain.append(render_frame(*mesh, **view))
             colored.append(render_frame(*mesh, **view, vertex_colors=colors))
@@ -127,17 +123,11 @@ def main() -> None:
     for pictures, file in ((plain, "qualitative.png"), (colored, "stretch_energy.png")):
         write_png(chosen.out / file, side_by_side(pictures, labels, columns=len(models)))
 
-    joined = {
-        name: np.concatenate(
-            [
-                results[name, garment][2][1:][
-                    :, np.asarray(results[name, garment][1].scene.garment.rest_areas) > 0
-                ].ravel()
-                for garment in garments
-            ]
-        )
-        for name in models
-    }
+    joined: dict[str, Any] = {}
+    for (name, _), (_, worn, energies) in results.items():
+        is_face = np.asarray(worn.scene.garment.rest_areas) > 0
+        joined.setdefault(name, []).append(energies[1:][:, is_face].ravel())
+    joined = {name: np.concatenate(parts) for name, parts in joined.items()}
     draw_distribution(joined, chosen.out / "stretch_energy_distribution.png")
     rows = {
         name: {

@@ -214,10 +214,7 @@ def _gap_every(setting: Setting) -> int:
 def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[str, float]:
     """Return the terms [J] as means over frames, their Total, and stretch and penetration beside it.
 
-    Args:
-        trajectory: A rollout.
-        scene: Its scene, with a body.
-        root_height: Height of the root joint in the first frame [m]; HOOD counts potential energy from near it.
+    HOOD counts potential energy from near the height of the root joint in the first frame [m].
     """
     origin = np.array([0.0, root_height + _ORIGIN_ABOVE_ROOT, 0.0], np.float32)
     found = hood_metrics(

@@ -186,15 +186,7 @@ class RestScene:
 def shape_loss(
     params: Any, network: Ssch, offsets: Float[Array, "shapes vertices 3"], rest: RestScene, key: Array
 ) -> Float[Array, ""]:
-    """Return the auto-encoder's loss: errors of offsets and of their Laplacians, depth, divergence [cm].
-
-    Args:
-        params: Of encoder and decoder.
-        network: For its scales.
-        offsets: Of simulated cloth [m].
-        rest: Where shapes meet the body.
-        key: Draws latents, of the offsets and at random.
-    """
+    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm]."""
     network = network.replace(params=params)
     scaled = standardise(offsets, network)
     mean, spread = _encode(params["encoder"], scaled)
@@ -251,15 +243,8 @@ def prepare(
     seen = np.concatenate([pose_features(clip, joints, is_static=True)[:, :-3] for clip in transforms])
     _, _, rows = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)
     flat = offsets.reshape((-1, *offsets.shape[2:]))
-    network = Ssch(
-        params={},
-        joints=joints,
-        basis=jnp.asarray(rows[:_CODE].T),
-        mean=jnp.zeros(1),
-        deviation=jnp.ones(1),
-        offset_mean=flat.mean(axis=0),
-        offset_deviation=jnp.maximum(flat.std(axis=0), 1e-4),
-    )
+    basis, scales = jnp.asarray(rows[:_CODE].T), (flat.mean(axis=0), jnp.maximum(flat.std(axis=0), 1e-4))
+    network = Ssch({}, joints, basis, jnp.zeros(1), jnp.ones(1), *scales)
     inputs = np.concatenate([motion_features(clip, network) for clip in transforms])
     keys = jax.random.split(jax.random.key(seed), 3)
     values = flat[0].size
@@ -268,20 +253,12 @@ def prepare(
         "decoder": Decoder(values).init(keys[1], jnp.zeros((1, _LATENTS))),
         "regressor": Regressor().init(keys[2], jnp.zeros((1, 2, inputs.shape[1]))),
     }
-    deviation = np.maximum(inputs.std(axis=0), 1e-3)
-    return network.replace(
-        params=params, mean=jnp.asarray(inputs.mean(axis=0)), deviation=jnp.asarray(deviation)
-    )
+    mean, deviation = map(jnp.asarray, (inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-3)))
+    return network.replace(params=params, mean=mean, deviation=deviation)
 
 
 def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, dict[str, Any]]:
-    """Train on a garment's simulated rollouts; return the network and how it was trained.
-
-    Args:
-        truth: The rollouts.
-        steps: Of the auto-encoder and of the regressor.
-        seed: Of weights and batches.
-    """
+    """Train auto-encoder and regressor on a garment's rollouts; return the network and how it was trained."""
     began = time.process_time()
     garment, body = load_garment(truth.worn[0].garment), load_body()
     scene_body = truth.worn[0].scene.body

@@ -47,11 +47,6 @@ class Truth(NamedTuple):
 def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
     """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`.
 
-    Args:
-        garment: Name of a bundled garment.
-        folder: Where the rollouts are kept.
-        is_smoke: A few frames of one clip.
-
     Raises:
         ValueError: The folder holds rollouts of other clips or lengths.
         NonFiniteError: A rollout is not finite.
@@ -82,13 +77,7 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
 
 
 def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
-    """Write nested arrays, and a record of plain values beside them.
-
-    Args:
-        path: Path of the archive; the record's has the suffix .json.
-        arrays: Dictionaries of arrays, nested as deep as wanted; no key holds a slash.
-        record: What JSON can hold.
-    """
+    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
     write_arrays(path, leaves, is_compressed=True)
@@ -111,15 +100,7 @@ def fit(
     steps: int,
     seed: int,
 ) -> tuple[Any, list[float]]:
-    """Return weights after `steps` of Adam, and their losses.
-
-    Args:
-        slope_of: From weights, a batch and a key to a loss and its gradient; compiled here.
-        params: Where to begin.
-        batches: Function of a step's number to a batch.
-        steps: Number of steps.
-        seed: Of the keys.
-    """
+    """Return weights after so many steps of Adam, and their losses; `slope_of` gives loss and gradient."""
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(_RATE, steps))
     )

@@ -17,7 +17,6 @@ from paper.tables import (
     TABLES,
     check_costs,
     check_networks,
-    plan_trainings,
     rows_of_setting,
     table_setting,
     with_changes,
@@ -27,7 +26,6 @@ from paper.tables import (
 
 from eslr_jax.assets.catalog import asset_names
 from eslr_jax.errors import NonFiniteError, Status
-from eslr_jax.training.recipe import load_recipe
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
 ROW = {"stretch": 0.1, "gap_share": 0.1}
@@ -152,29 +150,6 @@ def test_a_row_is_of_the_networks_that_it_was_measured_with(file):
     )
     with pytest.raises(SystemExit, match=r"a row mgn-5 of mgn-5-correction, weights/second.npz; give"):
         check_networks(file, {"mgn-5": ("mgn-5-correction", "other/second.npz")}, kept)
-
-
-def test_rows_of_architectures_are_trained_by_their_recipe(tmp_path):
-    rows = {
-        "mgn": ("mgn-5", "mgn-5"),
-        "hood": ("hood",),
-        "eslr-small": ("eslr-small",),
-        "optimum": ("optimum",),
-    }
-    changed, trainings = plan_trainings(rows, tmp_path)
-    assert changed["mgn"] == tuple(str(tmp_path / f"mgn-5-s{seed}" / "model.npz") for seed in (0, 1))
-    assert changed["eslr-small"] == ("eslr-small",)
-    assert changed["optimum"] == ("optimum",)
-    assert [(run.model, run.seed, run.recipe.stem) for run in trainings] == [
-        ("mgn-5", 0, "1k"),
-        ("mgn-5", 1, "1k"),
-        ("hood", 0, "full-size"),
-    ]
-    recipes = [
-        load_recipe(run.recipe, dict(text.split("=") for text in run.changes()[:1])) for run in trainings
-    ]
-    assert [recipe.model.latent_size for recipe in recipes] == [64, 64, 128]
-    assert recipes[0].model.output == "correction"
 
 
 @pytest.fixture
