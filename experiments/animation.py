@@ -38,7 +38,6 @@ _CONFIG = SimConfig(iterations=300, tolerance=1e-2)
 
 
 def main() -> None:
-    """Simulate, render and write."""
     chosen = parser(__doc__, "one garment at 1k, three frames").parse_args()
     worn, frames, vertices = (WORN[:1], 5, "1k") if chosen.smoke else (WORN, _FRAMES, "4k")
     body = load_body()

@@ -51,7 +51,6 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
 
 
 def main() -> None:
-    """Run the command line."""
     options = parser(__doc__, "two frames, one turn")
     options.add_argument("--vertices", choices=get_args(Resolution), default="1k")
     options.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64])

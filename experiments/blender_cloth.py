@@ -76,21 +76,15 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
     stretch = strip_stiffness(cloth.shear, cloth.area_stiffness)
     distance = float(contact_thickness(scene.garment, constants.collision_thickness))
     arrays = {
-        "start": start,
-        "faces": cloth.faces,
-        "is_pinned": cloth.is_pinned,
-        "frames": scene.num_frames,
-        "quality": effort[0],
-        "collision_quality": effort[1],
-        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME,
-        "gravity": float(constants.gravity),
+        "start": start, "faces": cloth.faces, "is_pinned": cloth.is_pinned, "frames": scene.num_frames,
+        "quality": effort[0], "collision_quality": effort[1],
+        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME, "gravity": float(constants.gravity),
         "mass": cloth.masses[cloth.masses > 0].mean(),
         "tension": 3**0.5 / 2 * stretch.mean() * lengths.mean() / 1e3,
         "bending": 0.03 * (cloth.bending / cloth.hinge_areas).mean(),
-        "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE),
-        "body_distance": _BODY_DISTANCE,
+        "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE), "body_distance": _BODY_DISTANCE,
         "friction": 100.0 * float(constants.friction_coefficient),
-    }
+    }  # fmt: skip
     if scene.self_contact is not None:
         arrays["layer_distance"] = float(contact_thickness(scene.garment, constants.repulsion_thickness))
     if cloth.is_pinned.any():

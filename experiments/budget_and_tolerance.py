@@ -80,7 +80,6 @@ def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dic
 
 
 def main() -> None:
-    """Measure, print and write."""
     options = parser(__doc__, "one garment, clip, tolerance and budget")
     options.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
     options.add_argument("--sizes", nargs="+", default=["1k", "4k"])

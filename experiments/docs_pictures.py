@@ -73,7 +73,6 @@ class Shot:
 
 
 def main() -> None:
-    """Make what was asked for."""
     options = parser(__doc__, "two pictures of few frames", EXPERIMENTS.parent / "docs" / "images")
     options.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
     chosen = options.parse_args()

@@ -109,7 +109,6 @@ def measure(size: str, turns: int, frames: int, cases: Sequence[str]) -> dict[st
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "1k, two frames, one turn")
     options.add_argument("--sizes", nargs="+", default=list(SIZES[:3]), choices=SIZES)
     options.add_argument("--no-self-contact", action="store_true", help="leave out the frame with it")

@@ -69,15 +69,7 @@ def keep(path: Path, result: Mapping[str, Any]) -> None:
 def put(
     path: Path, part: str, row: Mapping[str, Any], names: Sequence[str], about: Mapping[str, Any]
 ) -> None:
-    """Keep a row of a part, in the place of the one that had the same values under some names.
-
-    Args:
-        path: File of the result.
-        part: Key of the rows.
-        row: What was measured.
-        names: Keys that tell rows apart.
-        about: What else the result says, such as versions.
-    """
+    """Keep a row of a part, and what else a result says, in the place of the row that has the same names."""
     result = kept(path)
     others = [one for one in result.get(part, []) if any(one.get(name) != row.get(name) for name in names)]
     keep(path, {**result, part: [*others, row], **about})
@@ -119,13 +111,10 @@ def codes(commit: str) -> Iterator[dict[str, Path]]:
 def in_turns(
     roots: Mapping[str, Path], program: str, arguments: list, turns: int = 1
 ) -> dict[str, list[Any]]:
-    """Return what a program prints last, as JSON, in every turn of every code, each in a process of its own.
+    """Return what a program prints last, as JSON, in every turn of every code of `codes`.
 
-    Args:
-        roots: Of `codes`. What else runs on the machine disturbs both alike, as they run alternately.
-        program: Its text; it uses only what both codes have, and finds its arguments as JSON in `sys.argv[1]`.
-        arguments: What it is told.
-        turns: Processes of each code.
+    The program is a text that uses only what all codes have; its arguments are JSON in `sys.argv[1]`. Codes run
+    alternately, in processes of their own, so that what else runs on the machine disturbs them alike.
 
     Raises:
         subprocess.CalledProcessError: The program failed; its errors are on standard error.

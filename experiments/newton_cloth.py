@@ -109,19 +109,14 @@ def prepare_cloth(garment: Garment, material: Material) -> Cloth:
     squared = np.sum((rest[hinges[:, 1]] - rest[hinges[:, 0]]) ** 2, axis=1)
     stiffness = each(material.bending_stiffness, is_hinge)
     return Cloth(
-        vertices=np.flatnonzero(is_vertex),
-        rest=rest[is_vertex],
-        faces=index[np.asarray(garment.faces)[is_face]],
-        hinges=index[hinges],
-        masses=np.where(is_pinned, 0.0, masses),
-        is_pinned=is_pinned,
+        vertices=np.flatnonzero(is_vertex), rest=rest[is_vertex],
+        faces=index[np.asarray(garment.faces)[is_face]], hinges=index[hinges],
+        masses=np.where(is_pinned, 0.0, masses), is_pinned=is_pinned,
         areas=np.asarray(garment.rest_areas, np.float64)[is_face],
         shear=each(material.lame_mu, is_face) * thickness,
         area_stiffness=each(material.lame_lambda, is_face) * thickness,
-        bending=stiffness * squared / (4.0 * areas),
-        bending_stiffness=stiffness,
-        hinge_areas=areas,
-    )
+        bending=stiffness * squared / (4.0 * areas), bending_stiffness=stiffness, hinge_areas=areas,
+    )  # fmt: skip
 
 
 def springs(cloth: Cloth) -> tuple[Int[np.ndarray, "edges 2"], Float[np.ndarray, " edges"]]:

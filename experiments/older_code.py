@@ -50,7 +50,6 @@ print(json.dumps([fixed["solver"], iteration]))
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "T-shirt at 1k, few frames, one turn")
     options.add_argument("--commit", default=COMMIT, help="the older code")
     options.add_argument("--sizes", nargs="+", default=["1k", "4k", "10k"])

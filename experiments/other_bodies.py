@@ -326,7 +326,6 @@ def _depth(distances: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Measure every garment on every body; write a table and pictures."""
     options = parser(__doc__, "one garment, one body, few frames")
     options.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
     chosen = options.parse_args()

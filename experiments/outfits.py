@@ -71,7 +71,6 @@ def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1)
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "one outfit, six frames, no substeps")
     options.add_argument("--substeps", type=int, nargs="+", default=[1, 2])
     chosen = options.parse_args()

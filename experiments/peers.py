@@ -246,17 +246,12 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
 
 
 COLUMNS = {
-    "method": "method",
-    "effort": "substeps x iterations",
-    "frame_ms": "ms a frame",
-    "frame_cpu_ms": "CPU ms",
-    "gap_relative_median": "gap, median [%]",
-    "gap_relative_own": "on its own rollout [%]",
-    "pooled_stretch_p99": "stretch, 99 % of faces",
-    "penetration_p999_mm": "penetration, 99.9 % [mm]",
-    "intersections_body": "pairs with the body",
+    "method": "method", "effort": "substeps x iterations", "frame_ms": "ms a frame",
+    "frame_cpu_ms": "CPU ms", "gap_relative_median": "gap, median [%]",
+    "gap_relative_own": "on its own rollout [%]", "pooled_stretch_p99": "stretch, 99 % of faces",
+    "penetration_p999_mm": "penetration, 99.9 % [mm]", "intersections_body": "pairs with the body",
     "intersections_cloth": "pairs of cloth",
-}
+}  # fmt: skip
 
 
 def peer_versions() -> dict[str, str]:
@@ -271,7 +266,6 @@ def peer_versions() -> dict[str, str]:
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "one scene, one setting per solver, few frames")
     options.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
     options.add_argument("--frames", type=int, default=40)
@@ -282,14 +276,10 @@ def main() -> None:
         efforts, covering, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
-        "clip": CLIP,
-        "frames": chosen.frames,
-        "processor": device_name(),
-        "cores": cores,
-        "date": time.strftime("%Y-%m-%d"),
-        **environment(),
+        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores,
+        "date": time.strftime("%Y-%m-%d"), **environment(),
         "scenes": kept(chosen.out / "peers.json").get("scenes", {}),
-    }
+    }  # fmt: skip
     result["versions"] |= peer_versions()
     for name in chosen.scenes:
         scene = example_scene(*name.split("_"), CLIP, chosen.frames)

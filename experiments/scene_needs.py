@@ -69,7 +69,6 @@ def ratio_of(times: dict[str, float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "1k, three frames, one pair, one turn")
     options.add_argument("--vertices", default="4k", choices=["1k", "4k", "10k"])
     chosen = options.parse_args()

@@ -72,7 +72,6 @@ def moved(scene: Scene, number: int) -> Scene:
 
 
 def main() -> None:
-    """Measure and write."""
     options = parser(__doc__, "T-shirt at 1k, one clip, six frames")
     options.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     options.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])

@@ -97,7 +97,6 @@ def draw(result: dict, path: Path) -> None:
 
 
 def main() -> None:
-    """Measure, draw and write."""
     options = parser(__doc__, "one garment, few frames")
     options.add_argument("--sizes", nargs="+", default=["1k", "4k"])
     options.add_argument("--models", nargs="*", default=list(asset_names("model")))

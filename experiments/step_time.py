@@ -183,7 +183,6 @@ def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None
 
 
 def main() -> None:
-    """Measure, print and write."""
     parsed = parser(__doc__, "1k, one turn, neither training nor PyTorch")
     parsed.add_argument("--sizes", nargs="+", default=["1k", "4k"], choices=SIZES, help="vertices")
     parsed.add_argument("--turns", type=int, default=10, help="turns per comparison")

@@ -171,7 +171,6 @@ def measure_time(
 
 
 def main() -> None:
-    """Run the command line."""
     options = parser(__doc__, "one garment, one clip, few frames")
     options.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
     options.add_argument("--garment", nargs="*", choices=GARMENTS)

@@ -28,7 +28,6 @@ RECIPE = EXPERIMENTS / "configs" / "eslr-small.toml"
 
 
 def main() -> None:
-    """Measure and write."""
     chosen = parser(__doc__, "a small model, one turn").parse_args()
     small = {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]}
     config = load_recipe(RECIPE, {"split": "validation", **(small if chosen.smoke else {})})

@@ -140,7 +140,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run the command line; an error on purpose is one line and exit code 2."""
     from eslr_jax.errors import EslrError
 
     arguments = parse_arguments()

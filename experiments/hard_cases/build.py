@@ -32,6 +32,13 @@ def grid_faces(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
     return np.concatenate([first, second])
 
 
+def same_way_faces(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
+    """Return two triangles per square of a grid of vertices, diagonals all one way."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
 def sheet(rows: int, columns: int, size: tuple[float, float]) -> Mesh:
     """Return a level sheet around the origin, facing up; `size` is along x and z [m]."""
     x, z = np.meshgrid(

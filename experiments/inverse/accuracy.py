@@ -114,7 +114,6 @@ def measure(
 
 
 def main() -> None:
-    """Measure by iterations, by the tolerance of a frame, and by that of the linear system."""
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     turns = 1 if options.smoke else 15
     counts, tolerances, linear = (

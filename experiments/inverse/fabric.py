@@ -54,7 +54,6 @@ def fabric(logs: jax.Array, scene: Scene) -> Material:
 
 
 def main() -> None:
-    """Recover the fabric from three wrong starts, by gradients and without."""
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, turns, iterations = (3, 1, 30) if options.smoke else (25, 25, 150)
     scene = make_scene()
@@ -75,13 +74,10 @@ def main() -> None:
         by_gradient = descend(functions[1], start, steps)
         runs.append((by_gradient, search_simplex(functions[0], start, round(cost * steps))))
     result = {
-        "what": NAMES,
-        "starts": STARTS,
-        "gradient_in_evaluations": round(cost, 2),
+        "what": NAMES, "starts": STARTS, "gradient_in_evaluations": round(cost, 2),
         "lbfgs": [report(run, cost) for run, _ in runs],
-        "nelder_mead": [report(run, 1.0) for _, run in runs],
-        "sensitivity_mm": sensitivities(simulate),
-    }
+        "nelder_mead": [report(run, 1.0) for _, run in runs], "sensitivity_mm": sensitivities(simulate),
+    }  # fmt: skip
     keep(options.out / "fabric.json", result | environment())
     save(draw(runs, cost, np.asarray(measured), scene), options.out / "fabric.png")
 

@@ -52,7 +52,6 @@ def make_scene(body: Body, num_frames: int) -> Scene:
 
 
 def main() -> None:
-    """Let the shirt out by gradients and by Nelder-Mead, and keep both."""
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 9)
     config = SimConfig(iterations=20 if options.smoke else 100)

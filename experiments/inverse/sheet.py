@@ -6,7 +6,7 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hard_cases.build import make_cloth
+from hard_cases.build import make_cloth, same_way_faces
 
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
@@ -20,11 +20,8 @@ def square(side: int, size: float, pins: list[int]) -> Garment:
     """Return a level square of side x side vertices around the origin, of a size [m], with pins."""
     line = np.linspace(-0.5, 0.5, side) * size
     x, z = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    index = np.arange(side * side).reshape(side, side)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     positions = np.stack([x, np.zeros_like(x), z], axis=1)
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    return make_cloth((positions, faces), {}, is_pinned=np.array(pins, int))
+    return make_cloth((positions, same_way_faces(side, side)), {}, is_pinned=np.array(pins, int))
 
 
 def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) -> Scene:

@@ -62,7 +62,6 @@ def loss(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def main() -> None:
-    """Throw by gradients and by Nelder-Mead, and keep both."""
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, turns = (3, 1) if options.smoke else (30, 25)
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))

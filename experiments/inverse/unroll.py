@@ -109,7 +109,6 @@ def judge(params, scene: Scene, solved: jax.Array) -> dict:
 
 
 def main() -> None:
-    """Train with every loss and judge all on the same motion."""
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, count, seen = (2, 1, 3) if options.smoke else (150, 12, FRAMES)
     kinds = LOSSES[2:] if options.smoke else LOSSES

@@ -105,7 +105,6 @@ def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
     import harness
 
     parser = harness.parser(__doc__, "the smallest of every part")

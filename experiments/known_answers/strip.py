@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hard_cases.build import make_cloth, make_scene
+from hard_cases.build import make_cloth, make_scene, same_way_faces
 
 from eslr_jax import PhysicsConstants, SimConfig
 from eslr_jax.scene.build import start_integrator
@@ -15,10 +15,7 @@ LENGTH = 0.5  # [m]
 def strip(integrator="euler", *, frames, is_pinned, timestep=1 / 30, tilt=0.35, **modelled):
     """A strip that is released at an angle [rad] from the vertical; pinned at its upper end, or nowhere."""
     x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
-    index = np.arange(22).reshape(2, 11)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    mesh = np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1), faces
+    mesh = np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1), same_way_faces(2, 11)
     garment = jax.tree.map(jnp.asarray, make_cloth(mesh, {}, is_pinned=along == 0 if is_pinned else None))
     scene = make_scene(garment, mesh[0], frames, timestep=timestep, constants=PhysicsConstants())
     return scene.replace(initial_state=start_integrator(scene.initial_state, integrator), **modelled)

@@ -262,7 +262,6 @@ def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
     chosen = options(__doc__, 2000).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, 2 if chosen.smoke else chosen.steps, chosen.seed)

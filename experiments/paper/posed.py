@@ -259,7 +259,6 @@ def read_network(path: Path) -> tuple[PosedNetwork, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
     parser = options(__doc__, 2000)
     parser.add_argument("system", choices=SYSTEMS)
     chosen = parser.parse_args()

@@ -80,7 +80,6 @@ def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
 
 
 def main() -> None:
-    """Simulate, render and write."""
     parser = harness.parser(__doc__, "the optimum on one garment, few frames", RESULTS)
     parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--frames", type=int, default=90, help="of every rollout")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, get_args
 
 import harness
@@ -45,12 +46,10 @@ class System(NamedTuple):
 
     params: Any  # weights; None without a network
     config: SimConfig
-    garment_options: dict[str, Any]  # of `load_garment`
-    control: Control | None
-    cost: Mapping[str, float]  # parameters, and core-hours of the training where they are known
-    weights_on: Callable[[Worn], Any] | None = (
-        None  # of what is made for one scene: all positions of a replay
-    )
+    cost: Mapping[str, float] = MappingProxyType({})  # parameters, and core-hours where they are known
+    garment_options: dict[str, Any] = ModelConfig().garment_options  # of `load_garment`
+    control: Control | None = None
+    weights_on: Callable[[Worn], Any] | None = None  # made for one scene: all positions of a replay
 
 
 def read_system(name: str) -> System:
@@ -69,7 +68,7 @@ def read_system(name: str) -> System:
         return _read_trained(*name.split("@", 1))
     if name in (OPTIMUM, GUESS):
         iterations = OPTIMUM_ITERATIONS if name == OPTIMUM else 0
-        return System(*simulator_of(SOLVER, iterations), ModelConfig().garment_options, None, {})
+        return System(*simulator_of(SOLVER, iterations))
     network, _, change = name.partition("~")
     network, _, iterations = network.partition("+")
     params, config = simulator_of(network, int(iterations or 0))
@@ -86,7 +85,7 @@ def read_system(name: str) -> System:
     hours = model_record(network).get("core_hours")
     if hours is not None and control not in CONTROLS_OF_WEIGHTS:  # those show nothing of the training
         cost["core_hours"] = hours
-    return System(params, config, options, control, cost)
+    return System(params, config, cost, options, control)
 
 
 def _read_trained(kind: str, folder: str) -> System:
@@ -110,24 +109,25 @@ def _read_trained(kind: str, folder: str) -> System:
         return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
     if kind != "mat":
-        return _replayed(
-            lambda worn: reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms),
-            cost,
-        )
+
+        def positions(worn: Worn) -> Any:
+            return reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms)
+
+        return _replayed(positions, cost)
 
     def stepper_of(worn: Worn) -> Any:
         network = network_of(worn)
         network = mat.untrained(network) if change else network
         return network.replace(space=prepare_space(worn.scene.garment))
 
-    config = SimConfig(model=mat.Mat(), iterations=0)
-    return System(None, config, ModelConfig().garment_options, None, {} if change else cost, stepper_of)
+    return System(
+        None, SimConfig(model=mat.Mat(), iterations=0), {} if change else cost, weights_on=stepper_of
+    )
 
 
 def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
     """Return the system whose positions are known beforehand."""
-    config = SimConfig(model=posed.Replay(), iterations=0)
-    return System(None, config, ModelConfig().garment_options, None, cost, positions)
+    return System(None, SimConfig(model=posed.Replay(), iterations=0), cost, weights_on=positions)
 
 
 class Reference(NamedTuple):

@@ -325,7 +325,6 @@ def read_network(path: Path) -> tuple[Ssch, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
     chosen = options(__doc__, (2000, 400), nargs=2, metavar=("SHAPE", "MOTION")).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, (2, 2) if chosen.smoke else tuple(chosen.steps), chosen.seed)

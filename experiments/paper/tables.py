@@ -79,7 +79,6 @@ Rows = dict[str, tuple[str, ...]]
 
 
 def main() -> None:
-    """Measure and write."""
     parser = harness.parser(__doc__, "few frames of one garment on one clip", RESULTS)
     parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--tables", nargs="+", default=TABLES, choices=TABLES)
@@ -270,9 +269,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
             continue
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
-        systems[name] = System(
-            params, SimConfig(model=config, iterations=0), config.garment_options, None, cost
-        )
+        systems[name] = System(params, SimConfig(model=config, iterations=0), cost, config.garment_options)
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
