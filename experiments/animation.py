@@ -9,10 +9,8 @@ Writes animation.webp.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
+from harness import parser
 from PIL import Image
 
 from eslr_jax.assets import load_body, load_garment, load_motion
@@ -40,15 +38,12 @@ _CONFIG = SimConfig(iterations=300, tolerance=1e-2)
 
 
 def main() -> None:
-    """Simulate, render and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="one garment at 1k, three frames")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    chosen = parser.parse_args()
+    chosen = parser(__doc__, "one garment at 1k, three frames").parse_args()
     worn, frames, vertices = (WORN[:1], 5, "1k") if chosen.smoke else (WORN, _FRAMES, "4k")
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
     moving, strips = with_settling(poses, SETTLE_FRAMES, body), []
+    look = {"rest_positions": np.asarray(poses.rest_positions), "rig": body, "camera": _CAMERA, "size": _SIZE}
     for name, fabric, color in worn:
         options = SceneOptions(has_skin=True, integrator="bdf2")
         scene = prepare_scene(
@@ -56,22 +51,13 @@ def main() -> None:
         )
         trajectory = simulate(None, scene, config=_CONFIG).trajectory
         print(f"{name}: {float(np.mean(trajectory.iterations[1:])):.0f} iterations a frame", flush=True)
-        pictures = render_frames(
-            np.asarray(poses.positions),
-            np.asarray(poses.faces),
-            np.asarray(trajectory.positions)[SETTLE_FRAMES:],
-            np.asarray(scene.garment.faces),
-            frame_indices=range(0, frames, _EVERY),
-            rest_positions=np.asarray(poses.rest_positions),
-            rig=body,
-            camera=_CAMERA,
-            size=_SIZE,
-            garment_color=color,
+        cloth = np.asarray(trajectory.positions)[SETTLE_FRAMES:], np.asarray(scene.garment.faces)
+        shown = {"frame_indices": range(0, frames, _EVERY), "garment_color": color, **look}
+        strips.append(
+            list(render_frames(np.asarray(poses.positions), np.asarray(poses.faces), *cloth, **shown))
         )
-        strips.append(list(pictures))
     labels = [f"{name}, {fabric}" for name, fabric, _ in worn]
     images = [Image.fromarray(side_by_side(row, labels)) for row in zip(*strips, strict=True)]
-    chosen.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(chosen.out / "animation.webp") as temporary:
         images[0].save(
             temporary,
@@ -80,7 +66,7 @@ def main() -> None:
             append_images=images[1:] + images[-2:0:-1],  # forth and back: a loop without a jump
             duration=round(1000 * _EVERY * float(poses.timestep)),
             loop=0,
-            quality=70,
+            quality=50,
         )
 
 

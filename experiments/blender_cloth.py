@@ -57,15 +57,10 @@ def blender_python() -> str | None:
 
 
 def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
-    """Simulate a scene in Blender.
-
-    Args:
-        scene: The scene.
-        effort: Steps per frame, and rounds of collision per step.
+    """Simulate a scene in Blender, with so many steps per frame and rounds of collision per step.
 
     Raises:
-        EslrError: The scene can't be carried over, or Blender failed; the message holds the last line that it
-            wrote.
+        EslrError: The scene can't be carried over, or Blender failed; the message holds the last line it wrote.
     """
     constants, cloth = scene.constants, prepare_cloth(scene.garment, scene.material)
     first, rows = scene.initial_state, cloth.vertices
@@ -81,21 +76,15 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
     stretch = strip_stiffness(cloth.shear, cloth.area_stiffness)
     distance = float(contact_thickness(scene.garment, constants.collision_thickness))
     arrays = {
-        "start": start,
-        "faces": cloth.faces,
-        "is_pinned": cloth.is_pinned,
-        "frames": scene.num_frames,
-        "quality": effort[0],
-        "collision_quality": effort[1],
-        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME,
-        "gravity": float(constants.gravity),
+        "start": start, "faces": cloth.faces, "is_pinned": cloth.is_pinned, "frames": scene.num_frames,
+        "quality": effort[0], "collision_quality": effort[1],
+        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME, "gravity": float(constants.gravity),
         "mass": cloth.masses[cloth.masses > 0].mean(),
         "tension": 3**0.5 / 2 * stretch.mean() * lengths.mean() / 1e3,
         "bending": 0.03 * (cloth.bending / cloth.hinge_areas).mean(),
-        "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE),
-        "body_distance": _BODY_DISTANCE,
+        "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE), "body_distance": _BODY_DISTANCE,
         "friction": 100.0 * float(constants.friction_coefficient),
-    }
+    }  # fmt: skip
     if scene.self_contact is not None:
         arrays["layer_distance"] = float(contact_thickness(scene.garment, constants.repulsion_thickness))
     if cloth.is_pinned.any():
@@ -123,10 +112,7 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
 
 
 def blender_simulator(effort: tuple[int, int]) -> Simulator:
-    """Return Blender's cloth as a simulator of the hard cases.
-
-    Args:
-        effort: Steps per frame, and rounds of collision per step.
+    """Return Blender's cloth as a simulator of the hard cases, with an effort as for `run_blender`.
 
     Raises:
         MissingExtraError: BLENDER_PYTHON names no Python.

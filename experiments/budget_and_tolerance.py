@@ -11,36 +11,24 @@ Writes budget_and_tolerance.json; a part that is not measured anew stays in it. 
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from harness import kept, machine, parser, put
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
+from eslr_jax import load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax.assets import load_splits
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import prepare_scene, prepare_scenes
-from eslr_jax.simulation.budget import (
-    Calibration,
-    choose,
-    device_name,
-    keep_budget,
-    methods_at,
-    read_calibration,
-)
+from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.simulation.budget import Calibration, choose, keep_budget, methods_at, read_calibration
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 GARMENTS = ("tshirt", "dress", "pants")
 TOLERANCES = (0.01, 0.001)
 PARTS = ("tolerance", "budget")
@@ -48,25 +36,13 @@ BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration
 EVERY = 2  # frames between those whose gap is measured
 
 
-def vertex_count(scene: Scene) -> int:
-    """Return the number of vertices of a scene's garment, without padding."""
-    return int(np.sum(scene.garment.vertex_mask))
-
-
 def measure_tolerance(
     calibration: Calibration, scenes: Sequence[Scene], tolerance: float, every: int
 ) -> dict[str, Any]:
-    """Return how many frames of free rollouts keep a tolerance.
-
-    Args:
-        calibration: Measurements that the simulator is chosen from.
-        scenes: Scenes of one resolution.
-        tolerance: Relative gap that is asked for.
-        every: Distance of the frames whose gap is measured.
-    """
+    """Return how many of every so many frames keep a relative gap; scenes are of one resolution."""
     choices, shares, spent = [], [], []
     for scene in scenes:
-        choice = choose(calibration, vertex_count(scene), tolerance=tolerance)
+        choice = choose(calibration, int(np.sum(scene.garment.vertex_mask)), tolerance=tolerance)
         params, config = simulator_of(choice.method, tolerance=choice.tolerance)
         trajectory = rollout_scene(params, scene, config, choice.iterations)
         gap = trajectory_gap(trajectory, scene, every=every)
@@ -87,14 +63,8 @@ def measure_tolerance(
 
 
 def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dict[str, Any]:
-    """Return how long the frames of a rollout take with a budget.
-
-    Args:
-        calibration: Measurements that the simulator is chosen from.
-        scene: Scene to simulate.
-        factor: Budget as a multiple of the fastest frame that the calibration knows of.
-    """
-    count = vertex_count(scene)
+    """Return how long frames take with a budget, a multiple of the fastest frame that the calibration knows."""
+    count = int(np.sum(scene.garment.vertex_mask))
     fastest = min(method.fixed_ms + method.iteration_ms for method in methods_at(calibration, count))
     budget = factor * fastest
     choice = choose(calibration, count, budget_ms=budget)
@@ -110,69 +80,44 @@ def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dic
 
 
 def main() -> None:
-    """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
-    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
-    parser.add_argument(
+    options = parser(__doc__, "one garment, clip, tolerance and budget")
+    options.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
+    options.add_argument("--sizes", nargs="+", default=["1k", "4k"])
+    options.add_argument(
         "--calibration", type=Path, help="calibration to choose by; by default that of `eslr simulate`"
     )
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="one garment, clip, tolerance and budget")
-    arguments = parser.parse_args()
+    chosen = options.parse_args()
     garments, clips, frames, every = GARMENTS, load_splits()["motions"]["test"], 40, EVERY
     tolerances, budgets = TOLERANCES, BUDGETS
-    if arguments.smoke:
-        garments, clips, frames, every, arguments.sizes = garments[:1], clips[:1], 6, 2, ["1k"]
+    if chosen.smoke:
+        garments, clips, frames, every, chosen.sizes = garments[:1], clips[:1], 6, 2, ["1k"]
         tolerances, budgets = tolerances[:1], budgets[:1]
     body = load_body()
     motions = [pose_body(body, load_motion(clip), num_frames=frames) for clip in clips]
-    calibration = read_calibration(arguments.calibration)
-    path = arguments.out / "budget_and_tolerance.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
-    kept: dict[str, list[dict[str, Any]]] = {
-        part: [
-            row
-            for row in known.get(part, [])
-            if part not in arguments.parts or row["size"] not in arguments.sizes
-        ]
-        for part in PARTS
-    }
-    about = dict(known.get("environments", {})) | dict.fromkeys(arguments.parts, environment())
-    for size in arguments.sizes:
+    calibration = read_calibration(chosen.calibration)
+    path = chosen.out / "budget_and_tolerance.json"
+    about = {"clips": clips, "calibrated_on": calibration.device, **machine()}
+    for size in chosen.sizes:
         cloths = {garment: load_garment(garment, vertices=size) for garment in garments}
-        tasks = tolerances if "tolerance" in arguments.parts else ()
+        tasks = tolerances if "tolerance" in chosen.parts else ()
         scenes = []
         for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
         for tolerance in tasks:
             row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
-            kept["tolerance"].append(row)
+            put(path, "tolerance", row, ("size", "tolerance"), about)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
-        for garment, cloth in cloths.items() if "budget" in arguments.parts else ():
+        for garment, cloth in cloths.items() if "budget" in chosen.parts else ():
             scene = prepare_scene(cloth, motions[0])  # not padded to a common size
             for factor in budgets:
-                row = {"size": size, "garment": garment, **measure_budget(calibration, scene, factor)}
-                kept["budget"].append(row)
+                row = {"size": size, "garment": garment, "factor": factor}
+                row |= measure_budget(calibration, scene, factor)
+                put(path, "budget", row, ("size", "garment", "factor"), about)
                 text = f"budget {row['budget_ms']:.1f} ms, took {row['frame_ms']:.1f} ms"
                 print(f"{size} {garment}: {text}", flush=True)
         jax.clear_caches()
-    ratios = [row["frame_ms"] / row["budget_ms"] for row in kept["budget"]]
-    result = {
-        "clips": clips,
-        **kept,
-        "budget_ratio_median": float(np.median(ratios)) if ratios else None,
-        "calibrated_on": calibration.device,
-        "processor": device_name(),
-        "environments": about,
-    }
-    if ratios:
+    if ratios := [row["frame_ms"] / row["budget_ms"] for row in kept(path).get("budget", [])]:
         print(f"time over budget, median: {np.median(ratios):.2f}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ picture of `eslr play` needs Chromium and the package playwright; without them i
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import shutil
 import tempfile
@@ -20,15 +19,15 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from flax import struct
+from harness import EXPERIMENTS, RESULTS, parser
 from known_answers.drape import hang
 from other_bodies import child
 from PIL import Image
 
-from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
-from eslr_jax.body.motion import pose_body
+from eslr_jax import SceneOptions, SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.rig import make_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.fields import Field, run_field
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
@@ -45,12 +44,10 @@ from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.physics.materials import WOVEN, fabric_names
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.scene.build import skin_garment
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.simulate import last_frames, simulate
+from eslr_jax.simulation.simulate import last_frames
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Term
 
-RESULTS = Path(__file__).parent / "results"
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",
     "train": RESULTS / "hood_5_curves.png",  # `eslr train` wrote it
@@ -77,13 +74,9 @@ class Shot:
 
 
 def main() -> None:
-    """Make what was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="two pictures of few frames")
-    parser.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
-    chosen = parser.parse_args()
-    chosen.out.mkdir(parents=True, exist_ok=True)
+    options = parser(__doc__, "two pictures of few frames", EXPERIMENTS.parent / "docs" / "images")
+    options.add_argument("--only", nargs="*", choices=[*COPIED, *PICTURES])
+    chosen = options.parse_args()
     frames = _SMOKE_FRAMES if chosen.smoke else _FRAMES
     names = chosen.only or (["install", "first-cloth"] if chosen.smoke else [*COPIED, *PICTURES])
     for name in names:
@@ -132,37 +125,19 @@ def figures(
 ) -> list[np.ndarray]:
     """Render frames of a scene."""
     given = outfit_colors(list(shot.stored.outfit.values())) if colors is None else colors
-    return list(
-        render_frames(
-            np.asarray(shot.poses.positions),
-            np.asarray(shot.poses.faces),
-            np.asarray(shot.trajectory.positions),
-            np.asarray(shot.scene.garment.faces),
-            frame_indices=indices,
-            rest_positions=np.asarray(shot.poses.rest_positions),
-            rig=shot.body,
-            vertex_colors=given,
-            **{"camera": _CAMERA, "size": _SIZE} | options,
-        )
-    )
+    cloth = shot.trajectory.positions, shot.scene.garment.faces
+    mesh = map(np.asarray, (shot.poses.positions, shot.poses.faces, *cloth))
+    look = {"camera": _CAMERA, "size": _SIZE, "vertex_colors": given, **options}
+    look |= {"rest_positions": np.asarray(shot.poses.rest_positions), "rig": shot.body}
+    return list(render_frames(*mesh, frame_indices=indices, **look))
 
 
 def worn(stored: Any, body: Any, positions: np.ndarray | None = None, **options: Any) -> np.ndarray:
     """Render a garment on a body at rest."""
     rest = np.asarray(body.rest_positions)
     cloth = stored.rest_positions if positions is None else positions
-    look = {"camera": _CAMERA, "size": _SIZE} | options
-    return next(
-        render_frames(
-            rest[None],
-            np.asarray(body.faces),
-            cloth[None],
-            stored.faces,
-            rest_positions=rest,
-            rig=body,
-            **look,
-        )
-    )
+    look = {"camera": _CAMERA, "size": _SIZE, "rest_positions": rest, "rig": body, **options}
+    return next(render_frames(rest[None], np.asarray(body.faces), cloth[None], stored.faces, **look))
 
 
 def install(_: int) -> np.ndarray:
@@ -337,18 +312,11 @@ def play(frames: int) -> np.ndarray | None:
 
 
 PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
-    "install": install,
-    "first-cloth": first_cloth,
-    "own-garment": own_garment,
-    "own-body": own_body,
-    "outfits": outfits,
-    "fabrics": fabrics,
-    "extend": extend,
-    "report": report,
-    "score": score,
-    "limits": limits,
-    "play": play,
-}
+    make.__name__.replace("_", "-"): make
+    for make in (
+        install, first_cloth, own_garment, own_body, outfits, fabrics, extend, report, score, limits, play,
+    )
+}  # fmt: skip
 
 
 if __name__ == "__main__":

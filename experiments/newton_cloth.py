@@ -108,19 +108,14 @@ def prepare_cloth(garment: Garment, material: Material) -> Cloth:
     squared = np.sum((rest[hinges[:, 1]] - rest[hinges[:, 0]]) ** 2, axis=1)
     stiffness = each(material.bending_stiffness, is_hinge)
     return Cloth(
-        vertices=np.flatnonzero(is_vertex),
-        rest=rest[is_vertex],
-        faces=index[np.asarray(garment.faces)[is_face]],
-        hinges=index[hinges],
-        masses=np.where(is_pinned, 0.0, masses),
-        is_pinned=is_pinned,
+        vertices=np.flatnonzero(is_vertex), rest=rest[is_vertex],
+        faces=index[np.asarray(garment.faces)[is_face]], hinges=index[hinges],
+        masses=np.where(is_pinned, 0.0, masses), is_pinned=is_pinned,
         areas=np.asarray(garment.rest_areas, np.float64)[is_face],
         shear=each(material.lame_mu, is_face) * thickness,
         area_stiffness=each(material.lame_lambda, is_face) * thickness,
-        bending=stiffness * squared / (4.0 * areas),
-        bending_stiffness=stiffness,
-        hinge_areas=areas,
-    )
+        bending=stiffness * squared / (4.0 * areas), bending_stiffness=stiffness, hinge_areas=areas,
+    )  # fmt: skip
 
 
 def springs(cloth: Cloth) -> tuple[Int[np.ndarray, "edges 2"], Float[np.ndarray, " edges"]]:
@@ -188,10 +183,6 @@ class NewtonCloth:
 
     def __init__(self, scene: Scene, setting: Setting) -> None:
         """Build the model.
-
-        Args:
-            scene: The scene.
-            setting: Solver and effort.
 
         Raises:
             MissingExtraError: Newton is not installed.
@@ -297,25 +288,12 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
         "xpbd": cloth.bending / cloth.hinge_areas,
     }[solver]
     zeros = [0.0] * len(cloth.faces)
-    builder.add_triangles(
-        *cloth.faces.T,
-        tri_ke=cloth.shear.tolist(),
-        tri_ka=cloth.area_stiffness.tolist(),
-        tri_kd=zeros,
-        tri_drag=zeros,
-        tri_lift=zeros,
-        custom_attributes=triangles,
-    )
-    builder.add_edges(
-        left,
-        right,
-        start,
-        end,
-        rest=[0.0] * len(start),  # fabric is flat
-        edge_ke=bending.tolist(),
-        edge_kd=[0.0] * len(start),
-        custom_attributes=hinges,
-    )
+    stiffness = {"tri_ke": cloth.shear.tolist(), "tri_ka": cloth.area_stiffness.tolist()}
+    stiffness |= dict.fromkeys(("tri_kd", "tri_drag", "tri_lift"), zeros)
+    builder.add_triangles(*cloth.faces.T, custom_attributes=triangles, **stiffness)
+    zeros = [0.0] * len(start)
+    bent = {"rest": zeros, "edge_ke": bending.tolist(), "edge_kd": zeros}  # fabric is flat at rest
+    builder.add_edges(left, right, start, end, custom_attributes=hinges, **bent)
     if solver == "xpbd":
         for (i, j), stiffness in zip(*springs(cloth), strict=True):
             builder.add_spring(int(i), int(j), float(stiffness), 0.0, control=0.0)
@@ -357,9 +335,6 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
 
 def newton_simulator(setting: Setting) -> Simulator:
     """Return a solver of Newton as a simulator of the hard cases.
-
-    Args:
-        setting: Solver and effort.
 
     Raises:
         MissingExtraError: Newton is not installed.

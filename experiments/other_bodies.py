@@ -8,16 +8,14 @@ proportions and on other rigs, in T-poses, and a figure of capsules with a surfa
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from harness import keep, kept, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.joints import find_parts
@@ -33,11 +31,9 @@ from eslr_jax.fit.clearance import body_heights
 from eslr_jax.fit.postures import find_arms, rest_posture
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import last_frames, simulate
 from eslr_jax.types import Body
 
@@ -56,13 +52,9 @@ _MIXAMO = {"LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2"}
 def proportioned(
     mesh: RiggedMesh, lengths: dict[str, float], girths: dict[str, float], size: float = 1.0
 ) -> RiggedMesh:
-    """Return a body of other proportions: every bone longer and thicker by factors for its part.
+    """Return a body of other proportions, larger by a size.
 
-    Args:
-        mesh: The body at rest.
-        lengths: Factor on the length of the bones of a part, such as upper_leg; 1 where none is given.
-        girths: Factor on the thickness around them.
-        size: Factor on everything.
+    Bones become longer by `lengths`, and thicker by `girths`, factors by their part, such as upper_leg.
     """
     skeleton = mesh.skeleton
     part_of = {joint: part[1] for part, joints in find_parts(skeleton).items() for joint in joints}
@@ -79,20 +71,19 @@ def proportioned(
         maps[joint] = size * (lengths.get(part, 1.0) * along + girths.get(part, 1.0) * (np.eye(3) - along))
     places = rest.copy()
     for joint, parent in enumerate(skeleton.parents):
-        places[joint] = (
-            places[parent] + maps[parent] @ (rest[joint] - rest[parent])
-            if parent >= 0
-            else size * rest[joint]
-        )
+        above = places[parent] + maps[parent] @ (rest[joint] - rest[parent])
+        places[joint] = above if parent >= 0 else size * rest[joint]
     blended = np.einsum("vi,vixy->vxy", mesh.skin_weights, maps[mesh.skin_indices])
     offsets = np.einsum(
         "vi,vix->vx", mesh.skin_weights, (places - np.einsum("jxy,jy->jx", maps, rest))[mesh.skin_indices]
     )
     moved = np.einsum("vxy,vy->vx", blended, mesh.positions) + offsets
-    return RiggedMesh(
-        mesh.name, moved, mesh.faces, mesh.skin_weights, mesh.skin_indices,
-        Skeleton(skeleton.joint_names, skeleton.parents, places),
-    )  # fmt: skip
+    return dataclasses.replace(mesh, positions=moved, skeleton=moved_skeleton(mesh, places))
+
+
+def moved_skeleton(mesh: RiggedMesh, places: np.ndarray) -> Skeleton:
+    """Return a mesh's skeleton with joints at other places [m]."""
+    return dataclasses.replace(mesh.skeleton, rest_positions=places)
 
 
 def posed(mesh: RiggedMesh, arm_angle: float) -> RiggedMesh:
@@ -102,22 +93,14 @@ def posed(mesh: RiggedMesh, arm_angle: float) -> RiggedMesh:
     transforms = np.asarray(poses.joint_transforms[0], np.float64)
     rest = mesh.skeleton.rest_positions
     places = np.einsum("jxy,jy->jx", transforms[:, :, :3], rest) + transforms[:, :, 3]
-    skeleton = Skeleton(mesh.skeleton.joint_names, mesh.skeleton.parents, places)
     positions = np.asarray(poses.positions[0], np.float64)
-    return RiggedMesh(mesh.name, positions, mesh.faces, mesh.skin_weights, mesh.skin_indices, skeleton)
+    return dataclasses.replace(mesh, positions=positions, skeleton=moved_skeleton(mesh, places))
 
 
 def renamed(
     mesh: RiggedMesh, names: tuple[str, ...], parents: tuple[int, ...], owner: np.ndarray
 ) -> RiggedMesh:
-    """Return a body on another rig.
-
-    Args:
-        mesh: The body.
-        names: Joints of the new rig.
-        parents: Their parents.
-        owner: Joint of the new rig for every joint of the old one, shape [joints].
-    """
+    """Return a body on a rig of other names and parents; `owner` has the new joint of every old one."""
     first = [int(np.argmax(owner == joint)) for joint in range(len(names))]
     weights = np.zeros((len(mesh.positions), len(names)))
     rows = np.arange(len(weights))[:, None]
@@ -125,9 +108,8 @@ def renamed(
     chosen = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     kept = np.take_along_axis(weights, chosen, axis=1)
     skeleton = Skeleton(names, parents, mesh.skeleton.rest_positions[first])
-    return RiggedMesh(
-        mesh.name, mesh.positions, mesh.faces, kept / kept.sum(1, keepdims=True), chosen, skeleton
-    )
+    kept /= kept.sum(1, keepdims=True)
+    return dataclasses.replace(mesh, skin_weights=kept, skin_indices=chosen, skeleton=skeleton)
 
 
 def bundled_mesh(body: Body | None = None) -> RiggedMesh:
@@ -150,10 +132,7 @@ def smpl_rig(mesh: RiggedMesh) -> RiggedMesh:
     places = [old.index(theirs) for theirs in _SMPL.values()]
     tree = tuple(-1 if parents[place] < 0 else int(owner[parents[place]]) for place in places)
     result = renamed(mesh, names, tree, owner)
-    skeleton = Skeleton(names, tree, mesh.skeleton.rest_positions[places])
-    return RiggedMesh(
-        mesh.name, result.positions, result.faces, result.skin_weights, result.skin_indices, skeleton
-    )
+    return dataclasses.replace(result, skeleton=moved_skeleton(result, mesh.skeleton.rest_positions[places]))
 
 
 def smpl_male() -> RiggedMesh:
@@ -195,39 +174,24 @@ def mixamo() -> RiggedMesh:
     mesh = proportioned(mesh, lengths, {"spine": 1.12, "forearm": 0.9, "upper_leg": 0.92, "hips": 0.9})
     mesh = posed(mesh, 47.0)
     names = tuple(f"mixamorig:{_MIXAMO.get(name, name)}" for name in mesh.skeleton.joint_names)
-    return _scaled(renamed(mesh, names, mesh.skeleton.parents, np.arange(len(names))), 100.0)
-
-
-def _scaled(mesh: RiggedMesh, factor: float) -> RiggedMesh:
-    skeleton = mesh.skeleton
-    places = Skeleton(skeleton.joint_names, skeleton.parents, factor * skeleton.rest_positions)
-    return RiggedMesh(
-        mesh.name, factor * mesh.positions, mesh.faces, mesh.skin_weights, mesh.skin_indices, places
-    )
+    mesh = renamed(mesh, names, mesh.skeleton.parents, np.arange(len(names)))
+    places = 100.0 * mesh.skeleton.rest_positions
+    return dataclasses.replace(mesh, positions=100.0 * mesh.positions, skeleton=moved_skeleton(mesh, places))
 
 
 # A figure of capsules: (joint, parent, place [m], radius at the joint and at its end, end), VRM's names.
 _FIGURE = (
-    ("C_Hips", -1, (0.0, 0.52, 0.0)),
-    ("C_Spine", 0, (0.0, 0.60, 0.0)),
-    ("C_Chest", 1, (0.0, 0.72, 0.0)),
-    ("C_Neck", 2, (0.0, 0.86, 0.0)),
-    ("C_Head", 3, (0.0, 0.93, 0.0)),
-    ("L_Shoulder", 2, (0.03, 0.82, 0.0)),
-    ("L_UpperArm", 5, (0.15, 0.81, 0.0)),
-    ("L_LowerArm", 6, (0.29, 0.70, 0.0)),
-    ("L_Hand", 7, (0.43, 0.59, 0.0)),
-    ("R_Shoulder", 2, (-0.03, 0.82, 0.0)),
-    ("R_UpperArm", 9, (-0.15, 0.81, 0.0)),
-    ("R_LowerArm", 10, (-0.29, 0.70, 0.0)),
-    ("R_Hand", 11, (-0.43, 0.59, 0.0)),
-    ("L_UpperLeg", 0, (0.085, 0.48, 0.0)),
-    ("L_LowerLeg", 13, (0.10, 0.27, 0.0)),
-    ("L_Foot", 14, (0.11, 0.06, 0.0)),
-    ("R_UpperLeg", 0, (-0.085, 0.48, 0.0)),
-    ("R_LowerLeg", 16, (-0.10, 0.27, 0.0)),
+    ("C_Hips", -1, (0.0, 0.52, 0.0)), ("C_Spine", 0, (0.0, 0.60, 0.0)),
+    ("C_Chest", 1, (0.0, 0.72, 0.0)), ("C_Neck", 2, (0.0, 0.86, 0.0)),
+    ("C_Head", 3, (0.0, 0.93, 0.0)), ("L_Shoulder", 2, (0.03, 0.82, 0.0)),
+    ("L_UpperArm", 5, (0.15, 0.81, 0.0)), ("L_LowerArm", 6, (0.29, 0.70, 0.0)),
+    ("L_Hand", 7, (0.43, 0.59, 0.0)), ("R_Shoulder", 2, (-0.03, 0.82, 0.0)),
+    ("R_UpperArm", 9, (-0.15, 0.81, 0.0)), ("R_LowerArm", 10, (-0.29, 0.70, 0.0)),
+    ("R_Hand", 11, (-0.43, 0.59, 0.0)), ("L_UpperLeg", 0, (0.085, 0.48, 0.0)),
+    ("L_LowerLeg", 13, (0.10, 0.27, 0.0)), ("L_Foot", 14, (0.11, 0.06, 0.0)),
+    ("R_UpperLeg", 0, (-0.085, 0.48, 0.0)), ("R_LowerLeg", 16, (-0.10, 0.27, 0.0)),
     ("R_Foot", 17, (-0.11, 0.06, 0.0)),
-)
+)  # fmt: skip
 _CAPSULES = (  # joint, start and end [m], radii [m]
     (0, (-0.04, 0.50, 0.0), (0.04, 0.50, 0.0), 0.095, 0.095),
     (1, (0.0, 0.56, 0.01), (0.0, 0.68, 0.0), 0.110, 0.100),
@@ -282,16 +246,9 @@ def _capsule_distances(points: np.ndarray) -> np.ndarray:
     return result
 
 
-BODIES = {
-    "smpl_male": smpl_male,
-    "smpl_female": smpl_female,
-    "child": child,
-    "mixamo": mixamo,
-    "figure": figure,
-}
+BODIES = {make.__name__: make for make in (smpl_male, smpl_female, child, mixamo, figure)}
 
 
-RESULTS = Path(__file__).parent / "results"
 GARMENTS = (
     "tshirt", "tank", "longsleeve", "shortsleeve", "dress", "tightdress", "shorts", "kneepants", "pants",
 )  # fmt: skip
@@ -301,6 +258,7 @@ STILL, RAISE = 50, 25  # frames that the body stands, and in which it lifts its 
 STANDING = 45.0  # [degrees] of the arms below the horizontal, as garments are cut
 SMOKE_FRAMES = STILL  # of the walk
 ITERATIONS = 30  # of the solver
+CONFIG = SimConfig(iterations=ITERATIONS)
 
 
 def standing_motion(body: Body, frames: int) -> Motion:
@@ -329,7 +287,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
             simulate(
                 None,
                 prepare_scene(cloth, poses, options=options, surface=surface),
-                config=SimConfig(iterations=ITERATIONS),
+                config=CONFIG,
                 raises=False,
             )
             for poses in (still, with_settling(walk, SETTLE_FRAMES, body))
@@ -367,49 +325,32 @@ def _depth(distances: np.ndarray) -> float:
     return float(max(-np.asarray(distances).min(), 0.0) * 1e3)
 
 
-def _picture(body: Body, panels: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return a strip of pictures: labels, body vertices, cloth vertices and faces."""
-    faces = np.asarray(body.faces)
-    dressed = {"rest_positions": np.asarray(body.rest_positions), "rig": body, "follows": False}
-    pictures = [
-        render_frame(skin, faces, cloth, triangles, camera=25.0, size=(180, 280), **dressed)
-        for _, skin, cloth, triangles in panels
-    ]
-    return side_by_side(pictures, tuple(label for label, *_ in panels))
-
-
 def main() -> None:
-    """Measure every garment on every body; write a table and pictures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="one garment, one body, few frames")
-    parser.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the table and the pictures")
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    names, garments = (["mixamo"], GARMENTS[:1]) if arguments.smoke else (arguments.bodies, GARMENTS)
-    path = arguments.out / "other_bodies.json"
-    table: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    table |= {
-        "clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, "device": device_name(), **environment(),
-    }  # fmt: skip
+    options = parser(__doc__, "one garment, one body, few frames")
+    options.add_argument("--bodies", nargs="+", default=["bundled", *BODIES], choices=["bundled", *BODIES])
+    chosen = options.parse_args()
+    names, garments = (["mixamo"], GARMENTS[:1]) if chosen.smoke else (chosen.bodies, GARMENTS)
+    path = chosen.out / "other_bodies.json"
+    about = {"clip": CLIP, "frames": FRAMES, "iterations": ITERATIONS, **environment()}
+    table: dict[str, Any] = {**kept(path), **about}
     for name in names:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnitsWarning)  # Mixamo's is in centimetres, on purpose
             body = load_body() if name == "bundled" else make_body(BODIES[name]())
-        rows, panels = [], []
+        rows, pictures = [], []
+        dressed = {"rest_positions": np.asarray(body.rest_positions), "rig": body, "follows": False}
         for row, (moving, positions, faces) in measure(
-            body, garments, frames=SMOKE_FRAMES if arguments.smoke else FRAMES
+            body, garments, frames=SMOKE_FRAMES if chosen.smoke else FRAMES
         ):
-            print(
-                name,
-                {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()},
-            )
+            print(name, row, flush=True)
             rows.append(row)
-            panels.append((row["garment"], moving[-1], positions[-1], faces))
+            mesh = (moving[-1], np.asarray(body.faces), positions[-1], faces)
+            pictures.append(render_frame(*mesh, camera=25.0, size=(180, 280), **dressed))
         table[name] = rows
-        write_png(arguments.out / f"other_bodies_{name}.png", _picture(body, panels))
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(table, indent=1) + "\n")
+        write_png(
+            chosen.out / f"other_bodies_{name}.png", side_by_side(pictures, [row["garment"] for row in rows])
+        )
+        keep(path, table)
 
 
 if __name__ == "__main__":

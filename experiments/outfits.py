@@ -8,28 +8,20 @@ the hard cases counts intersecting pairs of a face of one garment and a face of 
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import keep, machine, parser
 
-from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
-from eslr_jax.body.motion import pose_body
+from eslr_jax import SceneOptions, SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs
-from eslr_jax.evaluation.report import environment
 from eslr_jax.fit.outfit import combine_garments
 from eslr_jax.geometry.topology import is_on_boundary
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.garment import GarmentFile
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.budget import device_name
-from eslr_jax.simulation.simulate import simulate
 
-RESULTS = Path(__file__).parent / "results"
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
 CLIP = "cmu_016_32"  # of the test split
 FRAMES = 100
@@ -50,20 +42,15 @@ def skirt_of(dress: GarmentFile) -> GarmentFile:
     )
 
 
-def load(name: str) -> GarmentFile:
-    """Return a bundled garment, or a skirt."""
-    return skirt_of(load_garment_file("dress")) if "skirt" in name else load_garment_file(name)
-
-
 def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1) -> dict[str, Any]:
-    """Return the intersecting pairs of two garments in every so many frames of a walk, and milliseconds a frame.
-
-    Args:
-        names: Garments, the inner one first.
-        frames: Of the walk.
-        substeps: Of every frame.
-    """
-    outfit = combine_garments([load(name) for name in names], names)
+    """Return the pairs of two garments, the inner one first, in every so many frames of a walk."""
+    outfit = combine_garments(
+        [
+            skirt_of(load_garment_file("dress")) if "skirt" in name else load_garment_file(name)
+            for name in names
+        ],
+        names,
+    )
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(CLIP), num_frames=frames), SETTLE_FRAMES, body)
     options = SceneOptions(has_skin=True, integrator="bdf2", substeps=substeps)
@@ -84,27 +71,19 @@ def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1)
 
 
 def main() -> None:
-    """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--substeps", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="one outfit, six frames, no substeps")
-    arguments = parser.parse_args()
-    outfits, frames, substeps = OUTFITS, FRAMES, arguments.substeps
-    if arguments.smoke:
+    options = parser(__doc__, "one outfit, six frames, no substeps")
+    options.add_argument("--substeps", type=int, nargs="+", default=[1, 2])
+    chosen = options.parse_args()
+    outfits, frames, substeps = OUTFITS, FRAMES, chosen.substeps
+    if chosen.smoke:
         outfits, frames, substeps = OUTFITS[:1], 6, [1]
     rows = []
     for names in outfits:
         for count in substeps:
             rows.append(row := count_pairs(names, frames, count))
             print(json.dumps(row), flush=True)
-    result = {"clip": CLIP, "frames": frames, "every": EVERY, "rows": rows}
-    result |= {"device": device_name(), "environment": environment()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / "outfits.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    result = {"clip": CLIP, "frames": frames, "every": EVERY, "rows": rows, **machine()}
+    keep(chosen.out / "outfits.json", result)
 
 
 if __name__ == "__main__":

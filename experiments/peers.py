@@ -20,48 +20,36 @@ Newton comes with the extra `peers`; Blender runs where BLENDER_PYTHON names a P
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import importlib.metadata
-import json
 import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from blender_cloth import blender_python, run_blender
-from hard_cases import drop_scene
+from harness import keep, kept, markdown, parser
 from newton_cloth import NewtonCloth, Setting, require_newton
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, Trajectory, score_trajectory
 from eslr_jax.errors import MissingExtraError, NonFiniteError
 from eslr_jax.evaluation.calibrate import example_scene
 from eslr_jax.evaluation.gap import reached_potentials, trajectory_gap, trajectory_states
 from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.score import score_trajectory
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import rollout_scene, step_frame
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.types import ClothState, Scene, Trajectory
+from eslr_jax.types import ClothState, Scene
 
-RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
 SETTINGS = (
-    Setting("vbd", 1, 20),
-    Setting("vbd", 5, 5),
-    Setting("vbd", 5, 10),
-    Setting("vbd", 5, 20),
-    Setting("style3d", 1, 20),
-    Setting("style3d", 2, 5),
-    Setting("style3d", 2, 10),
-    Setting("style3d", 2, 20),
+    *(Setting("vbd", *effort) for effort in ((1, 20), (5, 5), (5, 10), (5, 20))),
+    *(Setting("style3d", *effort) for effort in ((1, 20), (2, 5), (2, 10), (2, 20))),
     Setting("xpbd", None, 1),
 )
 SMOKE_SETTINGS = (Setting("vbd", 5, 5), Setting("style3d", 2, 5), Setting("xpbd", None, 1))
@@ -75,6 +63,7 @@ SCORE = {  # measure of `score_trajectory` -> column
     "intersections_cloth": "intersections_cloth",
     "intersections_body": "intersections_body",
 }
+GAPS = ("gap_relative_median", "gap_relative_max", "gap_j_median")
 EVERY = 6  # frames between those whose gap is measured
 TIMED_FRAMES = 20  # of `peer_points`
 
@@ -122,23 +111,10 @@ def newton_methods(scene: Scene, settings: tuple[Setting, ...]) -> list[Method]:
     return [Method(s.name, cloth.substeps, s.iterations, cloth) for s, cloth in cloths]
 
 
-def make_scene(name: str, num_frames: int) -> Scene:
-    """Return a scene by name: a garment on the clip, or the sheet dropped on a ball, and its resolution."""
-    what, size = name.split("_")
-    if what == "ball":
-        return drop_scene({}, columns={"1k": 33, "4k": 65}[size], seconds=(num_frames - 1) / 30).scene
-    return example_scene(what, size, CLIP, num_frames)
-
-
 def take_turns(
     methods: list[Method], scene: Scene, num_frames: int
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Roll all methods out, frame by frame in turns.
-
-    Args:
-        methods: On the scene.
-        scene: The scene.
-        num_frames: The start included.
+    """Roll all methods out, frame by frame in turns, to a number of frames with the start.
 
     Returns:
         Per method positions [m], shape [frames, vertices, 3]; and wall and processor time per frame [ms].
@@ -161,14 +137,7 @@ def take_turns(
 def teach(
     methods: list[Method], scene: Scene, truth: Trajectory, every: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return every method's gap [J] after one frame from states of a rollout, and the frames' initial gaps [J].
-
-    Args:
-        methods: On the scene.
-        scene: The scene.
-        truth: Its near-optimal rollout.
-        every: Frames between the states.
-    """
+    """Return every method's gap [J] a frame after every so many states of `truth`, and the initial gaps [J]."""
     ends = trajectory_gap(truth, scene, every=every)
     states, inputs = trajectory_states(truth, scene)
     taken = jax.tree.map(lambda leaf: leaf[1::every], (states, inputs))
@@ -245,21 +214,13 @@ def blender_rows(scene: Scene, efforts: tuple[tuple[int, int], ...], every: int)
 def summarize_gap(gap: np.ndarray, initial: np.ndarray) -> dict[str, float | None]:
     """Return medians and largest values; None where a position was not finite."""
     gap = np.maximum(gap, 0.0)
-    values = {
-        "gap_relative_median": np.median(gap / initial),
-        "gap_relative_max": np.max(gap / initial),
-        "gap_j_median": np.median(gap),
-    }
+    share = gap / initial
+    values = dict(zip(GAPS, (np.median(share), np.max(share), np.median(gap)), strict=True))
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 
 def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str, list[dict[str, Any]]]:
-    """Return what every peer takes and leaves, in the form of `speed_vs_error`; empty without Newton.
-
-    Args:
-        scenes: Of one size; the first is timed.
-        settings: Of Newton's solvers.
-    """
+    """Return what Newton's solvers take and leave as `speed_vs_error` does; the first of the scenes is timed."""
     methods, relative = [newton_methods(scenes[0], settings)], []
     if not methods[0]:
         return {}
@@ -285,33 +246,12 @@ def peer_points(scenes: list[Scene], settings: tuple[Setting, ...]) -> dict[str,
 
 
 COLUMNS = {
-    "method": "method",
-    "effort": "substeps x iterations",
-    "frame_ms": "ms a frame",
-    "frame_cpu_ms": "CPU ms",
-    "gap_relative_median": "gap, median [%]",
-    "gap_relative_own": "on its own rollout [%]",
-    "pooled_stretch_p99": "stretch, 99 % of faces",
-    "penetration_p999_mm": "penetration, 99.9 % [mm]",
-    "intersections_body": "pairs with the body",
+    "method": "method", "effort": "substeps x iterations", "frame_ms": "ms a frame",
+    "frame_cpu_ms": "CPU ms", "gap_relative_median": "gap, median [%]",
+    "gap_relative_own": "on its own rollout [%]", "pooled_stretch_p99": "stretch, 99 % of faces",
+    "penetration_p999_mm": "penetration, 99.9 % [mm]", "intersections_body": "pairs with the body",
     "intersections_cloth": "pairs of cloth",
-}
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows as a Markdown table."""
-
-    def cell(name: str, value: Any) -> str:
-        if value is None:
-            return "-"
-        if not isinstance(value, float):
-            return str(value)
-        scaled = 100 * value if name.startswith("gap_relative") else value
-        return f"{scaled:.3g}" if abs(scaled) < 1e3 else f"{scaled:.0f}"
-
-    lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]
-    lines += [[cell(name, row.get(name)) for name in COLUMNS] for row in rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+}  # fmt: skip
 
 
 def peer_versions() -> dict[str, str]:
@@ -326,42 +266,31 @@ def peer_versions() -> dict[str, str]:
 
 
 def main() -> None:
-    """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
-    parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="one scene, one setting per solver, few frames")
-    arguments = parser.parse_args()
+    options = parser(__doc__, "one scene, one setting per solver, few frames")
+    options.add_argument("--scenes", nargs="+", default=["tshirt_1k", "tshirt_4k", "tshirt_10k"])
+    options.add_argument("--frames", type=int, default=40)
+    chosen = options.parse_args()
     efforts, covering, settings, blender = OURS, OUR_SKIN, SETTINGS, BLENDER
-    if arguments.smoke:
-        arguments.scenes, arguments.frames = ["tshirt_1k"], 8
+    if chosen.smoke:
+        chosen.scenes, chosen.frames = ["tshirt_1k"], 8
         efforts, covering, settings, blender = OURS[-1:], (), SMOKE_SETTINGS, BLENDER[:1]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     result: dict[str, Any] = {
-        "clip": CLIP,
-        "frames": arguments.frames,
-        "processor": device_name(),
-        "cores": cores,
-        "date": time.strftime("%Y-%m-%d"),
-        **environment(),
-        "scenes": {},
-    }
+        "clip": CLIP, "frames": chosen.frames, "processor": device_name(), "cores": cores,
+        "date": time.strftime("%Y-%m-%d"), **environment(),
+        "scenes": kept(chosen.out / "peers.json").get("scenes", {}),
+    }  # fmt: skip
     result["versions"] |= peer_versions()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "peers.json"
-    if path.exists():
-        result["scenes"] = json.loads(path.read_text())["scenes"]
-    for name in arguments.scenes:
-        scene = make_scene(name, arguments.frames)
+    for name in chosen.scenes:
+        scene = example_scene(*name.split("_"), CLIP, chosen.frames)
         rows = measure_scene(scene, efforts, covering, settings, blender, EVERY)
         result["scenes"][name] = rows
         result["load"] = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # 1: nothing else runs
-        with atomic_write(path) as temporary:  # after every scene: they take minutes
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
-        print(f"\n{name}\n\n{table(rows)}", flush=True)
+        keep(chosen.out / "peers.json", result)
+        percent = [
+            {k: 100 * v if v and k.startswith("gap_relative") else v for k, v in row.items()} for row in rows
+        ]
+        print(f"\n{name}\n\n{markdown(COLUMNS, percent)}", flush=True)
         jax.clear_caches()
 
 

@@ -7,16 +7,15 @@ The same solver steps two scenes that differ in one part, and they are timed alt
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hard_cases import find_case
+from harness import keep, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body, still_motion
@@ -24,30 +23,18 @@ from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import starting_capacity
-from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.terms.air import Air
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"
 ITERATIONS = 20  # of the solver
 Pair = dict[str, Scene]  # two scenes by their labels; the first has more parts
-
-
-def layered_skirt(num_frames: int) -> Scene:
-    """Return the hard case's skirt over trousers, whose layers collide."""
-    from hard_cases import find_case
-
-    scene = find_case("layers").build({})["skirt over trousers"].scene
-    return with_room(first_frames(scene, num_frames))
 
 
 def with_room(scene: Scene) -> Scene:
@@ -55,20 +42,9 @@ def with_room(scene: Scene) -> Scene:
     return simulate(None, scene, config=SimConfig(iterations=ITERATIONS)).scene
 
 
-def without_layers(scene: Scene) -> Scene:
-    """Return a scene in which layers of cloth pass through each other."""
-    return scene.replace(self_contact=None)
-
-
 def with_layers(scene: Scene) -> Scene:
     """Return a scene in which layers of cloth collide."""
     return with_room(scene.replace(self_contact=starting_capacity(scene.garment.vertex_mask.shape[0])))
-
-
-def compare_steps(pair: Pair, turns: int) -> dict[str, float]:
-    """Return the milliseconds of both scenes' rollouts, and their ratio."""
-    step = partial(rollout_scene, None, config=SimConfig(iterations=ITERATIONS))
-    return ratio_of(take_turns({name: (step, (scene,)) for name, scene in pair.items()}, turns))
 
 
 def compare_searches(pair: Pair, turns: int) -> dict[str, Any]:
@@ -94,74 +70,56 @@ def ratio_of(times: dict[str, float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vertices", default="4k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="1k, three frames, one pair, one turn")
-    arguments = parser.parse_args()
-    frames, turns = (3, 1) if arguments.smoke else (12, 7)
-    if arguments.smoke:
-        arguments.vertices = "1k"
+    options = parser(__doc__, "1k, three frames, one pair, one turn")
+    options.add_argument("--vertices", default="4k", choices=["1k", "4k", "10k"])
+    chosen = options.parse_args()
+    frames, turns = (3, 1) if chosen.smoke else (12, 7)
+    if chosen.smoke:
+        chosen.vertices = "1k"
     body = load_body()
     poses = pose_body(body, load_motion(CLIP), num_frames=frames)
-    shirt = load_garment("tshirt", vertices=arguments.vertices)
+    shirt = load_garment("tshirt", vertices=chosen.vertices)
     whole = poses.surface
     by_face = COTTON.replace(
         **{name: jnp.full(shirt.faces.shape[0], getattr(COTTON, name)) for name in ("lame_mu", "lame_lambda")}
     )
     scene = prepare_scene(shirt, poses)
     still = pose_body(body, still_motion(body, frames, arm_angle=ARM_ABDUCTION), num_frames=frames)
-    dress = partial(prepare_scene, load_garment("dress", vertices=arguments.vertices), poses)
+    pinned = partial(prepare_scene, load_garment("dress", vertices=chosen.vertices), poses)
+
+    def modelled(**options: Any) -> Scene:
+        return prepare_scene(shirt, poses, options=SceneOptions(**options))
+
+    skirt = find_case("layers").build({})["skirt over trousers"].scene
     # Each pair is built when its turn comes; the smoke run takes the first.
     pairs: dict[str, Callable[[], Pair]] = {
-        "T-shirt: with a body against without": lambda: {
-            "with": scene,
-            "without": prepare_scene(shirt, poses, options=SceneOptions(has_body=False)),
-        },
+        "T-shirt: with a body against without": lambda: {"with": scene, "without": modelled(has_body=False)},
         "T-shirt: self-contact against none": lambda: {"with": with_layers(scene), "without": scene},
-        "T-shirt: skin contacts against none": lambda: {
-            "with": prepare_scene(shirt, poses, options=SceneOptions(has_skin=True)),
-            "without": scene,
-        },
-        "T-shirt: BDF2 against implicit Euler": lambda: {
-            "bdf2": prepare_scene(shirt, poses, options=SceneOptions(integrator="bdf2")),
-            "euler": scene,
-        },
+        "T-shirt: skin contacts against none": lambda: {"with": modelled(has_skin=True), "without": scene},
+        "T-shirt: BDF2 against implicit Euler": lambda: {"bdf2": modelled(integrator="bdf2"), "euler": scene},
         "T-shirt: air that moves against none": lambda: {
-            "with": prepare_scene(shirt, poses, options=SceneOptions(air=Air((3.0, 0.0, 0.0)))),
-            "without": scene,
+            "with": modelled(air=Air((3.0, 0.0, 0.0))), "without": scene,
         },
-        "T-shirt: whole body against what it reaches": lambda: {
-            "whole body": prepare_scene(shirt, poses, surface=whole),
-            "reached": scene,
-        },
+        "T-shirt: whole body against what it reaches": lambda: {"whole body": everything, "reached": scene},
         "T-shirt: fabric per face against one fabric": lambda: {
-            "per face": prepare_scene(shirt, poses, material=by_face),
-            "one": scene,
+            "per face": prepare_scene(shirt, poses, material=by_face), "one": scene,
         },
         "dress: pins that move against none": lambda: {
-            "pinned": dress(),
-            "free": dress().replace(pin_targets=None),
+            "pinned": pinned(), "free": pinned().replace(pin_targets=None),
         },
         "skirt over trousers: layers that collide against layers that don't": lambda: {
-            "with": (skirt := layered_skirt(frames)),
-            "without": without_layers(skirt),
+            "with": (worn := with_room(first_frames(skirt, frames))), "without": worn.replace(self_contact=None),
         },
         "T-shirt: moving body against a still one": lambda: {
-            "moving": scene,
-            "still": prepare_scene(shirt, still),
+            "moving": scene, "still": prepare_scene(shirt, still),
         },
         "T-shirt: all of that against what it needs": lambda: {
-            "all": with_layers(prepare_scene(shirt, poses, surface=whole, material=by_face)),
-            "needed": scene,
+            "all": with_layers(prepare_scene(shirt, poses, surface=whole, material=by_face)), "needed": scene,
         },
-    }
-    if arguments.smoke:
-        pairs = dict(list(pairs.items())[:1])
+    }  # fmt: skip
     everything = prepare_scene(shirt, poses, surface=whole)
+    if chosen.smoke:
+        pairs = dict(list(pairs.items())[:1])
     result: dict[str, Any] = {
         "vertices": int(np.sum(shirt.vertex_mask)),
         "frames": frames - 1,
@@ -170,13 +128,12 @@ def main() -> None:
             {"whole body": everything, "reached": scene}, turns
         ),
     }
+    step = partial(rollout_scene, None, config=SimConfig(iterations=ITERATIONS))
     for name, build in pairs.items():
-        result[name] = compare_steps(build(), turns)
+        calls = {label: (step, (one,)) for label, one in build().items()}
+        result[name] = ratio_of(take_turns(calls, turns))
         print(f"{name}: {result[name]['ratio']:.2f}x", flush=True)
-    result |= {"device": device_name(), "environment": environment()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / "scene_needs.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    keep(chosen.out / "scene_needs.json", {**result, **machine()})
 
 
 if __name__ == "__main__":

@@ -10,38 +10,33 @@ starts that differ by 1e-5 m. Writes self_contact_1k.json.
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from harness import keep, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import judge
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 FRAMES = 61  # two seconds
 EVERY = 5  # frames between those that are judged
 CONFIG = SimConfig(iterations=300, tolerance=0.01)
 _STARTS_APART = 1e-5  # [m] standard deviation
 
 
-def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) -> list[dict[str, Any]]:
-    """Return intersecting pairs of cloth faces over rollouts, and milliseconds a frame."""
+def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) -> Iterator[dict[str, Any]]:
+    """Yield intersecting pairs of cloth faces over rollouts, and milliseconds a frame."""
     cloth, body = load_garment(garment, vertices=vertices), load_body()
     poses = pose_body(body, load_motion(clip), num_frames=frames)
     surface = shared_surface([cloth], poses)  # all clips then share a program
-    rows = []
     kinds = [(True, False, 0), *((True, True, number) for number in range(starts)), (False, False, 0)]
     for is_put_on, has_layers, number in kinds:
         options = SceneOptions(self_contact=has_layers, has_skin=True, integrator="bdf2")
@@ -49,24 +44,22 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
         scene = moved(prepare_scene(cloth, moving, surface=surface, options=options), number)
         run = simulate(None, scene, config=CONFIG)
         positions = np.asarray(run.trajectory.positions)
-        row: dict[str, Any] = {"garment": garment, "clip": clip, "vertices": vertices}
-        row |= {"put_on": is_put_on, "self_contact": has_layers, "number": number}
-        row["start"] = judge(positions[0], np.asarray(cloth.faces)).cloth_cloth
-        counts = [
+        start, *counts = (
             judge(position, np.asarray(cloth.faces)).cloth_cloth
-            for position in positions[SETTLE_FRAMES:][::EVERY]
-        ]
-        row |= {"pairs": counts, "mean": float(np.mean(counts))}
-        row["residual_max"] = float(np.max(run.trajectory.residuals))
-        row["iterations"] = float(np.mean(run.trajectory.iterations))
-        row["frame_ms"] = run.timing.frame_ms
-        if run.trajectory.pair_demand is not None:
-            row |= {
-                "pairs_found": int(np.max(run.trajectory.pair_demand)),
-                "rows": run.scene.self_contact.pairs,
-            }
-        rows.append(row)
-    return rows
+            for position in (positions[0], *positions[SETTLE_FRAMES::EVERY])
+        )
+        trajectory = run.trajectory
+        row = {
+            "garment": garment, "clip": clip, "vertices": vertices,
+            "put_on": is_put_on, "self_contact": has_layers, "number": number,
+            "start": start, "pairs": counts, "mean": float(np.mean(counts)),
+            "residual_max": float(np.max(trajectory.residuals)),
+            "iterations": float(np.mean(trajectory.iterations)),
+            "frame_ms": run.timing.frame_ms,
+        }  # fmt: skip
+        if trajectory.pair_demand is not None:
+            row |= {"pairs_found": int(np.max(trajectory.pair_demand)), "rows": run.scene.self_contact.pairs}
+        yield row
 
 
 def moved(scene: Scene, number: int) -> Scene:
@@ -79,30 +72,23 @@ def moved(scene: Scene, number: int) -> Scene:
 
 
 def main() -> None:
-    """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])
-    parser.add_argument("--starts", type=int, default=3, help="of the rollouts with self-contact")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="T-shirt at 1k, one clip, six frames")
-    arguments = parser.parse_args()
-    clips, garments, frames = load_splits()["motions"]["test"], arguments.garments, FRAMES
-    if arguments.smoke:
-        clips, garments, frames, arguments.vertices = clips[:1], ["tshirt"], 6, "1k"
-        arguments.starts = 1
+    options = parser(__doc__, "T-shirt at 1k, one clip, six frames")
+    options.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
+    options.add_argument("--garments", nargs="+", default=["tshirt", "longsleeve", "dress", "pants"])
+    options.add_argument("--starts", type=int, default=3, help="of the rollouts with self-contact")
+    chosen = options.parse_args()
+    clips, garments, frames = load_splits()["motions"]["test"], chosen.garments, FRAMES
+    if chosen.smoke:
+        clips, garments, frames, chosen.vertices = clips[:1], ["tshirt"], 6, "1k"
+        chosen.starts = 1
     rows = []
     for garment in garments:
         for clip in clips:
-            rows += (found := measure(garment, clip, arguments.vertices, frames, arguments.starts))
-            print(*map(json.dumps, found), sep="\n", flush=True)
-    result = {"rows": rows, "frames": frames, "settle": SETTLE_FRAMES, "every": EVERY}
-    result |= {"device": device_name(), "environment": environment()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(arguments.out / f"self_contact_{arguments.vertices}.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+            for row in measure(garment, clip, chosen.vertices, frames, chosen.starts):
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+    result = {"rows": rows, "frames": frames, "settle": SETTLE_FRAMES, "every": EVERY, **machine()}
+    keep(chosen.out / f"self_contact_{chosen.vertices}.json", result)
 
 
 if __name__ == "__main__":

@@ -15,27 +15,18 @@ Writes speed_vs_error.json and .png after every size.
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 
 import jax
-import numpy as np
+from harness import keep, kept, parser, save
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.models import START_MODEL
-from eslr_jax.evaluation.calibrate import (
-    example_scene,
-    measure_methods,
-    read_coarse_edges,
-    simulator_of,
-)
+from eslr_jax.evaluation.calibrate import example_scene, measure_methods, read_coarse_edges, simulator_of
 from eslr_jax.evaluation.report import environment, trajectory_report
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.simulation.budget import SOLVER, Method, device_name, interpolate_gap
+from eslr_jax.simulation.budget import SOLVER, Method, device_name
 from eslr_jax.simulation.rollout import rollout_scene
 
-RESULTS = Path(__file__).parent / "results"
 CLIP = "cmu_016_32"  # of the test split
 GARMENTS = ("tshirt", "dress", "pants")
 ROLLOUTS = (5, 10, 20, 50, 100), (0, 5, 20)  # iterations of free rollouts, by the solver and behind a network
@@ -55,15 +46,7 @@ def points(method: Method) -> list[dict]:
 
 
 def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: tuple[int, ...]) -> list[dict]:
-    """Return the report of a free rollout for every number of iterations.
-
-    Args:
-        name: SOLVER, or a bundled network with the solver behind it.
-        garment: Name of a bundled garment.
-        size: Its resolution.
-        num_frames: Length of the rollouts.
-        counts: Numbers of iterations.
-    """
+    """Return the report of a free rollout for every number of iterations, behind a network or none."""
     reads_edges = read_coarse_edges((name,))
     scene = example_scene(garment, size, CLIP, num_frames, has_coarse_edges=reads_edges)
     reports = []
@@ -76,36 +59,8 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
     return reports
 
 
-def who_wins(by_name: dict[str, list[dict]], peers: list[str]) -> list[dict]:
-    """Return the gap of every method for a range of times per frame.
-
-    Between two measured numbers of iterations our methods are interpolated. A peer's settings are single points;
-    the best of those within the time counts.
-
-    Args:
-        by_name: Measured points of every method.
-        peers: Names of those that are peers.
-    """
-    least = min(point["frame_ms"] for entries in by_name.values() for point in entries)
-    most = max(point["frame_ms"] for entries in by_name.values() for point in entries)
-
-    def within(name: str, budget: float) -> float | None:
-        curve = {entry["frame_ms"]: entry["gap_relative_median"] for entry in by_name[name]}
-        if name in peers:
-            return min((gap for time, gap in curve.items() if time <= budget), default=None)
-        return interpolate_gap(curve, budget) if budget >= min(curve) else None
-
-    return [
-        {"budget_ms": float(budget), **{name: within(name, budget) for name in by_name}}
-        for budget in np.geomspace(least, most, 8)
-    ]
-
-
 def draw(result: dict, path: Path) -> None:
     """Draw the frontier, one panel per size."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -138,38 +93,32 @@ def draw(result: dict, path: Path) -> None:
         axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0][0].set_ylabel("optimality gap / the initial gap (median)")
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize=8)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+    save(figure, path)
 
 
 def main() -> None:
-    """Measure, draw and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = parser(__doc__, "one garment, few frames")
+    options.add_argument("--sizes", nargs="+", default=["1k", "4k"])
+    options.add_argument("--models", nargs="*", default=list(asset_names("model")))
+    options.add_argument("--garments", nargs="+", default=list(GARMENTS))
+    options.add_argument("--frames", type=int, default=40, help="of every garment; gaps are measured in all")
+    options.add_argument(
+        "--peers", action="store_true", help="other simulators too, where they are installed"
     )
-    parser.add_argument("--sizes", nargs="+", default=["1k", "4k"])
-    parser.add_argument("--models", nargs="*", default=list(asset_names("model")))
-    parser.add_argument("--garments", nargs="+", default=list(GARMENTS))
-    parser.add_argument("--frames", type=int, default=40, help="of every garment; gaps are measured in all")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
-    parser.add_argument("--smoke", action="store_true", help="one garment, few frames")
-    arguments = parser.parse_args()
-    garments, frames, rollout_frames = arguments.garments, arguments.frames, 60
+    chosen = options.parse_args()
+    garments, frames, rollout_frames = chosen.garments, chosen.frames, 60
     solver_counts, network_counts = ROLLOUTS
-    if arguments.smoke:
+    if chosen.smoke:
         garments, frames, rollout_frames = garments[:1], 8, 8
-        arguments.sizes, arguments.models = ["1k"], [START_MODEL]
+        chosen.sizes, chosen.models = ["1k"], [START_MODEL]
         solver_counts = network_counts = (10,)  # which the calibration has compiled
-    path = arguments.out / "speed_vs_error.json"
+    path = chosen.out / "speed_vs_error.json"
+    older = {} if chosen.smoke else kept(path)
     result: dict = {"clip": CLIP, "device": device_name(), "peers": [], "sizes": {}}
-    if path.exists() and not arguments.smoke:
-        older = json.loads(path.read_text())
-        result |= {name: older[name] for name in ("peers", "sizes")}
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    names = (SOLVER, *arguments.models)
+    result |= {name: older[name] for name in ("peers", "sizes") if name in older}
+    names = (SOLVER, *chosen.models)
     reads_edges = read_coarse_edges(names)
-    for size in arguments.sizes:
+    for size in chosen.sizes:
         scenes = [
             example_scene(garment, size, CLIP, frames, has_coarse_edges=reads_edges) for garment in garments
         ]
@@ -177,10 +126,10 @@ def main() -> None:
         print(f"{size}: methods measured", flush=True)
         measured = {method.name: points(method) for method in methods}
         about = environment()
-        if arguments.peers:
+        if chosen.peers:
             import peers
 
-            settings = peers.SMOKE_SETTINGS if arguments.smoke else peers.SETTINGS
+            settings = peers.SMOKE_SETTINGS if chosen.smoke else peers.SETTINGS
             of_peers = peers.peer_points(scenes, settings)
             result["peers"] = list(dict.fromkeys([*result["peers"], *of_peers]))
             measured |= of_peers
@@ -194,7 +143,7 @@ def main() -> None:
             ]
             for name, counts in (
                 (SOLVER, solver_counts),
-                *((model, network_counts) for model in arguments.models if model == START_MODEL),
+                *((model, network_counts) for model in chosen.models if model == START_MODEL),
             )
         }
         result["sizes"][size] = {
@@ -205,27 +154,12 @@ def main() -> None:
                 {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
                 for method in methods
             ],
-            "budgets": who_wins(measured, result["peers"]),
             "rollouts": rollouts,
             "environment": about,
         }
-        draw(result, arguments.out / "speed_vs_error.png")
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
-        print_budgets(size, result["sizes"][size]["budgets"])
+        draw(result, chosen.out / "speed_vs_error.png")
+        keep(path, result)
         jax.clear_caches()
-
-
-def print_budgets(size: str, rows: list[dict]) -> None:
-    """Print the best gap of every method within each budget."""
-    print(size)
-    for row in rows:
-        cells = ", ".join(
-            f"{name} {'-' if value is None else f'{value:.4%}'}"
-            for name, value in row.items()
-            if name != "budget_ms"
-        )
-        print(f"  {row['budget_ms']:7.1f} ms: {cells}", flush=True)
 
 
 if __name__ == "__main__":

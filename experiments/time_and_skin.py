@@ -16,34 +16,29 @@ Rows of time_and_skin.json stay until they are measured again.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import parser, put
 from scipy.spatial import cKDTree
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
+from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body, simulate
+from eslr_jax.assets import load_splits
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.cli.console import use_compile_cache
-from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import intersecting_pairs, judge
 from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import Integrator, start_integrator
-from eslr_jax.scene.plan import SceneOptions, prepare_scenes
-from eslr_jax.simulation.simulate import simulate
+from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parent / "results"
 PARTS = ("skin", "time")
+NAMES = ("garment", "vertices", "clip", "integrator", "steps")  # of a row
 GARMENTS = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")
 INTEGRATORS: tuple[Integrator, ...] = ("bdf2", "euler")
 FPS, FRAMES = 30.0, 60
@@ -113,11 +108,7 @@ def _body(scene: Scene, frame: int) -> tuple[np.ndarray, np.ndarray]:
 def judge_frame(scene: Scene, positions: np.ndarray, frame: int, crossings: np.ndarray) -> dict[str, Any]:
     """Return the pairs of a frame, its depth for 99.9 % of vertices [mm], and whether the body pinches it.
 
-    Args:
-        scene: Of the frame.
-        positions: Of the cloth [m].
-        frame: Its number.
-        crossings: Where the body intersects itself [m].
+    `crossings` are where the body intersects itself [m].
     """
     cloth, (body, faces) = scene.garment, _body(scene, frame)
     own = np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]
@@ -179,45 +170,25 @@ def measure_time(
                 }  # fmt: skip
 
 
-def keep(path: Path, part: str, row: dict[str, Any]) -> None:
-    """Put a row in the place of the one that was measured before."""
-    names = ("garment", "vertices", "clip", "integrator", "steps")
-
-    def key(one: dict[str, Any]) -> tuple:
-        return tuple(one.get(name) for name in names)
-
-    result = json.loads(path.read_text()) if path.exists() else {}
-    others = [one for one in result.get(part, []) if key(one) != key(row)]
-    result = {**result, part: [*others, row], **environment()}
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
-
-
 def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
-    parser.add_argument("--garment", nargs="*", choices=GARMENTS)
-    parser.add_argument("--vertices", default="1k")
-    arguments = parser.parse_args()
+    options = parser(__doc__, "one garment, one clip, few frames")
+    options.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    options.add_argument("--garment", nargs="*", choices=GARMENTS)
+    options.add_argument("--vertices", default="1k")
+    chosen = options.parse_args()
 
     use_compile_cache()
-    clips, is_smoke = list(load_splits()["motions"]["test"]), arguments.smoke
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / "time_and_skin.json"
-    for part in arguments.part:
-        garments = list(arguments.garment or (GARMENTS if part == "skin" else TIMED))[
-            : 1 if is_smoke else None
-        ]
+    clips, is_smoke = list(load_splits()["motions"]["test"]), chosen.smoke
+    path = chosen.out / "time_and_skin.json"
+    for part in chosen.part:
+        garments = list(chosen.garment or (GARMENTS if part == "skin" else TIMED))[: 1 if is_smoke else None]
         if part == "skin":
             frames, some = (6, clips[:1]) if is_smoke else (FRAMES, clips)
-            rows = measure_skin(garments, arguments.vertices, some, frames)
+            rows = measure_skin(garments, chosen.vertices, some, frames)
         else:
-            rows = measure_time(garments, arguments.vertices, clips[: 1 if is_smoke else 3], is_smoke)
+            rows = measure_time(garments, chosen.vertices, clips[: 1 if is_smoke else 3], is_smoke)
         for row in rows:
-            keep(path, part, row)
+            put(path, part, row, NAMES, environment())
             print(part, row, flush=True)
 
 

@@ -19,7 +19,7 @@ KERNELS = {
     "numerics", "body.lbs", "contact", "graph", "models", "terms", "physics", "scene.build", "simulation.frame",
     "simulation.network", "simulation.stepper", "simulation.rollout",
 }  # fmt: skip
-HOST_FILES = {"physics.newton", "physics.hessian", "physics.validate"}  # inside kernel rooms
+HOST_FILES = {"physics.validate"}  # inside kernel rooms
 SHARED = {"errors", "types", "config"}  # what kernels and host both read
 MAX_ARGUMENTS = 6
 DOORS = {

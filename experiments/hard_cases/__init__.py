@@ -39,16 +39,6 @@ def find_case(name: str) -> HardCase:
 
 
 __all__ = [
-    "CASES",
-    "CaseScene",
-    "HardCase",
-    "Measure",
-    "Outcome",
-    "Run",
-    "Simulator",
-    "drop_scene",
-    "find_case",
-    "network_simulator",
-    "run_case",
-    "solver_simulator",
-]
+    "CASES", "CaseScene", "HardCase", "Measure", "Outcome", "Run",
+    "Simulator", "drop_scene", "find_case", "network_simulator", "run_case", "solver_simulator",
+]  # fmt: skip

@@ -18,7 +18,6 @@ Needs the IPC Toolkit (extra `score`); `--sheet` needs the extra `render`.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -37,22 +36,17 @@ DEFAULT_MODEL = "eslr-small"
 
 def parse_arguments() -> argparse.Namespace:
     """Return what the command line asks for."""
-    parser = argparse.ArgumentParser(
-        prog="hard_cases", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    choices = [*ITERATIONS, *PEERS, "blender"]
-    parser.add_argument("simulator", nargs="?", default="corrected", choices=choices)
+    import harness
+
+    parser = harness.parser(__doc__, "one case")
+    parser.add_argument("simulator", nargs="?", default="corrected", choices=[*ITERATIONS, *PEERS, "blender"])
     parser.add_argument("--model", default=DEFAULT_MODEL)
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
     parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
-    parser.add_argument(
-        "--skin", action="store_true", help="physics: keep faces of the cloth off the body too"
-    )
+    parser.add_argument("--skin", action="store_true", help="physics: keep faces off the body too")
     parser.add_argument("--substeps", type=int, default=1, help="physics: of every frame")
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
-    parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
-    parser.add_argument("--smoke", action="store_true")
     arguments = parser.parse_args()
     if arguments.smoke:
         arguments.case = ["pull"]
@@ -114,14 +108,14 @@ def run(arguments: argparse.Namespace) -> None:
         for module in ("mitsuba", "PIL"):
             require(module, extra="render", purpose="--sheet")
 
-    from eslr_jax.io.atomic import atomic_write
+    import harness
+
     from eslr_jax.render import write_png
     from hard_cases import CASES, find_case, run_case
     from hard_cases.report import draw_sheet, merge_summaries, summarize
 
     cases = [find_case(name) for name in arguments.case or CASES]
     simulator = find_simulator(arguments)
-    arguments.out.mkdir(parents=True, exist_ok=True)
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
     other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
     other += "_skin" if arguments.skin else ""
@@ -133,10 +127,9 @@ def run(arguments: argparse.Namespace) -> None:
         outcome = run_case(case, simulator)
         outcomes.append(outcome)
         result = summarize(simulator.name, outcome)
-        if path.exists():
-            result = merge_summaries(json.loads(path.read_text()), result)
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
+        if older := harness.kept(path):
+            result = merge_summaries(older, result)
+        harness.keep(path, result)
         verdict = "passed" if outcome.is_passed else "FAILED"
         print(f"{case.name}: {verdict} in {time.perf_counter() - began:.0f} s", flush=True)
         for row in outcome.rows():
@@ -147,7 +140,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run the command line; an error on purpose is one line and exit code 2."""
     from eslr_jax.errors import EslrError
 
     arguments = parse_arguments()

@@ -66,10 +66,8 @@ def _measure_bad_mesh(runs: Runs) -> list[Measure]:
 
 
 BAD_MESH = HardCase(
-    name="bad_mesh",
-    reason="users' meshes: each is simulated within bars, or refused with a named error",
-    build=_build_bad_mesh,
-    measure=_measure_bad_mesh,
-    picture="slivers of aspect 50",
+    "bad_mesh",
+    "users' meshes: each is simulated within bars, or refused with a named error",
+    *(_build_bad_mesh, _measure_bad_mesh, "slivers of aspect 50"),
     may_refuse=True,
 )

@@ -31,35 +31,20 @@ def drop_scene(
     swing: float = 0.15,
     columns: int = 33,
 ) -> CaseScene:
-    """Return a sheet of one square metre over a ball that starts to swing at 1 Hz after half a second.
+    """Return a sheet of one square metre over a ball that starts to swing along x at 1 Hz after half a second.
 
-    Args:
-        options: Options of `prepare_garment` that the simulator asks for.
-        height: Height of the sheet over the ball's centre [m].
-        seconds: Length of the scene.
-        timestep: Time between frames [s].
-        material: Fabric.
-        swing: Amplitude of the ball along x [m].
-        columns: Vertices along the side of the sheet.
+    The sheet begins at a height over the ball's centre [m]; `swing` is the ball's amplitude [m].
     """
     garment = make_cloth(sheet(columns, columns, (1.0, 1.0)), options)
     start = np.asarray(garment.rest_positions, np.float64) + np.array([0.0, height, 0.0])
     ball = icosphere(4, _RADIUS)
     frames = round(seconds / timestep) + 1
     x = swing * np.sin(2 * np.pi * np.maximum(np.arange(frames) * timestep - _SWING_START, 0.0))
-    scene = make_scene(
-        garment,
-        start,
-        frames,
-        timestep=timestep,
-        material=material,
-        body=ball,
-        body_positions=ball[0] + x[:, None, None] * np.array([1.0, 0.0, 0.0]),
-    )
+    track = ball[0] + x[:, None, None] * np.array([1.0, 0.0, 0.0])
+    stepped = {"timestep": timestep, "material": material}
+    scene = make_scene(garment, start, frames, body=ball, body_positions=track, **stepped)
     return CaseScene(scene, lambda frame: (Sphere(np.array([x[frame], 0.0, 0.0]), _RADIUS),))
 
-
-# --- dropped on a ball that swings -----------------------------------------------------------------------
 
 _TAUGHT_FRAMES = (4, 7, 9, 11, 14, 18, 24, 32)  # fall, impact, drape, swing
 
@@ -89,15 +74,11 @@ def _measure_drop(runs: Runs) -> list[Measure]:
 
 
 DROP = HardCase(
-    name="drop_on_ball",
-    reason="impact, drape and drag: one scene with every energy at work, and an optimum to be measured by",
-    build=_build_drop,
-    measure=_measure_drop,
-    picture="drop",
+    "drop_on_ball",
+    "impact, drape and drag: one scene with every energy at work, and an optimum to be measured by",
+    *(_build_drop, _measure_drop, "drop"),
 )
 
-
-# --- started inside the body -----------------------------------------------------------------------------
 
 _DEPTHS = (5, 10, 20, 50)  # [mm]
 
@@ -123,15 +104,11 @@ def _measure_start_inside(runs: Runs) -> list[Measure]:
 
 
 START_INSIDE = HardCase(
-    name="start_inside",
-    reason="skinned garments start inside the body: they must come out soon, and not like a shot",
-    build=_build_start_inside,
-    measure=_measure_start_inside,
-    picture="50 mm",
+    "start_inside",
+    "skinned garments start inside the body: they must come out soon, and not like a shot",
+    *(_build_start_inside, _measure_start_inside, "50 mm"),
 )
 
-
-# --- other timesteps and fabrics -------------------------------------------------------------------------
 
 _TIMESTEPS = {"dt 1/60 s": 1 / 60, "dt 1/30 s": 1 / 30, "dt 1/15 s": 1 / 15, "dt 1/10 s": 1 / 10}
 _FABRICS = {  # HOOD's training ranges
@@ -167,11 +144,9 @@ def _measure_steps_and_fabrics(runs: Runs) -> list[Measure]:
 
 
 STEPS_AND_FABRICS = HardCase(
-    name="steps_and_fabrics",
-    reason="timesteps and fabrics at the ends of their ranges: within bars, or refused",
-    build=_build_steps_and_fabrics,
-    measure=_measure_steps_and_fabrics,
-    picture="dt 1/10 s",
+    "steps_and_fabrics",
+    "timesteps and fabrics at the ends of their ranges: within bars, or refused",
+    *(_build_steps_and_fabrics, _measure_steps_and_fabrics, "dt 1/10 s"),
     may_refuse=True,
     limit="the heaviest fabric (0.7 kg/m2, four times cotton) stretches by 1.255 where the bar is 1.25: that is "
     "the optimum's own stretch (gap below 1 uJ), so no solver of this potential can meet it. BDF2 swings "

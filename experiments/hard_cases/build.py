@@ -32,6 +32,13 @@ def grid_faces(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
     return np.concatenate([first, second])
 
 
+def same_way_faces(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
+    """Return two triangles per square of a grid of vertices, diagonals all one way."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
 def sheet(rows: int, columns: int, size: tuple[float, float]) -> Mesh:
     """Return a level sheet around the origin, facing up; `size` is along x and z [m]."""
     x, z = np.meshgrid(
@@ -49,14 +56,7 @@ def hanging_sheet(rows: int, columns: int, size: tuple[float, float]) -> Mesh:
 
 
 def tube(around: int, along: int, radii: tuple[float, float], length: float) -> Mesh:
-    """Return an open tube around y, from height zero down, facing out.
-
-    Args:
-        around: Vertices around.
-        along: Vertices along.
-        radii: Radius at the top and at the bottom [m].
-        length: Length [m].
-    """
+    """Return an open tube around y, from height zero down, facing out; radii at the top and the bottom [m]."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     share = np.linspace(0, 1, along)
     radius = radii[0] + (radii[1] - radii[0]) * share
@@ -147,12 +147,7 @@ def plane(size: float, count: int, tilt: float) -> Mesh:
 def turn_about_x(
     positions: Float[np.ndarray, "vertices 3"], angles: Float[np.ndarray, "frames angles"]
 ) -> Float[np.ndarray, "frames vertices 3"]:
-    """Return positions [m] turned about the x axis in every frame, shape [frames, vertices, 3].
-
-    Args:
-        positions: Positions before the turn [m], shape [vertices, 3].
-        angles: Angles [rad], shape [frames, vertices], or [frames, 1] for all vertices alike.
-    """
+    """Return positions [m] turned about the x axis in every frame, by an angle [rad] for each or for all."""
     x, y, z = positions.T
     sine, cosine = np.sin(angles), np.cos(angles)
     y, z = y * cosine - z * sine, y * sine + z * cosine
@@ -169,14 +164,7 @@ def join_meshes(*meshes: Mesh) -> Mesh:
 def make_cloth(
     mesh: Mesh, options: Mapping[str, Any], *, is_pinned: np.ndarray | None = None, **more: Any
 ) -> Garment:
-    """Return a garment that hangs on no body: every vertex has the same made-up joint.
-
-    Args:
-        mesh: Rest mesh.
-        options: Options of `prepare_garment` that the simulator asks for.
-        is_pinned: Vertices that follow the scene's pin targets, shape [vertices]; none by default.
-        more: Further options of `prepare_garment`.
-    """
+    """Return a garment that hangs on no body: every vertex has the same made-up joint; see `prepare_garment`."""
     ones = np.ones((len(mesh[0]), 1))
     joints = np.zeros_like(ones, int)
     return prepare_garment(
@@ -210,20 +198,9 @@ def make_scene(
 ) -> Scene:
     """Put cloth, body and pins together; the cloth starts at rest.
 
-    Args:
-        garment: Cloth.
-        start: Positions in frame 0 [m], shape [vertices, 3].
-        num_frames: Number of frames, frame 0 included.
-        timestep: Time between frames [s].
-        material: Fabric.
-        constants: Physical constants.
-        body: Body mesh, all of whose vertices have faces; None without a body.
-        body_positions: Body in every frame [m], shape [frames, body_vertices, 3]; it must not touch itself in
-            frame 0. By default the body stands still.
-        pin_targets: Positions of pinned vertices in every frame [m], shape [frames, vertices, 3], or in all,
-            shape [1, vertices, 3]; by default they stay where they start.
-        self_contact: Keep layers of cloth apart.
-        has_tips: Whether the body has tips finer than the cloth's mesh.
+    Without their tracks [m] the body, whose vertices all have faces, stands still, and pinned vertices stay
+    where they start. In frame 0 the body must not touch itself; `has_tips` says that it has tips finer
+    than the cloth's mesh.
     """
     position = jnp.asarray(start, jnp.float32)
     obstacle = pins = None

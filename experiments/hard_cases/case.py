@@ -19,17 +19,12 @@ Colliders = Callable[[int], Sequence[Collider]]
 """From a frame to the solids that the body stands for."""
 
 
-def no_colliders(frame: int) -> Sequence[Collider]:
-    """Return the solids of a scene that has none."""
-    return ()
-
-
 @dataclasses.dataclass(frozen=True)
 class CaseScene:
     """A scene of a case, with its body in closed form."""
 
     scene: Scene
-    colliders: Colliders = no_colliders
+    colliders: Colliders = lambda frame: ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ class Sphere:
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
         """Return signed distances [m]: |x - c| - r."""
-        return np.linalg.norm(_float64(points) - self.center, axis=-1) - self.radius
+        return np.linalg.norm(np.asarray(points, np.float64) - self.center, axis=-1) - self.radius
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Capsule:
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
         """Return signed distances [m]: the distance to the segment minus the radius."""
-        axis = _float64(self.end) - self.start
-        offset = _float64(points) - self.start
+        axis = np.asarray(self.end, np.float64) - self.start
+        offset = np.asarray(points, np.float64) - self.start
         share = np.clip(offset @ axis / float(axis @ axis), 0.0, 1.0)
         return np.linalg.norm(offset - share[..., None] * axis, axis=-1) - self.radius
 
@@ -60,7 +60,7 @@ class Plane:
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
         """Return signed distances [m]: n . (x - p)."""
-        return (_float64(points) - self.point) @ _float64(self.normal)
+        return (np.asarray(points, np.float64) - self.point) @ np.asarray(self.normal, np.float64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,8 @@ class RoundedCone:
         With s along the axis and r across it, the flank is r cos(a) - s sin(a) away. The apex is nearest where
         r sin(a) + s cos(a) < 0.
         """
-        offset = _float64(points) - self.apex
-        along = offset @ _float64(self.axis)
+        offset = np.asarray(points, np.float64) - self.apex
+        along = offset @ np.asarray(self.axis, np.float64)
         across = np.linalg.norm(offset - along[..., None] * self.axis, axis=-1)
         sine, cosine = np.sin(self.half_angle), np.cos(self.half_angle)
         is_before_apex = across * sine + along * cosine < 0
@@ -90,16 +90,12 @@ class RoundedCone:
 def triangle_distances(
     collider: Collider, corners: Float[np.ndarray, "faces 3 3"]
 ) -> Float[np.ndarray, " faces"]:
-    """Return the least signed distance over every triangle [m], to about 1e-4 of its size.
+    """Return the least signed distance over every triangle to a convex solid [m], to about 1e-4 of its size.
 
     Every round samples a smaller triangle around the best point so far. That can't end in the wrong place,
     because the distance to a convex solid has one minimum.
-
-    Args:
-        collider: A convex solid.
-        corners: Corner positions [m], shape [faces, 3, 3].
     """
-    corners = _float64(corners)
+    corners = np.asarray(corners, np.float64)
     weights = _barycentric_grid(_GRID)  # [samples, 3]
     center = np.full((len(corners), 3), 1.0 / 3.0)  # barycentric
     scale, best = 1.0, np.min(collider.distance(corners), axis=1)
@@ -120,7 +116,3 @@ def _barycentric_grid(count: int) -> np.ndarray:
     i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
     keep = i + j <= count
     return np.stack([i[keep], j[keep], count - i[keep] - j[keep]], axis=-1) / count
-
-
-def _float64(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values, np.float64)

@@ -30,9 +30,6 @@ _SIDE = 21  # vertices along the side of the small square cloth
 _SIZE = 0.5  # [m], its side
 
 
-# --- free fall -------------------------------------------------------------------------------------------
-
-
 def _build_free_fall(options: Mapping[str, Any]) -> Scenes:
     garment = make_cloth(sheet(_SIDE, _SIDE, (_SIZE, _SIZE)), options)
     tilt = np.radians(30)
@@ -66,15 +63,10 @@ def _own_parabola(run: Run) -> np.ndarray:
 
 
 FREE_FALL = HardCase(
-    name="free_fall",
-    reason="nothing but gravity acts: whatever else moves is the simulator's own invention",
-    build=_build_free_fall,
-    measure=_measure_free_fall,
-    picture="fall",
+    "free_fall",
+    "nothing but gravity acts: whatever else moves is the simulator's own invention",
+    *(_build_free_fall, _measure_free_fall, "fall"),
 )
-
-
-# --- hung by two corners ---------------------------------------------------------------------------------
 
 
 def _hung_cloth(options: Mapping[str, Any]) -> tuple[Garment, np.ndarray]:
@@ -122,15 +114,10 @@ def _measure_hang(runs: Runs) -> list[Measure]:
 
 
 HANG = HardCase(
-    name="hang",
-    reason="cloth that hangs must come to rest at its equilibrium, not short of it and not trembling",
-    build=_build_hang,
-    measure=_measure_hang,
-    picture="hang",
+    "hang",
+    "cloth that hangs must come to rest at its equilibrium, not short of it and not trembling",
+    *(_build_hang, _measure_hang, "hang"),
 )
-
-
-# --- bad starts ------------------------------------------------------------------------------------------
 
 
 def _build_bad_start(options: Mapping[str, Any]) -> Scenes:
@@ -182,17 +169,12 @@ def _flipped_share(run: Run) -> float:
 
 
 BAD_START = HardCase(
-    name="bad_start",
-    reason="crumpled, flat or inside-out starts: forces are huge and must lead home without a burst",
-    build=_build_bad_start,
-    measure=_measure_bad_start,
-    picture="scrambled",
+    "bad_start",
+    "crumpled, flat or inside-out starts: forces are huge and must lead home without a burst",
+    *(_build_bad_start, _measure_bad_start, "scrambled"),
     limit="by BDF2 the energy of the flattened start rises once, by 0.04 % of the drop with 200 "
     "iterations a frame; Euler's damping hides it",
 )
-
-
-# --- pulled and let go -----------------------------------------------------------------------------------
 
 
 def _build_pull(options: Mapping[str, Any]) -> Scenes:
@@ -223,15 +205,10 @@ def _measure_pull(runs: Runs) -> list[Measure]:
 
 
 PULL = HardCase(
-    name="pull",
-    reason="a cloth pulled to twice its size and let go: all the stored energy is set free at once",
-    build=_build_pull,
-    measure=_measure_pull,
-    picture="200 %",
+    "pull",
+    "a cloth pulled to twice its size and let go: all the stored energy is set free at once",
+    *(_build_pull, _measure_pull, "200 %"),
 )
-
-
-# --- twisted ---------------------------------------------------------------------------------------------
 
 
 def _build_twist(options: Mapping[str, Any]) -> Scenes:
@@ -259,9 +236,7 @@ def _measure_twist(runs: Runs) -> list[Measure]:
 
 
 TWIST = HardCase(
-    name="twist",
-    reason="a strip wrung for ten seconds: contact everywhere under rising tension",
-    build=_build_twist,
-    measure=_measure_twist,
-    picture="twist",
+    "twist",
+    "a strip wrung for ten seconds: contact everywhere under rising tension",
+    *(_build_twist, _measure_twist, "twist"),
 )

@@ -114,11 +114,9 @@ def _measure_layers(runs: Runs) -> list[Measure]:
 
 
 LAYERS = HardCase(
-    name="layers",
-    reason="layers that lie on each other must not pass through each other",
-    build=_build_layers,
-    measure=_measure_layers,
-    picture="skirt over trousers",
+    "layers",
+    "layers that lie on each other must not pass through each other",
+    *(_build_layers, _measure_layers, "skirt over trousers"),
     limit="layers have to be near each other at the start of a frame: with 2 cm in place of 4 the walls of a "
     "pleat cross, 17 pairs of triangles after 2 s. Few iterations, 20 behind a network, can leave two crumpling "
     "sheets crossed",

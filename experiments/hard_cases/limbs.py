@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.assets import load_body, load_garment
-from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax import SceneOptions, load_body, load_garment, pose_body, prepare_garment, prepare_scene
+from eslr_jax.body.motion import still_motion
 from eslr_jax.body.retarget import ARM_ABDUCTION
-from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
+from eslr_jax.scene.plan import first_frames
 from eslr_jax.types import Garment, Scene
 from hard_cases.build import (
     FRAME,
@@ -29,8 +28,6 @@ from hard_cases.build import (
 from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
 from hard_cases.colliders import Capsule
 from hard_cases.measures import MM, center, depths, largest_stretch, quantile_depth, rms, speeds
-
-# --- the same scene, turned ------------------------------------------------------------------------------
 
 
 def _turned(scene: Scene, matrix: np.ndarray) -> Scene:
@@ -48,13 +45,12 @@ def _turned(scene: Scene, matrix: np.ndarray) -> Scene:
 
 def _mirrored(garment: Garment, turn: Float[Array, "3 3"]) -> Garment:
     """Return the mirror image of a garment, vertex by vertex."""
-    return prepare_garment(
-        np.asarray(garment.rest_positions @ turn),
-        np.asarray(garment.faces)[:, ::-1].copy(),
-        skin_weights=np.asarray(garment.skin_weights),
-        skin_indices=np.asarray(garment.skin_indices),
-        embedding_size=garment.geodesic_embedding.shape[1],
-    )
+    skin = {
+        "skin_weights": np.asarray(garment.skin_weights),
+        "skin_indices": np.asarray(garment.skin_indices),
+    }
+    mesh = np.asarray(garment.rest_positions @ turn), np.asarray(garment.faces)[:, ::-1].copy()
+    return prepare_garment(*mesh, **skin, embedding_size=garment.geodesic_embedding.shape[1])
 
 
 def _yaw(degrees: float) -> np.ndarray:
@@ -89,15 +85,11 @@ def _measure_turned(runs: Runs) -> list[Measure]:
 
 
 TURNED = HardCase(
-    name="turned",
-    reason="physics knows no north and no left: the same scene turned or mirrored must give the same cloth",
-    build=_build_turned,
-    measure=_measure_turned,
-    picture="0",
+    "turned",
+    "physics knows no north and no left: the same scene turned or mirrored must give the same cloth",
+    *(_build_turned, _measure_turned, "0"),
 )
 
-
-# --- a limb that moves fast ------------------------------------------------------------------------------
 
 _SPEEDS = (1, 2, 4, 8)  # [m/s]
 _LIMB_RADIUS = 0.045  # [m]
@@ -110,14 +102,7 @@ _HALF = np.array([0.3, 0.0, 0.0])  # [m], half the axis of every limb
 
 
 def _limb_scene(garment: Garment, start: np.ndarray, path: np.ndarray, z: float) -> CaseScene:
-    """Return a scene of cloth and a limb along x, whose height is zero.
-
-    Args:
-        garment: Cloth before the limb or around it.
-        start: Its positions [m], shape [vertices, 3].
-        path: Displacement of the limb along z [m], shape [frames].
-        z: Where the limb begins [m].
-    """
+    """Return a scene of cloth and a limb along x at height zero, which begins at z and moves along a path [m]."""
     limb = capsule(_LIMB_RADIUS, 0.6)
     track = np.stack([np.zeros(len(path)), np.zeros(len(path)), z + path], axis=1)
     scene = make_scene(garment, start, len(path), body=limb, body_positions=limb[0] + track[:, None])
@@ -144,12 +129,7 @@ def _build_fast_limb(options: Mapping[str, Any]) -> Scenes:
 
 
 def _angles(run: Run, lines: np.ndarray) -> np.ndarray:
-    """Return the angle of vertices about the limb's axis, in turns, shape [frames, lines, line_vertices].
-
-    Args:
-        run: A scene with one limb along x.
-        lines: Vertices of each line, shape [lines, line_vertices].
-    """
+    """Return the angle of lines of vertices about the limb, in turns, shape [frames, lines, line_vertices]."""
     axis = np.array([run.colliders(frame)[0].start for frame in range(len(run.positions))])
     offset = run.positions[:, lines] - axis[:, None, None]
     return np.arctan2(offset[..., 2], offset[..., 1]) / (2 * np.pi)
@@ -198,15 +178,10 @@ def _measure_fast_limb(runs: Runs) -> list[Measure]:
 
 
 FAST_LIMB = HardCase(
-    name="fast_limb",
-    reason="an arm jerks its sleeve, or strikes a curtain, at up to 27 cm a frame",
-    build=_build_fast_limb,
-    measure=_measure_fast_limb,
-    picture="curtain, 8 m/s",
+    "fast_limb",
+    "an arm jerks its sleeve, or strikes a curtain, at up to 27 cm a frame",
+    *(_build_fast_limb, _measure_fast_limb, "curtain, 8 m/s"),
 )
-
-
-# --- pinched between two limbs ---------------------------------------------------------------------------
 
 
 def _build_pinch(options: Mapping[str, Any]) -> Scenes:
@@ -238,9 +213,7 @@ def _measure_pinch(runs: Runs) -> list[Measure]:
 
 
 PINCH = HardCase(
-    name="pinch",
-    reason="cloth between an arm and a chest that overlap has nowhere to go, and must not tremble",
-    build=_build_pinch,
-    measure=_measure_pinch,
-    picture="pinch",
+    "pinch",
+    "cloth between an arm and a chest that overlap has nowhere to go, and must not tremble",
+    *(_build_pinch, _measure_pinch, "pinch"),
 )

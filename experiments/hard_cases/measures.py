@@ -133,13 +133,7 @@ def largest_rise(energy: Float[np.ndarray, " frames"]) -> float:
 def settle(
     scene: Scene, position: Float[Array, "vertices 3"], pin_targets: Float[Array, "vertices 3"]
 ) -> Float[Array, "vertices 3"]:
-    """Return the equilibrium near some positions, without a body [m], shape [vertices, 3].
-
-    Args:
-        scene: Cloth, fabric and gravity.
-        position: Where to begin [m], shape [vertices, 3].
-        pin_targets: Where pinned vertices are [m], shape [vertices, 3].
-    """
+    """Return the equilibrium near some positions, without a body and with pins at their targets [m]."""
     problem = FrameProblem(
         garment=scene.garment,
         material=scene.material,

@@ -13,8 +13,6 @@ from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
 from hard_cases.colliders import Capsule, Plane, RoundedCone
 from hard_cases.measures import MM, center, depths, quantile_depth, triangle_depths
 
-# --- a needle and a thin edge ----------------------------------------------------------------------------
-
 _COLUMNS = 33  # vertices along a side of the half-metre sheet
 _TIP = 2e-3  # [m], radius of the needle's tip and of the edge
 _HALF_ANGLE = np.radians(15.0)
@@ -70,19 +68,14 @@ def _measure_needle(runs: Runs) -> list[Measure]:
 
 
 NEEDLE = HardCase(
-    name="needle",
-    reason="a tip of 2 mm finds the gap between vertices 16 mm apart",
-    build=_build_needle,
-    measure=_measure_needle,
-    picture="needle",
+    "needle",
+    "a tip of 2 mm finds the gap between vertices 16 mm apart",
+    *(_build_needle, _measure_needle, "needle"),
     limit="the needle holds the sheet for 0.2 s; then the sheet closes around it like an umbrella, no face is "
     "left over the tip, and it comes through by 77 to 88 mm. Asking less of the direction to a face (cosine 0.3 "
     "in place of 0.8) tore the sheet instead: 106 mm, edges 5.5 times their length. By Euler the thin edge "
     "passes",
 )
-
-
-# --- a long rest on a slope ------------------------------------------------------------------------------
 
 
 def _build_slope(options: Mapping[str, Any]) -> Scenes:
@@ -112,9 +105,7 @@ def _measure_slope(runs: Runs) -> list[Measure]:
 
 
 SLOPE = HardCase(
-    name="slope",
-    reason="a minute on a slope of 20 degrees with friction 0.5: cloth at rest must stay at rest",
-    build=_build_slope,
-    measure=_measure_slope,
-    picture="rest",
+    "slope",
+    "a minute on a slope of 20 degrees with friction 0.5: cloth at rest must stay at rest",
+    *(_build_slope, _measure_slope, "rest"),
 )

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax import ModelConfig, SimConfig, Trajectory, simulate
 from eslr_jax.scene.build import Integrator
-from eslr_jax.simulation.simulate import simulate
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 from hard_cases.case import Simulator
 
 
 def solver_simulator(
-    iterations: int = 200,
-    integrator: Integrator = "euler",
-    *,
-    has_skin: bool = False,
-    substeps: int = 1,
+    iterations: int = 200, integrator: Integrator = "euler", *, has_skin: bool = False, substeps: int = 1
 ) -> Simulator:
-    """Return the L-BFGS solver as a simulator.
-
-    Args:
-        iterations: Per frame, at most.
-        integrator: How time is stepped.
-        has_skin: Keep faces of the cloth off the body, besides its vertices.
-        substeps: Of every frame.
-    """
+    """Return the L-BFGS solver as a simulator; `has_skin`: faces of the cloth keep off the body too."""
 
     def run(scene: Scene) -> Trajectory:
         return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
@@ -37,14 +25,7 @@ def solver_simulator(
 
 
 def network_simulator(name: str, params: Any, model: ModelConfig, iterations: int = 0) -> Simulator:
-    """Return a network as a simulator.
-
-    Args:
-        name: What tables call it.
-        params: Weights of the network.
-        model: Architecture.
-        iterations: Iterations of the solver behind it, per frame.
-    """
+    """Return a network as a simulator, with so many iterations of the solver behind it."""
 
     def run(scene: Scene) -> Trajectory:
         config = SimConfig(model=model, iterations=iterations)

@@ -1,34 +1,32 @@
 """Error and cost of the gradient of a walking T-shirt, by the tolerances of the solver and the linear system.
 
-    python experiments/inverse/accuracy.py [--smoke] [--out DIR]
+    python experiments/inverse accuracy [--smoke] [--out DIR]
 
 Two losses after five frames (the shirt's mean x, its stretch energy in all frames) by three parameters (stiffness
 of the fabric, density, a shift of the body), in float32, the default. They are compared with central
 differences in float64, whose solver ends where float64 ends. The cost is the time of loss and gradient relative
-to that of the loss alone, for the frame after these five, timed alternately. Writes accuracy.json and
-accuracy.png.
+to that of the loss alone, for the frame after these five, timed alternately.
+Writes accuracy.json.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from sheet import keep, parse_options
+from harness import keep, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.physics import solve
 from eslr_jax.scene.build import slice_tracks
-from eslr_jax.scene.plan import first_frames, prepare_scene
+from eslr_jax.scene.plan import first_frames
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Scene, Trajectory, tree_cast
+from eslr_jax.types import Scene, tree_cast
+from inverse.sheet import RESULTS
 
 STEPS = {"fabric": 1e-4, "density": 1e-4, "body": 1e-6}  # of central differences; a share, a share, [m]
 LOSSES = ("mean x", "stretch energy")
@@ -87,14 +85,10 @@ def loss(change: dict, scene: Scene, weights: jax.Array, iterations: jax.Array, 
 def measure(
     scenes: tuple[Scene, Scene], expected: np.ndarray, config: SimConfig, counts: tuple, turns: int
 ) -> dict:
-    """Return errors of gradients in float32 (None: refused), and their cost, by the number of iterations.
+    """Return errors of gradients in float32 (None: refused) and their cost, by bounds of iterations.
 
-    Args:
-        scenes: The walk, and its next frame.
-        expected: Right gradients, shape [parameters, losses].
-        config: Holds the tolerance of a frame.
-        counts: Bounds of iterations.
-        turns: Of timing; 0 leaves the cost out.
+    `scenes` are the walk and its next frame, `expected` the right gradients, shape [parameters, losses]. Without
+    turns no cost is measured.
     """
     walk, frame = scenes
     value = jax.jit(partial(loss, config=config))
@@ -120,8 +114,7 @@ def measure(
 
 
 def main() -> None:
-    """Measure by iterations, by the tolerance of a frame, and by that of the linear system."""
-    options = parse_options(__doc__)
+    options = parser(__doc__, "a few steps", RESULTS).parse_args()
     turns = 1 if options.smoke else 15
     counts, tolerances, linear = (
         (ITERATIONS[:1], (), ()) if options.smoke else (ITERATIONS, TOLERANCES, LINEAR)
@@ -151,22 +144,4 @@ def main() -> None:
         jax.clear_caches()
         result["linear"][f"{share:g}"] = measure(scenes, expected, SimConfig(), (MOST,), 0)[MOST]
     solve._LINEAR_STOP["float32"] = default
-    keep(options.out, Path(__file__).stem, result, draw(result["iterations"]))
-
-
-def draw(rows: dict[int, dict]) -> plt.Figure:
-    """Return the errors by the iterations of a frame."""
-    figure, axis = plt.subplots(figsize=(7, 5), layout="constrained")
-    for style, name in zip("-:", LOSSES, strict=True):
-        for color, parameter in enumerate(STEPS):
-            errors = np.array([row[name][parameter] for row in rows.values()], float)  # NaN where refused
-            axis.loglog(list(rows), errors, f"C{color}o{style}", label=f"{name} by {parameter}")
-    axis.set(xlabel="iterations of a frame", ylabel="relative error of the gradient")
-    axis.set_xticks(list(rows), [str(count) for count in rows], minor=False)
-    axis.minorticks_off()
-    axis.legend()
-    return figure
-
-
-if __name__ == "__main__":
-    main()
+    keep(options.out / "accuracy.json", result | environment())

@@ -1,6 +1,6 @@
 """Recover two stiffnesses and the density of a fabric from the positions of a swinging sheet.
 
-    python experiments/inverse/fabric.py [--smoke] [--out DIR]
+    python experiments/inverse fabric [--smoke] [--out DIR]
 
 The sheet hangs from two corners, one of which a hand moves. Weight and inertia grow with the density, so motion
 in the air shows only stiffness over density. A washer of known mass on a free corner does not grow with it and
@@ -10,19 +10,19 @@ fabric.png.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from search import Search, descend, gradient_cost, search_simplex
-from sheet import TIMESTEP, held_scene, keep, parse_options, square
+from harness import keep, parser, save
 
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import environment
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Material, Scene
+from inverse.search import Search, descend, gradient_cost, search_simplex
+from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 
 SIDE, SIZE = 11, 0.3  # vertices, [m]
 FRAMES = 13
@@ -54,8 +54,7 @@ def fabric(logs: jax.Array, scene: Scene) -> Material:
 
 
 def main() -> None:
-    """Recover the fabric from three wrong starts, by gradients and without."""
-    options = parse_options(__doc__)
+    options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, turns, iterations = (3, 1, 30) if options.smoke else (25, 25, 150)
     scene = make_scene()
 
@@ -75,14 +74,12 @@ def main() -> None:
         by_gradient = descend(functions[1], start, steps)
         runs.append((by_gradient, search_simplex(functions[0], start, round(cost * steps))))
     result = {
-        "what": NAMES,
-        "starts": STARTS,
-        "gradient_in_evaluations": round(cost, 2),
+        "what": NAMES, "starts": STARTS, "gradient_in_evaluations": round(cost, 2),
         "lbfgs": [report(run, cost) for run, _ in runs],
-        "nelder_mead": [report(run, 1.0) for _, run in runs],
-        "sensitivity_mm": sensitivities(simulate),
-    }
-    keep(options.out, Path(__file__).stem, result, draw(runs, cost, np.asarray(measured), scene))
+        "nelder_mead": [report(run, 1.0) for _, run in runs], "sensitivity_mm": sensitivities(simulate),
+    }  # fmt: skip
+    keep(options.out / "fabric.json", result | environment())
+    save(draw(runs, cost, np.asarray(measured), scene), options.out / "fabric.png")
 
 
 def report(run: Search, cost: float) -> dict:
@@ -135,7 +132,3 @@ def draw(runs: list[tuple[Search, Search]], cost: float, measured: np.ndarray, s
     curve.set_title("solid: L-BFGS, dotted: Nelder-Mead")
     curve.legend(loc="lower left")
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -1,34 +1,30 @@
 """Let out a T-shirt that is too tight, so that its stretch on the body stays under a limit.
 
-    python experiments/inverse/fit.py [--smoke] [--out DIR]
+    python experiments/inverse fit [--smoke] [--out DIR]
 
 The shirt is cut 3 cm narrower all around. Parameters say how far each band of it (four heights of the trunk, the
 sleeves) is let out along its normals. The loss is the stretch on the body above the limit, after a few long
-frames in which the cloth comes to rest, and a small price for letting out. Writes fit.json and fit.png.
+frames in which the cloth comes to rest, and a small price for letting out. Writes fit.json.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from search import descend, gradient_cost, search_simplex
-from sheet import keep, parse_options
+from harness import keep, parser
 
-from eslr_jax.assets import load_body, load_garment
-from eslr_jax.body.motion import pose_body, still_motion
+from eslr_jax import SimConfig, load_body, load_garment, pose_body, prepare_scene
+from eslr_jax.body.motion import still_motion
 from eslr_jax.body.retarget import ARM_ABDUCTION
-from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import environment
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.rest_shape import with_rest_positions
-from eslr_jax.render.pictures import render_frame
-from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Body, Scene
+from inverse.search import descend, gradient_cost, search_simplex
+from inverse.sheet import RESULTS
 
 BAR = 1.08  # largest principal stretch
 TIGHT = -0.03  # [m], how far the shirt is taken in
@@ -56,17 +52,15 @@ def make_scene(body: Body, num_frames: int) -> Scene:
 
 
 def main() -> None:
-    """Let the shirt out by gradients and by Nelder-Mead, and keep both."""
-    options = parse_options(__doc__)
+    options = parser(__doc__, "a few steps", RESULTS).parse_args()
     frames, steps, turns = (2, 2, 1) if options.smoke else (5, 20, 9)
     config = SimConfig(iterations=20 if options.smoke else 100)
     body = load_body()
     scene = make_scene(body, frames)
     garment = scene.garment
     weights = jnp.asarray(band_weights(np.asarray(garment.rest_positions)), jnp.float32)
-    normals = jnp.asarray(
-        vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces)), jnp.float32
-    )
+    normals = vertex_normals(np.asarray(garment.rest_positions), np.asarray(garment.faces))
+    normals = jnp.asarray(normals, jnp.float32)
 
     def wear(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the shirt on the body [m], and the larger principal stretch of every face."""
@@ -77,9 +71,7 @@ def main() -> None:
 
     def loss(parameters: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         worn, stretch = wear(parameters)
-        over = jnp.sum(garment.rest_areas * jnp.maximum(stretch - BAR, 0.0) ** 2) / jnp.sum(
-            garment.rest_areas
-        )
+        over = jnp.average(jnp.maximum(stretch - BAR, 0.0) ** 2, weights=garment.rest_areas)
         return over + PRICE * jnp.sum(parameters**2), (worn, stretch)
 
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
@@ -104,13 +96,12 @@ def main() -> None:
         "let_out_mm": {name: np.round(1e3 * UNIT * best, 1) for name, best in shirts.items()},
         "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, (_, stretch) in worn.items()},
         "area_above_bar": {
-            name: float(areas[np.asarray(stretch) > BAR].sum() / areas.sum())
+            name: float(np.average(np.asarray(stretch) > BAR, weights=areas))
             for name, (_, stretch) in worn.items()
         },
         "loss_1e-4": {"lbfgs": min(by_gradient.losses), "nelder_mead": min(simplex.losses)},
     }
-    figure = draw(body, scene, worn, by_gradient.losses, simplex.losses, cost)
-    keep(options.out, Path(__file__).stem, result, figure)
+    keep(options.out / "fit.json", result | environment())
 
 
 def stretch_below(share: float, stretch: jax.Array, areas: np.ndarray) -> float:
@@ -118,43 +109,3 @@ def stretch_below(share: float, stretch: jax.Array, areas: np.ndarray) -> float:
     order = np.argsort(np.asarray(stretch))
     covered = np.cumsum(areas[order]) / areas.sum()
     return float(np.asarray(stretch)[order][np.searchsorted(covered, share)])
-
-
-def draw(
-    body: Body, scene: Scene, worn: dict, losses: list[float], free: list[float], cost: float
-) -> plt.Figure:
-    """Return the shirts, coloured by stretch, and both searches."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained")
-    faces, standing = (
-        np.asarray(scene.garment.faces),
-        pose_body(body, still_motion(body, 2, arm_angle=ARM_ABDUCTION)),
-    )
-    names = {"tight": "as it is cut", "lbfgs": "let out by gradients"}
-    for axis, (name, title) in zip(axes, names.items(), strict=False):
-        positions, stretch = (np.asarray(part) for part in worn[name])
-        count = np.maximum(np.bincount(faces.ravel(), minlength=len(positions)), 1)
-        mean = np.bincount(faces.ravel(), np.repeat(stretch, 3), minlength=len(positions)) / count
-        colors = plt.get_cmap("coolwarm")(np.clip((mean - 1) / (2 * (BAR - 1)), 0, 1))[:, :3]
-        picture = render_frame(
-            standing.positions[-1],
-            body.faces,
-            positions,
-            faces,
-            vertex_colors=colors,
-            rest_positions=body.rest_positions,
-            rig=body,
-            zoom=1.6,
-        )
-        axis.imshow(picture)
-        axis.set(title=f"{title}\nstretch: blue 1, grey {BAR}, red {2 * BAR - 1:.2f}")
-        axis.axis("off")
-    curve = axes[2]
-    curve.semilogy(cost * np.arange(1, len(losses) + 1), np.minimum.accumulate(losses), label="L-BFGS")
-    curve.semilogy(np.minimum.accumulate(free), label="Nelder-Mead")
-    curve.set(xlabel="evaluations of the loss (a gradient counts by its time)", ylabel="lowest loss [1e-4]")
-    curve.legend()
-    return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -28,11 +28,6 @@ def descend(value_and_grad: Callable, start: np.ndarray, steps: int) -> Search:
     """Search by L-BFGS of optax, one gradient a step.
 
     A step that made the loss much higher, or whose gradient was refused, is halved from the best point on.
-
-    Args:
-        value_and_grad: From parameters to their loss and its gradient.
-        start: Where to begin, shape [parameters].
-        steps: Number of gradients.
     """
     optimizer = optax.chain(optax.lbfgs(learning_rate=1.0, linesearch=None), optax.clip(_STEP))
     update = jax.jit(optimizer.update)
@@ -54,13 +49,7 @@ def descend(value_and_grad: Callable, start: np.ndarray, steps: int) -> Search:
 
 
 def search_simplex(value: Callable, start: np.ndarray, evaluations: int) -> Search:
-    """Search by SciPy's Nelder-Mead.
-
-    Args:
-        value: From parameters to their loss.
-        start: Where to begin, shape [parameters].
-        evaluations: How many it may take.
-    """
+    """Search by SciPy's Nelder-Mead, with so many evaluations at most."""
     losses: list[float] = []
 
     def record(parameters: np.ndarray) -> float:

@@ -1,59 +1,31 @@
-"""The scene of these experiments, a square sheet in the air, and how they keep what they find."""
+"""The scene of these experiments: a square sheet in the air."""
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-
+import harness
 import jax
 import jax.numpy as jnp
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
-from matplotlib.figure import Figure
+from hard_cases.build import make_cloth, same_way_faces
 
-from eslr_jax.evaluation.report import environment
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state, scene_terms
 from eslr_jax.types import Garment, Material, PhysicsConstants, Scene
 
-RESULTS = Path(__file__).parent.parent / "results" / "inverse"
+RESULTS = harness.RESULTS / "inverse"
 TIMESTEP = 1 / 30  # [s]
 
 
 def square(side: int, size: float, pins: list[int]) -> Garment:
-    """Return a level square of side x side vertices around the origin.
-
-    Args:
-        side: Number of vertices along an edge.
-        size: Length of an edge [m].
-        pins: Indices of vertices that are held.
-    """
+    """Return a level square of side x side vertices around the origin, of a size [m], with pins."""
     line = np.linspace(-0.5, 0.5, side) * size
     x, z = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    index = np.arange(side * side).reshape(side, side)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    return prepare_garment(
-        np.stack([x, np.zeros_like(x), z], axis=1),
-        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
-        skin_weights=np.ones((side * side, 1)),
-        skin_indices=np.zeros((side * side, 1), int),
-        is_pinned=np.array(pins, int),
-    )
+    positions = np.stack([x, np.zeros_like(x), z], axis=1)
+    return make_cloth((positions, same_way_faces(side, side)), {}, is_pinned=np.array(pins, int))
 
 
 def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) -> Scene:
-    """Return the scene of a sheet that starts level and at rest while its pinned vertices move.
-
-    Args:
-        garment: A sheet with pins.
-        shift: How far pinned vertices are from where they start [m], shape [frames, vertices or 1, 3].
-        material: Fabric.
-    """
+    """Return the scene of a sheet that starts level and at rest while its pins shift [m], frame by frame."""
     rest = jnp.asarray(garment.rest_positions)
     return Scene(
         garment=jax.tree.map(jnp.asarray, garment),
@@ -66,23 +38,3 @@ def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) 
         terms=scene_terms(None, has_ground=False, has_layers=False),
         num_frames=shift.shape[0],
     )
-
-
-def parse_options(description: str | None) -> argparse.Namespace:
-    """Return the options that all these scripts share."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true", help="a few steps, to see that it runs")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    return parser.parse_args()
-
-
-def keep(out: Path, name: str, result: dict, figure: Figure) -> None:
-    """Write a result with its environment as JSON, and its picture; print the result."""
-    out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(result | environment(), indent=1, default=lambda value: np.asarray(value).tolist())
-    with atomic_write(out / f"{name}.json") as path:
-        path.write_text(text + "\n")
-    figure.savefig(out / f"{name}.png", dpi=110)
-    print(json.dumps(result, default=lambda value: np.asarray(value).tolist())[:3000])

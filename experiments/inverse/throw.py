@@ -1,25 +1,24 @@
 """Find the hand's acceleration that throws a cloth so that its centre comes to a target.
 
-    python experiments/inverse/throw.py [--smoke] [--out DIR]
+    python experiments/inverse throw [--smoke] [--out DIR]
 
 A scene cannot let go of its pins, so a throw is two scenes: in the first a hand holds a corner; in the second,
 which begins with the last state of the first, nothing is pinned. Gradients pass from one into the other. The air
-is empty: the target is a point. Writes throw.json and throw.png.
+is empty: the target is a point. Writes throw.json.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from search import descend, gradient_cost, search_simplex
-from sheet import TIMESTEP, held_scene, keep, parse_options, square
+from harness import keep, parser
 
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import environment
 from eslr_jax.simulation.rollout import rollout_scene
+from inverse.search import descend, gradient_cost, search_simplex
+from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 
 SIDE, SIZE = 7, 0.24  # vertices, [m]
 HELD, FLIGHT = 9, 8  # frames in the hand and in the air
@@ -63,8 +62,7 @@ def loss(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def main() -> None:
-    """Throw by gradients and by Nelder-Mead, and keep both."""
-    options = parse_options(__doc__)
+    options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, turns = (3, 1) if options.smoke else (30, 25)
     both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
 
@@ -87,25 +85,4 @@ def main() -> None:
         calls = round(len(run.losses) * (cost if run is by_gradient else 1.0))
         distance = 1e3 * float(jnp.linalg.norm(miss(positions)))
         result[name] = {"evaluations": calls, "miss_mm": distance, "loss": min(run.losses)}
-    keep(options.out, Path(__file__).stem, result, draw(throws[0], by_gradient.losses, simplex.losses, cost))
-
-
-def draw(positions: np.ndarray, losses: list[float], free: list[float], ratio: float) -> plt.Figure:
-    """Return the throw from the side, and both searches."""
-    figure, (side, curve) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
-    shades = plt.get_cmap("viridis")(np.linspace(0, 0.9, len(positions)))
-    for frame, shade in zip(positions[::2], shades[::2], strict=True):
-        side.triplot(frame[:, 0], frame[:, 1], np.asarray(GARMENT.faces), color=shade, linewidth=0.6)
-    side.plot(positions[:HELD, 0, 0], positions[:HELD, 0, 1], "r.-", label="hand")
-    side.plot(TARGET[0], TARGET[1], "kx", markersize=12, label="target of the centre")
-    side.set(xlabel="x [m]", ylabel="y [m]", title="every second frame", aspect="equal")
-    curve.semilogy(ratio * np.arange(1, len(losses) + 1), np.minimum.accumulate(losses), label="L-BFGS")
-    curve.semilogy(np.minimum.accumulate(free), label="Nelder-Mead")
-    curve.set(xlabel="evaluations of the loss (a gradient counts by its time)", ylabel="lowest loss [m²]")
-    side.legend()
-    curve.legend()
-    return figure
-
-
-if __name__ == "__main__":
-    main()
+    keep(options.out / "throw.json", result | environment())

@@ -1,35 +1,35 @@
 """Train a small network frame by frame, and through time.
 
-    python experiments/inverse/unroll.py [--smoke] [--out DIR]
+    python experiments/inverse unroll [--smoke] [--out DIR]
 
 The network simulates a swinging sheet alone, from its own states. Three losses, the same steps and motions:
 - "per frame": the potential of every frame, each from a given state (as `eslr train` does);
 - "potential through time": the same sum, with gradients through the states that a frame hands on;
 - "distance through time": the squared distance from the solver's motion, gradients through the states.
-Judged on a longer motion that none has seen. Writes unroll.json and unroll.png.
+Judged on a longer motion that none has seen. Writes unroll.json.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import optax
-from sheet import TIMESTEP, held_scene, keep, parse_options, square
+from harness import keep, parser
 
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.gap import trajectory_gap
+from eslr_jax.evaluation.report import environment
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import Scene
+from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 
 SIDE, SIZE = 7, 0.24  # vertices, [m]
 FRAMES, TEST_FRAMES = 9, 25
@@ -51,13 +51,7 @@ def make_scene(seed: int, num_frames: int) -> Scene:
 
 
 def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
-    """Return every frame's potential [J] where the network's own motion ended it.
-
-    Args:
-        params: Weights of the network.
-        scene: The sheet.
-        is_detached: Stop gradients between frames.
-    """
+    """Return every frame's potential [J] where the network ended it; detached: frames hand on no gradient."""
     step = make_stepper(params, ALONE)
 
     def advance(state, inputs):
@@ -78,10 +72,8 @@ def loss(weights, others: dict, scene: Scene, solved: jax.Array, *, kind: str) -
     return jnp.mean(potentials(params, scene, is_detached=kind == "per frame")) / ENERGY
 
 
-def train(
-    kind: str, scenes: list[Scene], solved: list[jax.Array], steps: int
-) -> tuple[dict, float, list[float]]:
-    """Return trained parameters, the milliseconds of a step, and the norms of its gradients."""
+def train(kind: str, scenes: list[Scene], solved: list[jax.Array], steps: int) -> tuple[dict, float]:
+    """Return trained parameters, and the milliseconds of a step."""
     params = init_model(MODEL)
     others = {name: part for name, part in params.items() if name != "params"}
     weights = params["params"]
@@ -93,16 +85,15 @@ def train(
     def step(weights, state, scene, solved):
         gradient = jax.grad(loss)(weights, others, scene, solved, kind=kind)
         updates, state = optimizer.update(gradient, state)
-        return optax.apply_updates(weights, updates), state, optax.tree.norm(gradient)
+        return optax.apply_updates(weights, updates), state
 
-    state, norms, times = optimizer.init(weights), [], []
+    state, times = optimizer.init(weights), []
     for index in range(steps):
         began = time.perf_counter()
         row = index % len(scenes)
-        weights, state, norm = step(weights, state, scenes[row], solved[row])
-        norms.append(float(norm))
+        weights, state = jax.block_until_ready(step(weights, state, scenes[row], solved[row]))
         times.append(1e3 * (time.perf_counter() - began))
-    return {**others, "params": weights}, float(np.median(times)), norms
+    return {**others, "params": weights}, float(np.median(times))
 
 
 def judge(params, scene: Scene, solved: jax.Array) -> dict:
@@ -118,8 +109,7 @@ def judge(params, scene: Scene, solved: jax.Array) -> dict:
 
 
 def main() -> None:
-    """Train with every loss and judge all on the same motion."""
-    options = parse_options(__doc__)
+    options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, count, seen = (2, 1, 3) if options.smoke else (150, 12, FRAMES)
     kinds = LOSSES[2:] if options.smoke else LOSSES
     scenes = [make_scene(seed, seen) for seed in range(count)]
@@ -127,22 +117,7 @@ def main() -> None:
     test = make_scene(1000, 3 if options.smoke else TEST_FRAMES)
     truth = rollout_scene(None, test, SOLVER).positions
     result = {"steps": steps, "untrained": judge(init_model(MODEL), test, truth)}
-    figure, (error, slope) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
-    error.plot(result["untrained"]["rms_mm"], "k:", label="untrained")
     for kind in kinds:
-        params, milliseconds, norms = train(kind, scenes, solved, steps)
+        params, milliseconds = train(kind, scenes, solved, steps)
         result[kind] = {"step_ms": round(milliseconds, 2), **judge(params, test, truth)}
-        error.plot(result[kind]["rms_mm"], label=kind)
-        slope.semilogy(norms, label=kind)
-    error.axvline(seen - 1, color="0.7", linewidth=1)
-    error.set(
-        xlabel="frame (training ends at the line)", ylabel="distance from the solver, rms [mm]", yscale="log"
-    )
-    slope.set(xlabel="step", ylabel="norm of the gradient")
-    for axis in (error, slope):
-        axis.legend()
-    keep(options.out, Path(__file__).stem, result, figure)
-
-
-if __name__ == "__main__":
-    main()
+    keep(options.out / "unroll.json", result | environment())

@@ -12,8 +12,6 @@ known_drapes.png.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,19 +49,14 @@ def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     """Draw the answers, the walk's error and what was draped just now; nothing without matplotlib."""
     try:
-        import matplotlib
+        import matplotlib.pyplot as plt
     except ImportError:
         return
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
     if drapes:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
     figure, (left, others, right) = plt.subplots(1, 3, figsize=(18, 10), layout="constrained")
-    for axes, part, limit, title in (
-        (left, "answers", 5, "ours"),
-        (others, "peers", 60, "other simulators"),
-    ):
+    for axes, part, limit, title in ((left, "answers", 5, "ours"), (others, "peers", 60, "other simulators")):
         _draw_errors(axes, result.get(part, []), limit)
         axes.set_title(title)
     walk = result.get("walk", [])
@@ -103,14 +96,8 @@ def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
     for place, error in enumerate(errors):
         if abs(error) > limit:
             side = 1 if error > 0 else -1
-            axes.text(
-                0.97 * side * limit,
-                place,
-                f"{error:.0f} %",
-                ha="right" if side > 0 else "left",
-                va="center",
-                size=9,
-            )
+            aligned = {"ha": "right" if side > 0 else "left", "va": "center", "size": 9}
+            axes.text(0.97 * side * limit, place, f"{error:.0f} %", **aligned)
     axes.set_xlim(-limit, limit)
     axes.set_xlabel("error [%]")
     axes.tick_params(axis="y", labelsize=9)
@@ -118,21 +105,16 @@ def _draw_errors(axes: Any, rows: list[dict[str, Any]], limit: float) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="known_answers", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--out", type=Path, default=EXPERIMENTS / "results")
+    import harness
+
+    parser = harness.parser(__doc__, "the smallest of every part")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
     arguments = parser.parse_args()
 
     from eslr_jax.evaluation.report import environment
-    from eslr_jax.io.atomic import atomic_write
 
-    arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "known_answers.json"
-    result = json.loads(path.read_text()) if path.exists() else {}
+    result = harness.kept(path)
     drapes: list = []
     for part in arguments.part:
         rows = []
@@ -140,8 +122,7 @@ def main() -> None:
             rows.append(row)
             drapes += [] if drawn is None else [drawn]
             result = {**result, part: rows, **environment()}
-            with atomic_write(path) as temporary:
-                temporary.write_text(json.dumps(result, indent=1) + "\n")
+            harness.keep(path, result)
             told = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
             print(part, told, flush=True)
     draw(result, drapes, path.with_suffix(".png"))

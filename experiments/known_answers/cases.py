@@ -18,7 +18,6 @@ from eslr_jax.config import SimConfig
 from eslr_jax.fabric import Described, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.numerics import components, dot3, sub3
-from eslr_jax.physics import hessian
 from eslr_jax.physics.materials import COTTON, Weave, stretch_stiffness
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.air import Air
@@ -143,12 +142,9 @@ def rigidity(is_smoke: bool) -> list[Answer]:
         for name, mesh in (("grid", grid), ("irregular", irregular)):
             positions, faces = mesh(0.25, 0.1, spacing)
             garment = make_cloth((positions, faces), {})
-            flat = np.asarray(garment.rest_positions, np.float64)
             setting = f"{name}, {1e3 * spacing:g} mm"
             material = with_rigidity(garment, (RIGIDITY, RIGIDITY))
-            matrix = hessian.plate_matrix(flat, garment, material)
-            across = matrix.tocsr()[1::3][:, 1::3]
-            found = cantilever_rigidity(garment, across)
+            found = cantilever_rigidity(garment, material.plate)
             answers.append(Answer("rigidity of a cantilever", setting, "N m", found, RIGIDITY, 0.05))
             angles, _ = dihedral_angles(jnp.asarray(tube(positions, 0.12, 0.4), jnp.float32), garment)
             energies = 0.5 * np.sum(np.asarray(plate_curvatures(angles, material.plate)) ** 2, axis=0)
@@ -190,14 +186,9 @@ def slope(simulator: Simulator, angles: tuple[float, ...] = (25.0, 35.0, 45.0, 6
         along = np.array([np.cos(tilt), np.sin(tilt), 0.0])
         normal = np.array([-np.sin(tilt), np.cos(tilt), 0.0])
         start = np.outer(mesh[0][:, 0], along) + mesh[0] * [0, 0, 1] + 2.2e-3 * normal
-        scene = make_scene(
-            garment,
-            start + 0.8 * along,
-            49,
-            timestep=1 / 60,
-            body=plane(8.0, 41, tilt),
-            constants=PhysicsConstants(friction_coefficient=friction),
-        )
+        constants = PhysicsConstants(friction_coefficient=friction)
+        body, start = plane(8.0, 41, tilt), start + 0.8 * along
+        scene = make_scene(garment, start, 49, timestep=1 / 60, body=body, constants=constants)
         path = np.asarray(_simulate(simulator, scene).positions).mean(axis=1) @ -along
         # From the second differences, which do not know when it began to slide.
         found = float(np.polyfit(np.arange(24) / 60, path[25:], 2)[0] * 2)
@@ -213,11 +204,7 @@ def sphere(simulator: Simulator) -> list[Answer]:
     mesh = sheet(count, count, (0.4, 0.4))
     garment, ball = make_cloth(mesh, {}), icosphere(3, 0.1)
     scene = make_scene(
-        garment,
-        mesh[0] + [0, 0.105, 0],
-        121,
-        body=ball,
-        constants=PhysicsConstants(friction_coefficient=0.1),
+        garment, mesh[0] + [0, 0.105, 0], 121, body=ball, constants=PhysicsConstants(friction_coefficient=0.1)
     )
     trajectory = _simulate(simulator, scene.replace(terms=(*scene.terms, Brake(2.0))))
     last, loads = np.asarray(trajectory.positions[-1]), np.asarray(trajectory.friction_loads[-1])

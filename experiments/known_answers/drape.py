@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from hard_cases.build import make_cloth, make_scene
-from scipy.spatial import Delaunay
 
 from eslr_jax.config import SimConfig
 from eslr_jax.fabric import describe_fabric, on_threads
 from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.simulation.rollout import rollout_scene
-from known_answers.sheets import irregular
+from known_answers.sheets import irregular, triangulate
 
 DISC, TABLE = 0.15, 0.09  # radii [m]
 _PIXEL = 1e-3  # [m], of the shadow
@@ -43,11 +42,7 @@ def disc(spacing: float) -> tuple[np.ndarray, np.ndarray]:
     flat = flat[np.linalg.norm(flat, axis=1) < DISC - 0.55 * spacing]
     angle = np.linspace(0, 2 * np.pi, round(2 * np.pi * DISC / spacing), endpoint=False)
     flat = np.concatenate([flat, DISC * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
-    faces = Delaunay(flat).simplices
-    edges = flat[faces[:, 1:]] - flat[faces[:, :1]]
-    doubled = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    faces = np.where((doubled > 0)[:, None], faces[:, [0, 2, 1]], faces)[np.abs(doubled) > 1e-2 * spacing**2]
-    return np.stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]], axis=1), faces
+    return triangulate(flat, 1e-2 * spacing**2)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -60,12 +55,7 @@ def _settle(scene: Any, config: SimConfig) -> tuple[jax.Array, jax.Array]:
 def hang(
     fabric: str, *, spacing: float = 0.01, frames: int = 121
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Lay a disc of a fabric over the table and let go of its rim.
-
-    Args:
-        fabric: Name, as for `eslr simulate --fabric`.
-        spacing: Edges of the mesh [m].
-        frames: Frames in which it settles.
+    """Lay a disc of a fabric, with edges of a spacing [m], over the table and let go of its rim.
 
     Returns:
         Where it comes to rest [m], where it lay flat [m], its faces, and the speed of the last frame, rms [mm/s].

@@ -3,13 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hard_cases.build import make_cloth, make_scene, same_way_faces
 
-from eslr_jax.config import SimConfig
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state, scene_terms, start_integrator
+from eslr_jax import PhysicsConstants, SimConfig
+from eslr_jax.scene.build import start_integrator
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import PhysicsConstants, Scene
 
 LENGTH = 0.5  # [m]
 
@@ -20,28 +18,13 @@ def strip(integrator="euler", *terms, frames, is_pinned, timestep=1 / 30, tilt=0
     Terms beyond those of every scene, such as air, are given after the integrator.
     """
     x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
-    index = np.arange(22).reshape(2, 11)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    garment = prepare_garment(
-        np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1),
-        np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]),
-        skin_weights=np.ones((22, 1)),
-        skin_indices=np.zeros((22, 1), int),
-        is_pinned=along == 0 if is_pinned else None,
+    mesh = np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1), same_way_faces(2, 11)
+    garment = jax.tree.map(jnp.asarray, make_cloth(mesh, {}, is_pinned=along == 0 if is_pinned else None))
+    scene = make_scene(
+        garment, mesh[0], frames, timestep=timestep, constants=PhysicsConstants(gravity=gravity)
     )
-    garment = jax.tree.map(jnp.asarray, garment)
-    start, dt = garment.rest_positions, jnp.float32(timestep)
-    return Scene(
-        garment=garment,
-        material=COTTON,
-        constants=PhysicsConstants(gravity=gravity),
-        initial_state=start_integrator(initial_state(start, jnp.zeros_like(start)), integrator),
-        timestep=dt,
-        body=None,
-        pin_targets=jnp.broadcast_to(start, (frames, *start.shape)) if is_pinned else None,
-        terms=(*scene_terms(None, has_ground=False, has_layers=False), *terms),
-        num_frames=frames,
-    )
+    start = start_integrator(scene.initial_state, integrator)
+    return scene.replace(initial_state=start, terms=(*scene.terms, *terms))
 
 
 def kept_per_period(integrator: str, *, timestep: float = 1 / 30, substeps: int = 1) -> float:

@@ -8,11 +8,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
+from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
 from eslr_jax.geometry.closest import closest_points
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
 
@@ -31,16 +28,7 @@ class Refinement(NamedTuple):
 
 
 def run(garment: str, vertices: str, frames: int, *, iterations: int, steps: int = 1, integrator="bdf2"):
-    """Return positions [m] and faces of a walk, frame by frame at 30 frames a second.
-
-    Args:
-        garment: Name of a bundled garment.
-        vertices: Its resolution.
-        frames: Frames at 30 a second.
-        iterations: Of the solver, per step.
-        steps: Steps per frame; the body moves in as many.
-        integrator: How time is stepped.
-    """
+    """Return positions [m] and faces of a walk at 30 frames a second, each of so many steps of iterations."""
     cloth = load_garment(garment, vertices=vertices)
     poses = pose_body(load_body(), load_motion(CLIP), fps=FPS * steps, num_frames=(frames - 1) * steps + 1)
     scene = prepare_scene(cloth, poses, options=SceneOptions(integrator=integrator))

@@ -34,14 +34,7 @@ def hood_metrics(
     """Return the terms [J] of every frame from the third on, each with the two frames before it: [frames - 2].
 
     The paper's Total is the mean over frames of the sum of the terms. Its collision column most likely uses the
-    training criterion at 5e3: `HoodParameters()` with "postcvpr".
-
-    Args:
-        positions: Garment vertices of all frames [m], shape [frames, vertices, 3].
-        scene: Their scene, with a body; every face that it searches counts.
-        origin: Point from which heights count [m], shape [3].
-        parameters: Weights and thresholds.
-        criterion: Frames of the body that count, see `terms.hood`.
+    training criterion at 5e3: `HoodParameters()` with "postcvpr". Heights count from `origin` [m].
 
     Source: HOOD, repository at 9bc1076, utils/metrics.py.
     """

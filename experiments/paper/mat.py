@@ -1,6 +1,6 @@
 """MAT on our own data: a transformer over a garment's faces that steps the cloth, frame after frame.
 
-    python experiments/paper/mat.py GARMENT --out FOLDER [--steps 2000] [--smoke]
+    python experiments/paper mat GARMENT [--out FOLDER] [--steps 2000] [--smoke]
 
 It keeps faces as tokens with the published features of two frames, one token for the whole, heads that average
 along geodesics, the change of every face's frame as output, the Poisson solve that joins faces, and the
@@ -16,7 +16,6 @@ Source: Li et al. 2024 (MAT), whose published run names no flags; weights of los
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from functools import partial
@@ -27,16 +26,24 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float
-from mat_space import Change, Space, change_between, face_frames, heading, prepare_space, rebuild, step_off
-from supervised import Truth, fit, load_truth
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
+from paper.mat_space import (
+    Change,
+    Space,
+    change_between,
+    face_frames,
+    heading,
+    prepare_space,
+    rebuild,
+    step_off,
+)
+from paper.supervised import Truth, fit, load_truth, options, read_archive, write_archive
 
 _WIDTH, _LAYERS, _HEADS = 64, 3, 4  # MAT: 512, 6, 8
 _GEODESIC_HEADS = 1  # of the heads; MAT: 2 of 8
@@ -118,38 +125,20 @@ def observe(
     space: Space,
     turn: Float[Array, "3 3"],
 ) -> Seen:
-    """Return what the network is told.
-
-    Args:
-        position: At t [m].
-        step: Displacement since t - 1 [m].
-        contacts: Nearest body points at t, and where they go.
-        space: Of the garment.
-        turn: Of `heading`.
-    """
+    """Return what the network is told of positions at t, of the step since t - 1 [m] and of contacts."""
     garment = space.garment
     # Rows of vectors are turned back by a product from the right.
-    x, moved, body, normals, turned = (
-        rows @ turn
-        for rows in (
-            position,
-            step,
-            contacts.next_points - contacts.points,
-            contacts.normals,
-            contacts.next_normals - contacts.normals,
-        )
+    arrows = (
+        contacts.next_points - contacts.points,
+        contacts.normals,
+        contacts.next_normals - contacts.normals,
     )
+    x, moved, body, normals, turned = (rows @ turn for rows in (position, step, *arrows))
     is_real = garment.vertex_mask[:, None]
     now, before = (face_frames(y, garment) @ space.inverse_frames for y in (x, x - moved))
     distance = jnp.clip(contacts.distances, -CONTACT_RADIUS, CONTACT_RADIUS)[:, None]
-    at_vertices = [
-        x - jnp.mean(x, axis=0, where=is_real, keepdims=True),
-        moved,
-        distance,
-        normals,
-        body,
-        turned,
-    ]
+    own = x - jnp.mean(x, axis=0, where=is_real, keepdims=True)
+    at_vertices = [own, moved, distance, normals, body, turned]
     at_faces = jnp.mean(jnp.concatenate(at_vertices, axis=1)[garment.faces], axis=1)
     faces = jnp.concatenate([now.reshape((-1, 9)), (now - before).reshape((-1, 9)), at_faces], axis=1)
     near = is_real & contacts.is_near[:, None]
@@ -273,20 +262,9 @@ def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("garment")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="two steps on one short clip")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, 2000).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, 2 if chosen.smoke else chosen.steps, chosen.seed)
     path = chosen.out / f"mat_{chosen.garment}.npz"
     write_network(network, path, training)
     print(path, training)
-
-
-if __name__ == "__main__":
-    main()

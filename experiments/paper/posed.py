@@ -1,6 +1,6 @@
 """Baselines that see the body's motion and not the cloth: one network a garment, trained on energies alone.
 
-    python experiments/paper/posed.py pbns|snug|snug-m GARMENT --out FOLDER [--steps 2000] [--smoke]
+    python experiments/paper posed GARMENT pbns|snug|snug-m [--out FOLDER] [--steps 2000] [--smoke]
 
 They predict displacements of the rest mesh, which the skin weights then carry along. What each keeps and lacks:
 
@@ -19,7 +19,6 @@ Source: Bertiche et al. 2021 (PBNS); Santesteban et al. 2022 (SNUG); Chen et al.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from functools import partial
@@ -30,10 +29,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float, Int
-from supervised import fit
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
@@ -46,6 +43,7 @@ from eslr_jax.training.data import TrainingData, build_training_data
 from eslr_jax.training.pool import FPS, Slot, sample_material
 from eslr_jax.training.step import slot_problem
 from eslr_jax.types import Garment, Material
+from paper.supervised import fit, options, read_archive, write_archive
 
 SYSTEMS = ("pbns", "snug", "snug-m")
 WINDOW = 4  # frames; the first only tells where the others' contacts are searched
@@ -116,11 +114,6 @@ def pose_features(
     return jnp.concatenate(parts, axis=1)
 
 
-def fabric_features(garment: Garment, material: Material) -> Float[Array, " 4"]:
-    """Return bending stiffness, mu and lambda over HOOD's ranges, and the logarithm of the density."""
-    return jnp.append(material_inputs(garment, material)[0], jnp.log(material.density / DENSITY_SCALE))
-
-
 def displace(
     network: PosedNetwork, garment: Garment, transforms: Float[Array, "frames joints 3 4"]
 ) -> Float[Array, "frames vertices 3"]:
@@ -157,7 +150,8 @@ def _inputs(
     features = (features - network.mean[None]) / network.deviation[None]
     if network.system != "snug-m":
         return features
-    fabric = fabric_features(garment, material)
+    # Bending stiffness, mu and lambda over HOOD's ranges, and the logarithm of the density.
+    fabric = jnp.append(material_inputs(garment, material)[0], jnp.log(material.density / DENSITY_SCALE))
     return jnp.concatenate([features, jnp.broadcast_to(fabric, (len(features), 4))], axis=1)
 
 
@@ -185,13 +179,11 @@ def train(system: str, name: str, steps: int, seed: int = 0) -> tuple[PosedNetwo
     # Last frames of windows that lie within a clip.
     ends = np.flatnonzero(np.asarray(data.frames_left)[: 1 - WINDOW] >= WINDOW - 1) + WINDOW - 1
     draw = np.random.default_rng(seed)
-    params, losses = fit(
-        partial(_loss_and_gradient, module),
-        params,
-        lambda _: (network, data, draw.choice(ends, _BATCH)),
-        steps,
-        seed,
-    )
+
+    def windows(_: int) -> tuple[PosedNetwork, TrainingData, np.ndarray]:
+        return network, data, draw.choice(ends, _BATCH)
+
+    params, losses = fit(partial(_loss_and_gradient, module), params, windows, steps, seed)
     return network.replace(params=params), losses
 
 
@@ -268,14 +260,8 @@ def read_network(path: Path) -> tuple[PosedNetwork, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, 2000)
     parser.add_argument("system", choices=SYSTEMS)
-    parser.add_argument("garment")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="two steps")
     chosen = parser.parse_args()
     if chosen.smoke:
         chosen.steps = 2
@@ -286,9 +272,6 @@ def main() -> None:
         "core_hours": (time.process_time() - began) / 3600,
         "final_loss_j": float(np.mean(losses[-100:])) * _UNIT,
     }
-    write_network(network, chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)
-    print(chosen.out / f"{chosen.system}_{chosen.garment}.npz", training)
-
-
-if __name__ == "__main__":
-    main()
+    path = chosen.out / f"{chosen.system}_{chosen.garment}.npz"
+    write_network(network, path, training)
+    print(path, training)

@@ -1,6 +1,6 @@
 """The paper's two figures: how the networks' cloth looks, and where it stores stretch energy.
 
-    python experiments/paper/qualitative.py [--models NAME ...] [--garments NAME ...] [--smoke]
+    python experiments/paper qualitative [--models NAME ...] [--garments NAME ...] [--smoke]
 
 Free rollouts on an unseen clip, the same frame of each. Our optimum takes the place of the paper's reference,
 ARCSim. A name is one of `rollouts.read_system`. Writes qualitative.png (cloth), stretch_energy.png (energy per
@@ -11,21 +11,21 @@ from __future__ import annotations
 
 from typing import Any
 
+import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rollouts import OPTIMUM, arguments, read_system, scenes_of, write
-from worn import Setting, Worn, check_optimum, not_finite
 
 from eslr_jax.assets import load_body, load_splits
 from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.render import render_frame, side_by_side, write_png
 from eslr_jax.render.colors import color_scale
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.types import Scene
+from paper.rollouts import OPTIMUM, RESULTS, read_system, scenes_of
+from paper.worn import Setting, Worn, check_optimum, not_finite
 
 GARMENTS = ("tshirt", "dress")
 DEEP = tuple(f"{name}-5-correction" for name in ("hood", "mgn", "gsa", "lsdmp", "eslr"))
@@ -63,9 +63,6 @@ def at_vertices(energies: np.ndarray, scene: Scene) -> np.ndarray:
 
 def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
     """Draw the share of faces that hold more than an energy per area."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6.4, 3.6))
@@ -79,13 +76,12 @@ def draw_distribution(energies: dict[str, np.ndarray], path) -> None:
     axis.grid(True, which="both", alpha=0.2)
     axis.legend(fontsize=8)
     figure.tight_layout()
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+    harness.save(figure, path)
 
 
 def main() -> None:
-    """Simulate, render and write."""
-    parser = arguments(__doc__)
+    parser = harness.parser(__doc__, "the optimum on one garment, few frames", RESULTS)
+    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--frames", type=int, default=90, help="of every rollout")
     parser.add_argument("--models", nargs="+", default=list(MODELS), help="columns, the optimum added")
     parser.add_argument("--garments", nargs="+", default=list(GARMENTS), help="rows")
@@ -117,31 +113,20 @@ def main() -> None:
         for name in models:
             positions, (_, scene, poses), energies = results[name, garment]
             is_face = np.asarray(scene.garment.rest_areas) > 0
-            mesh = (
-                np.asarray(poses.positions)[-1],
-                np.asarray(poses.faces),
-                positions[-1],
-                np.asarray(scene.garment.faces)[is_face],
-            )
+            cloth = positions[-1], np.asarray(scene.garment.faces)[is_face]
+            mesh = (np.asarray(poses.positions)[-1], np.asarray(poses.faces), *cloth)
             colors = color_scale(at_vertices(energies[-1], scene), 0.0, limit)
             plain.append(render_frame(*mesh, **view))
             colored.append(render_frame(*mesh, **view, vertex_colors=colors))
     labels = [name.partition("@")[0] for name in models] * len(garments)
-    chosen.out.mkdir(parents=True, exist_ok=True)
     for pictures, file in ((plain, "qualitative.png"), (colored, "stretch_energy.png")):
         write_png(chosen.out / file, side_by_side(pictures, labels, columns=len(models)))
 
-    joined = {
-        name: np.concatenate(
-            [
-                results[name, garment][2][1:][
-                    :, np.asarray(results[name, garment][1].scene.garment.rest_areas) > 0
-                ].ravel()
-                for garment in garments
-            ]
-        )
-        for name in models
-    }
+    joined: dict[str, Any] = {}
+    for (name, _), (_, worn, energies) in results.items():
+        is_face = np.asarray(worn.scene.garment.rest_areas) > 0
+        joined.setdefault(name, []).append(energies[1:][:, is_face].ravel())
+    joined = {name: np.concatenate(parts) for name, parts in joined.items()}
     draw_distribution(joined, chosen.out / "stretch_energy_distribution.png")
     rows = {
         name: {
@@ -152,8 +137,5 @@ def main() -> None:
         for name, values in joined.items()
     }
     sizes = {"clip": clip, "frames": chosen.frames, "vertices": chosen.vertices, "garments": garments}
-    write({**sizes, "mean": rows, "environment": environment()}, chosen.out / "stretch_energy.json")
-
-
-if __name__ == "__main__":
-    main()
+    result = {**sizes, "mean": rows, "environment": environment()}
+    harness.keep(chosen.out / "stretch_energy.json", result)

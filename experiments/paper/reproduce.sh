@@ -29,8 +29,8 @@ one_garment() { # script, system, arguments
   shift 2
   rows+=("$system=$system@$out/tshirt")
   [[ -f $out/tshirt/${system}_tshirt.npz ]] && return
-  [[ $script == posed ]] && set -- "$system" tshirt "$@" || set -- tshirt "$@"
-  python "experiments/paper/$script.py" "$@" --out "$out/tshirt" ${STEPS:+--smoke}
+  [[ $script == posed ]] && set -- tshirt "$system" "$@" || set -- tshirt "$@"
+  python experiments/paper "$script" "$@" --out "$out/tshirt" ${STEPS:+--smoke}
 }
 
 rows=()
@@ -42,7 +42,7 @@ if [[ $size == tshirt ]]; then
   one_garment ssch ssch --steps 1200 250
   one_garment mat mat --steps 1400
   rows+=("mat, untrained=mat@$out/tshirt~untrained" optimum=optimum)
-  python experiments/paper/tables.py --tables native_garments --garments tshirt --models "${rows[@]}" \
+  python experiments/paper tables --tables native_garments --garments tshirt --models "${rows[@]}" \
     --out "$out/tables_tshirt" ${STEPS:+--smoke}
   exit
 elif [[ $size == full ]]; then
@@ -62,5 +62,5 @@ else
   done
   vertices=1k
 fi
-python experiments/paper/tables.py --models guess=guess "${rows[@]}" optimum=optimum --controls \
+python experiments/paper tables --models guess=guess "${rows[@]}" optimum=optimum --controls \
   --vertices "$vertices" --out "$out/tables" ${STEPS:+--smoke}

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, get_args
 
+import harness
 import jax
-import mat
 import numpy as np
-import posed
-import ssch
-from hood_metrics import hood_metrics
-from mat_space import prepare_space
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, wear
 
 from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
@@ -25,15 +19,18 @@ from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_ga
 from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.models.registry import count_parameters
 from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters
 from eslr_jax.types import Scene, Trajectory
+from paper import mat, posed, ssch
+from paper.hood_metrics import hood_metrics
+from paper.mat_space import prepare_space
+from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, wear
 
-RESULTS = Path(__file__).parents[1] / "results" / "paper"
+RESULTS = harness.RESULTS / "paper"
 OPTIMUM, GUESS, SKINNED = "optimum", "guess", "skinned"
 CONTROLS: tuple[Control, ...] = get_args(Control)
 CONTROLS_OF_WEIGHTS = tuple(name for name in CONTROLS if name not in EMBEDDING_CONTROLS)
@@ -44,26 +41,15 @@ _GAP_FRAMES = 10  # of every rollout, from whose states the gap is measured
 _GAPS = ("gap_mj", "gap_share", "own_gap_mj", "own_gap_share")
 
 
-def arguments(description: str | None) -> argparse.ArgumentParser:
-    """Return the parser of the options that every script of this folder has."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="few frames of one garment on one clip")
-    return parser
-
-
 class System(NamedTuple):
     """A simulator of the tables."""
 
     params: Any  # weights; None without a network
     config: SimConfig
-    garment_options: dict[str, Any]  # of `load_garment`
-    control: Control | None
-    cost: Mapping[str, float]  # parameters, and core-hours of the training where they are known
-    weights_on: Callable[[Worn], Any] | None = (
-        None  # of what is made for one scene: all positions of a replay
-    )
+    cost: Mapping[str, float] = MappingProxyType({})  # parameters, and core-hours where they are known
+    garment_options: dict[str, Any] = ModelConfig().garment_options  # of `load_garment`
+    control: Control | None = None
+    weights_on: Callable[[Worn], Any] | None = None  # made for one scene: all positions of a replay
 
 
 def read_system(name: str) -> System:
@@ -82,7 +68,7 @@ def read_system(name: str) -> System:
         return _read_trained(*name.split("@", 1))
     if name in (OPTIMUM, GUESS):
         iterations = OPTIMUM_ITERATIONS if name == OPTIMUM else 0
-        return System(*simulator_of(SOLVER, iterations), ModelConfig().garment_options, None, {})
+        return System(*simulator_of(SOLVER, iterations))
     network, _, change = name.partition("~")
     network, _, iterations = network.partition("+")
     params, config = simulator_of(network, int(iterations or 0))
@@ -99,7 +85,7 @@ def read_system(name: str) -> System:
     hours = model_record(network).get("core_hours")
     if hours is not None and control not in CONTROLS_OF_WEIGHTS:  # those show nothing of the training
         cost["core_hours"] = hours
-    return System(params, config, options, control, cost)
+    return System(params, config, cost, options, control)
 
 
 def _read_trained(kind: str, folder: str) -> System:
@@ -123,24 +109,25 @@ def _read_trained(kind: str, folder: str) -> System:
         return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
     if kind != "mat":
-        return _replayed(
-            lambda worn: reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms),
-            cost,
-        )
+
+        def positions(worn: Worn) -> Any:
+            return reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms)
+
+        return _replayed(positions, cost)
 
     def stepper_of(worn: Worn) -> Any:
         network = network_of(worn)
         network = mat.untrained(network) if change else network
         return network.replace(space=prepare_space(worn.scene.garment))
 
-    config = SimConfig(model=mat.Mat(), iterations=0)
-    return System(None, config, ModelConfig().garment_options, None, {} if change else cost, stepper_of)
+    return System(
+        None, SimConfig(model=mat.Mat(), iterations=0), {} if change else cost, weights_on=stepper_of
+    )
 
 
 def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
     """Return the system whose positions are known beforehand."""
-    config = SimConfig(model=posed.Replay(), iterations=0)
-    return System(None, config, ModelConfig().garment_options, None, cost, positions)
+    return System(None, SimConfig(model=posed.Replay(), iterations=0), cost, weights_on=positions)
 
 
 class Reference(NamedTuple):
@@ -227,10 +214,7 @@ def _gap_every(setting: Setting) -> int:
 def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[str, float]:
     """Return the terms [J] as means over frames, their Total, and stretch and penetration beside it.
 
-    Args:
-        trajectory: A rollout.
-        scene: Its scene, with a body.
-        root_height: Height of the root joint in the first frame [m]; HOOD counts potential energy from near it.
+    HOOD counts potential energy from near the height of the root joint in the first frame [m].
     """
     origin = np.array([0.0, root_height + _ORIGIN_ABOVE_ROOT, 0.0], np.float32)
     found = hood_metrics(
@@ -239,10 +223,3 @@ def measure(trajectory: Trajectory, scene: Scene, root_height: float) -> dict[st
     terms = {name: float(np.mean(found[name])) for name in TERMS}
     frames = measure_frames(trajectory.positions, scene)
     return {**terms, "total": sum(terms.values()), **extremes(frames, np.asarray(scene.garment.vertex_mask))}
-
-
-def write(result: dict[str, Any], path: Path) -> None:
-    """Write a result, or nothing of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")

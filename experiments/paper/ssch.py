@@ -1,6 +1,6 @@
 """SSCH on our own data: one network a garment, from the body's motion to a latent shape, and on to the cloth.
 
-    python experiments/paper/ssch.py GARMENT --out FOLDER [--steps 2000 400] [--smoke]
+    python experiments/paper ssch GARMENT [--out FOLDER] [--steps 2000 400] [--smoke]
 
 It keeps a garment space without the pose, a variational auto-encoder of 25 latents whose random shapes are kept
 off the body at rest, and GRUs that turn the body's motion into latents; supervised by simulated rollouts, here
@@ -13,7 +13,6 @@ Source: Santesteban et al. 2021 (SSCH), whose loss weights were not published; o
 
 from __future__ import annotations
 
-import argparse
 import time
 from functools import partial
 from pathlib import Path
@@ -23,17 +22,16 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from archive import read_archive, write_archive
 from flax import struct
 from jaxtyping import Array, Float, Int
-from posed import carried_joints, carry, pose_features
-from supervised import Truth, fit, load_truth
 
 from eslr_jax.assets import load_body, load_garment
 from eslr_jax.body import lbs
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.terms.collision import penetration
 from eslr_jax.types import BodySurface, Garment
+from paper.posed import carried_joints, carry, pose_features
+from paper.supervised import Truth, fit, load_truth, options, read_archive, write_archive
 
 _LATENTS = 25  # SSCH
 _CODE = 10  # numbers for a pose (SSCH)
@@ -188,15 +186,7 @@ class RestScene:
 def shape_loss(
     params: Any, network: Ssch, offsets: Float[Array, "shapes vertices 3"], rest: RestScene, key: Array
 ) -> Float[Array, ""]:
-    """Return the auto-encoder's loss: errors of offsets and of their Laplacians, depth, divergence [cm].
-
-    Args:
-        params: Of encoder and decoder.
-        network: For its scales.
-        offsets: Of simulated cloth [m].
-        rest: Where shapes meet the body.
-        key: Draws latents, of the offsets and at random.
-    """
+    """Return the auto-encoder's loss: errors of offsets [m] and of their Laplacians, depth, divergence [cm]."""
     network = network.replace(params=params)
     scaled = standardise(offsets, network)
     mean, spread = _encode(params["encoder"], scaled)
@@ -253,15 +243,8 @@ def prepare(
     seen = np.concatenate([pose_features(clip, joints, is_static=True)[:, :-3] for clip in transforms])
     _, _, rows = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)
     flat = offsets.reshape((-1, *offsets.shape[2:]))
-    network = Ssch(
-        params={},
-        joints=joints,
-        basis=jnp.asarray(rows[:_CODE].T),
-        mean=jnp.zeros(1),
-        deviation=jnp.ones(1),
-        offset_mean=flat.mean(axis=0),
-        offset_deviation=jnp.maximum(flat.std(axis=0), 1e-4),
-    )
+    basis, scales = jnp.asarray(rows[:_CODE].T), (flat.mean(axis=0), jnp.maximum(flat.std(axis=0), 1e-4))
+    network = Ssch({}, joints, basis, jnp.zeros(1), jnp.ones(1), *scales)
     inputs = np.concatenate([motion_features(clip, network) for clip in transforms])
     keys = jax.random.split(jax.random.key(seed), 3)
     values = flat[0].size
@@ -270,20 +253,12 @@ def prepare(
         "decoder": Decoder(values).init(keys[1], jnp.zeros((1, _LATENTS))),
         "regressor": Regressor().init(keys[2], jnp.zeros((1, 2, inputs.shape[1]))),
     }
-    deviation = np.maximum(inputs.std(axis=0), 1e-3)
-    return network.replace(
-        params=params, mean=jnp.asarray(inputs.mean(axis=0)), deviation=jnp.asarray(deviation)
-    )
+    mean, deviation = map(jnp.asarray, (inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-3)))
+    return network.replace(params=params, mean=mean, deviation=deviation)
 
 
 def train(truth: Truth, steps: tuple[int, int], seed: int = 0) -> tuple[Ssch, dict[str, Any]]:
-    """Train on a garment's simulated rollouts; return the network and how it was trained.
-
-    Args:
-        truth: The rollouts.
-        steps: Of the auto-encoder and of the regressor.
-        seed: Of weights and batches.
-    """
+    """Train auto-encoder and regressor on a garment's rollouts; return the network and how it was trained."""
     began = time.process_time()
     garment, body = load_garment(truth.worn[0].garment), load_body()
     scene_body = truth.worn[0].scene.body
@@ -350,20 +325,9 @@ def read_network(path: Path) -> tuple[Ssch, dict[str, Any]]:
 
 
 def main() -> None:
-    """Train and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("garment")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, nargs=2, default=(2000, 400), metavar=("SHAPE", "MOTION"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="two steps on one short clip")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, (2000, 400), nargs=2, metavar=("SHAPE", "MOTION")).parse_args()
     truth = load_truth(chosen.garment, chosen.out, is_smoke=chosen.smoke)
     network, training = train(truth, (2, 2) if chosen.smoke else tuple(chosen.steps), chosen.seed)
     path = chosen.out / f"ssch_{chosen.garment}.npz"
     write_network(network, path, training)
     print(path, training)
-
-
-if __name__ == "__main__":
-    main()

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import harness
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float
-from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 from eslr_jax.assets import split_clips
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.io.npz import read_arrays, write_arrays
 from eslr_jax.simulation.rollout import rollout_scene
+from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
 
 _FRAMES = 100  # of a clip, as in the tables
 _RATE = 1e-3  # of Adam (PBNS, GAPS, MAT), falling to zero along a cosine
+
+
+def options(description: str | None, steps: Any, **settings: Any) -> argparse.ArgumentParser:
+    """Return the parser of a script that trains a network for one garment, with settings of --steps."""
+    parser = harness.parser(description, "two steps on one short clip", "out/one_garment")
+    parser.add_argument("garment")
+    parser.add_argument("--steps", type=int, default=steps, **settings)
+    parser.add_argument("--seed", type=int, default=0)
+    return parser
 
 
 class Truth(NamedTuple):
@@ -32,11 +46,6 @@ class Truth(NamedTuple):
 
 def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
     """Return rollouts of a garment at 1k vertices, simulated the first time and then read from `folder`.
-
-    Args:
-        garment: Name of a bundled garment.
-        folder: Where the rollouts are kept.
-        is_smoke: A few frames of one clip.
 
     Raises:
         ValueError: The folder holds rollouts of other clips or lengths.
@@ -67,6 +76,23 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
     return Truth(worn, kept["positions"], float(kept["core_hours"]))
 
 
+def write_archive(path: Path, arrays: dict[str, Any], record: dict[str, Any]) -> None:
+    """Write nested dictionaries of arrays, whose keys hold no slash, and a record beside them as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    leaves = {"/".join(keys): np.asarray(leaf) for keys, leaf in flatten_dict(arrays).items()}
+    write_arrays(path, leaves, is_compressed=True)
+    path.with_suffix(".json").write_text(json.dumps(record, indent=1))
+
+
+def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the arrays and the record that `write_archive` wrote."""
+    arrays = {
+        tuple(name.split("/")): jnp.asarray(leaf)
+        for name, leaf in read_arrays(path, content="network").items()
+    }
+    return unflatten_dict(arrays), json.loads(path.with_suffix(".json").read_text())
+
+
 def fit(
     slope_of: Callable[[Any, Any, Array], tuple[Array, Any]],
     params: Any,
@@ -74,15 +100,7 @@ def fit(
     steps: int,
     seed: int,
 ) -> tuple[Any, list[float]]:
-    """Return weights after `steps` of Adam, and their losses.
-
-    Args:
-        slope_of: From weights, a batch and a key to a loss and its gradient; compiled here.
-        params: Where to begin.
-        batches: Function of a step's number to a batch.
-        steps: Number of steps.
-        seed: Of the keys.
-    """
+    """Return weights after so many steps of Adam, and their losses; `slope_of` gives loss and gradient."""
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(_RATE, steps))
     )

@@ -1,7 +1,7 @@
 """The paper's tables: every system beside its controls, the solver and the optimum.
 
-    python experiments/paper/tables.py [--tables native_garments unseen_garments new_motion model_cost]
-        [--models LABEL=NAME,NAME ...] [--train] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
+    python experiments/paper tables [--tables native_garments unseen_garments new_motion model_cost]
+        [--models LABEL=NAME,NAME ...] [--controls] [--anew] [--clips NAME ...] [--frames 100] [--smoke]
 
 native_garments (I, II): six garments on three unseen clips. unseen_garments (III): garments that no network has
 seen, with other modes of the geodesic embedding. new_motion (IV): clips of another source; the paper takes a
@@ -15,8 +15,6 @@ gap, from the optimum's states and from its own, and the energies of free rollou
 same network untrained.
 --controls adds it with a decoder of zeros, and with zero and with random geodesic coordinates.
 
---train takes names of architectures (`mgn-5`, `hood`) and trains each first, by configs/paper/1k.toml or, at the
-paper's width, full-size.toml; the k-th network of a row has seed k. Run it again to go on where it stopped.
 A table is never written over one of another setting, nor a row that names its networks over one of others: give
 another --out or label. A row that a table has is kept, and not measured again. Rows are written one by one, each
 with the versions and the device that made it, so that several runs can fill a table.
@@ -24,55 +22,46 @@ with the versions and the device that made it, so that several runs can fill a t
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import harness
 import jax
 import numpy as np
-from rollouts import (
+
+from eslr_jax import ModelConfig, SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax.assets import load_splits
+from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
+from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import take_turns
+from eslr_jax.models.registry import MODELS, count_parameters, init_model
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import make_stepper
+from paper.rollouts import (
     CONTROLS,
     CONTROLS_OF_WEIGHTS,
     GUESS,
     OPTIMUM,
+    RESULTS,
     Reference,
     Setting,
     System,
-    arguments,
     find_references,
     measure_system,
     read_system,
-    write,
 )
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
-from eslr_jax.body.motion import pose_body
-from eslr_jax.cli.train import train
-from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.models.registry import MODELS, count_parameters, init_model
-from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.training.checkpoint import has_checkpoint
-
-WEIGHTS = Path(__file__).parents[1] / "results" / "paper" / "weights"  # seeds that are not bundled
+WEIGHTS = RESULTS / "weights"  # seeds that are not bundled
 # Applied once a frame. They were trained by configs/paper/1k.toml, and then for as many steps again at half its
-# learning rate. hood-5 and mgn-16 have a fifth of the steps. The other networks have recipes of their own.
+# learning rate. hood-5 has a fifth of the steps. The other networks have recipes of their own.
 DEEP = (
     f"mgn-5=mgn-5-correction,{WEIGHTS / 'mgn-5_60k_s1.npz'}",
-    f"mgn-16, 12,000 steps={WEIGHTS / 'mgn-16_12k.npz'}",
     "hood-5=hood-5-correction",
     "gsa-5=gsa-5-correction",
     "lsdmp-5=lsdmp-5-correction",
     f"eslr-5=eslr-5-correction,{WEIGHTS / 'eslr-5_60k_s1.npz'}",
 )
-CONFIGS = Path(__file__).parents[1] / "configs" / "paper"
-RECIPES = {64: "1k", 128: "full-size"}  # by the network's width
 BUNDLED = (
     f"eslr-small={DEFAULT_MODEL}",
     *(f"{START_MODEL}+{iterations}={START_MODEL}+{iterations}" for iterations in (5, 20)),
@@ -89,28 +78,11 @@ _TURNS = 7  # in which latencies are measured
 Rows = dict[str, tuple[str, ...]]
 
 
-class Training(NamedTuple):
-    """A network to train."""
-
-    model: str  # name in the registry
-    seed: int
-    recipe: Path
-    folder: Path
-
-    def changes(self) -> tuple[str, ...]:
-        """Return what the run changes in its recipe."""
-        key = "model.base" if self.recipe.stem == "1k" else "model"
-        return (f"{key}={self.model}", f"seed={self.seed}")
-
-
 def main() -> None:
-    """Measure and write."""
-    parser = arguments(__doc__)
+    parser = harness.parser(__doc__, "few frames of one garment on one clip", RESULTS)
+    parser.add_argument("--vertices", default="1k", choices=["1k", "4k", "10k"])
     parser.add_argument("--tables", nargs="+", default=TABLES, choices=TABLES)
     parser.add_argument("--models", nargs="+", metavar="LABEL=NAME,NAME", help="rows")
-    parser.add_argument(
-        "--train", action="store_true", help="train the rows that are named by an architecture"
-    )
     parser.add_argument("--controls", action="store_true", help="rows for each network's controls")
     parser.add_argument(
         "--anew", action="store_true", help="measure rows again that the table has; others stay in any case"
@@ -125,16 +97,13 @@ def main() -> None:
         label: tuple(names.split(","))
         for label, names in (row.split("=", 1) for row in chosen.models or SYSTEMS)
     }
+    cost_file = chosen.out / f"model_cost_{chosen.vertices}.json"
     if "model_cost" in chosen.tables:  # before anything is trained and measured
-        check_costs(cost_file(chosen), (*rows, *full_size(chosen.vertices, chosen.smoke)))
-    if chosen.train:
-        rows, trainings = plan_trainings(rows, chosen.out)
-        for training in trainings:
-            run_training(training, ("steps=2",) if chosen.smoke else ())
+        check_costs(cost_file, (*rows, *full_size(chosen.vertices, chosen.smoke)))
     for name in chosen.tables:
         if name == "model_cost":
             costs = cost_table(rows, chosen.vertices, chosen.smoke)
-            write(with_totals(costs, chosen.out / f"{TABLES[0]}.json"), cost_file(chosen))
+            harness.keep(cost_file, with_totals(costs, chosen.out / f"{TABLES[0]}.json"))
         else:
             setting = table_setting(name, chosen.clips, chosen.garments, chosen.frames, chosen.vertices)
             if not (setting.garments and setting.clips):
@@ -153,39 +122,7 @@ def main() -> None:
             for label, networks in missing.items():
                 row = measure_row(networks, setting, references)
                 parts = with_row(rows_of_setting(file, setting), label, row)  # another run may have written
-                write({**setting._asdict(), **parts}, file)
-
-
-def plan_trainings(rows: Rows, out: Path) -> tuple[Rows, list[Training]]:
-    """Return the rows with exported files for the architectures among their names, and how these are made.
-
-    Args:
-        rows: Names by label.
-        out: Folder of the tables; a network's own is MODEL-sSEED in it.
-    """
-    changed, trainings = {}, []
-    for label, names in rows.items():
-        files = []
-        for seed, name in enumerate(names):
-            recipe = RECIPES.get(MODELS[name].latent_size) if name in MODELS else None
-            folder = out / f"{name}-s{seed}"
-            if recipe:
-                trainings.append(Training(name, seed, CONFIGS / f"{recipe}.toml", folder))
-            files.append(str(folder / "model.npz") if recipe else name)
-        changed[label] = tuple(files)
-    return changed, trainings
-
-
-def run_training(training: Training, changes: tuple[str, ...]) -> None:
-    """Train a network as `eslr train` does, or go on with it; nothing is done if it is trained."""
-    if (training.folder / "model.npz").exists():
-        return
-    if has_checkpoint(training.folder):
-        train(training.folder, resume=True)
-    else:
-        train(training.folder, training.recipe, (*training.changes(), *changes))
-    if not (training.folder / "model.npz").exists():
-        raise SystemExit("the training was stopped; run the same command to go on")
+                harness.keep(file, {**setting._asdict(), **parts})
 
 
 def table_setting(
@@ -270,7 +207,7 @@ def rows_of_setting(file: Path, setting: Setting) -> dict[str, dict[str, Any]]:
         SystemExit: It is of other garments, clips, frames or vertices and may not be written over. Says which
             differ, and what to give.
     """
-    found = json.loads(file.read_text()) if file.exists() else {}
+    found = harness.kept(file)
     parts = {name: found.get(name, {}) for name in PARTS}
     asked = {"clips": list(setting.clips), "frames": setting.frames, "vertices": setting.vertices}
     differs = [name for name, value in asked.items() if found.get(name, value) != value]
@@ -302,11 +239,6 @@ def short_name(name: str) -> str:
     return "/".join(Path(name).parts[-2:])
 
 
-def cost_file(chosen: argparse.Namespace) -> Path:
-    """Return the file of the table of costs."""
-    return chosen.out / f"model_cost_{chosen.vertices}.json"
-
-
 def full_size(vertices: str, is_smoke: bool) -> tuple[str, ...]:
     """Return the architectures without weights whose cost is measured too."""
     if is_smoke:
@@ -320,7 +252,7 @@ def check_costs(file: Path, names: Sequence[str]) -> None:
     Raises:
         SystemExit: Names them.
     """
-    found = json.loads(file.read_text())["mean"] if file.exists() else {}
+    found = harness.kept(file).get("mean", {})
     if lost := [name for name in found if name not in names]:
         raise SystemExit(f"{file} has rows for {', '.join(lost)}; measure them too, or give another --out")
 
@@ -337,9 +269,7 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
             continue
         params, config = init_model(MODELS[name]), MODELS[name]
         cost = {"parameters": count_parameters(params)}
-        systems[name] = System(
-            params, SimConfig(model=config, iterations=0), config.garment_options, None, cost
-        )
+        systems[name] = System(params, SimConfig(model=config, iterations=0), cost, config.garment_options)
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
@@ -368,12 +298,8 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
 
 def with_totals(costs: dict[str, Any], energies: Path) -> dict[str, Any]:
     """Return the table of costs with the Total [J] of the rows that a table of energies at its size has."""
-    found = json.loads(energies.read_text()) if energies.exists() else {}
+    found = harness.kept(energies)
     if found.get("vertices") == costs["vertices"]:
         for label in costs["mean"].keys() & found["mean"].keys():
             costs["mean"][label]["total"] = found["mean"][label]["total"]
     return costs
-
-
-if __name__ == "__main__":
-    main()

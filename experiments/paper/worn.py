@@ -64,9 +64,7 @@ def check_optimum(trajectory: Trajectory, garment: str) -> None:
 def wear(garment_options: tuple[tuple[str, object], ...], setting: Setting) -> list[Worn]:
     """Return every garment on every clip, in cotton; all share a compiled rollout.
 
-    Args:
-        garment_options: Of `load_garment`, by name.
-        setting: Garments and clips. The last answer is kept, as most systems ask for the same.
+    The last answer is kept, as most systems ask for the same options of `load_garment`.
     """
     body = load_body()
     motions = [

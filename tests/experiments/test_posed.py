@@ -5,10 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-import posed
 import pytest
-import supervised
-from posed import pose_features
+from paper import posed, supervised
+from paper.posed import pose_features
 from scipy.spatial.transform import Rotation
 
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import ssch
-from posed import carry
+from paper import ssch
+from paper.posed import carry
 from scipy.spatial.transform import Rotation
 
 

@@ -1,6 +1,6 @@
 """Time rollouts of many scenes by how many go through a step together.
 
-    python experiments/benchmarks/batch_size.py [--vertices 1k] [--batches 1 8 64] [--out DIR] [--smoke]
+    python experiments/batch_size.py [--vertices 1k] [--batches 1 8 64] [--out DIR] [--smoke]
 
 A T-shirt walks on the clips of the test split, as often as the largest batch asks for. Every frame takes 20
 iterations. Writes batch_size.json with the milliseconds of a frame, and of a frame and scene.
@@ -8,28 +8,22 @@ iterations. Writes batch_size.json with the milliseconds of a frame, and of a fr
 
 from __future__ import annotations
 
-import argparse
-import json
 from functools import partial
-from pathlib import Path
 from typing import get_args
 
 import jax
 import jax.numpy as jnp
+from harness import keep, kept, machine, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
+from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body
+from eslr_jax.assets import split_clips
 from eslr_jax.assets.garments import Resolution
-from eslr_jax.body.motion import pose_body
-from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
 from eslr_jax.simulation.budget import device_name
 
-RESULTS = Path(__file__).parents[1] / "results"
 CONFIG = SimConfig(iterations=20)
 
 
@@ -57,20 +51,15 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
 
 
 def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--vertices", choices=get_args(Resolution), default="1k")
-    parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="two frames, one turn")
-    chosen = parser.parse_args()
-    chosen.out.mkdir(parents=True, exist_ok=True)
+    options = parser(__doc__, "two frames, one turn")
+    options.add_argument("--vertices", choices=get_args(Resolution), default="1k")
+    options.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64])
+    chosen = options.parse_args()
     path = chosen.out / "batch_size.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
+    result = kept(path)
     rows = measure(chosen.vertices, chosen.batches, *((2, 1) if chosen.smoke else (20, 3)))
-    known[f"{device_name()}, {chosen.vertices}"] = {"rows": rows, "environment": environment()}
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(known, indent=1))
+    result[f"{device_name()}, {chosen.vertices}"] = {"rows": rows, **machine()}
+    keep(path, result)
 
 
 if __name__ == "__main__":

@@ -1,27 +1,22 @@
 """Compare a training step with the forward pass, backward pass and update of the same model alone.
 
-    python experiments/benchmarks/train_throughput.py [--json] [--smoke]
+    python experiments/train_throughput.py [--smoke] [--out DIR]
 
 The whole step also poses the body, searches contacts, states the frame's problem, advances the trajectory and
-keeps the metrics. The bare step is given a problem of the same size. Both are timed alternately.
+keeps the metrics. The bare step is given a problem of the same size. Both are timed alternately. Writes
+train_throughput.json.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import optax
+from harness import EXPERIMENTS, keep, machine, parser
 
-from eslr_jax.assets import load_body, load_motion, split_clips
-from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.report import environment
+from eslr_jax import load_body, load_motion, pose_body, prepare_scene
+from eslr_jax.assets import split_clips
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
@@ -29,21 +24,13 @@ from eslr_jax.training.memory import keep_memory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import init_train_state, make_optimizer, make_train_step
 
-RECIPE = Path(__file__).parents[1] / "configs" / "eslr-small.toml"
+RECIPE = EXPERIMENTS / "configs" / "eslr-small.toml"
 
 
 def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--smoke", action="store_true", help="a small model, one turn")
-    arguments = parser.parse_args()
-    changes = (
-        {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]} if arguments.smoke else {}
-    )
-    config = load_recipe(RECIPE, {"split": "validation", **changes})
+    chosen = parser(__doc__, "a small model, one turn").parse_args()
+    small = {"model": "mgn-small", "model.refinement_steps": 2, "garments": ["tshirt"]}
+    config = load_recipe(RECIPE, {"split": "validation", **(small if chosen.smoke else {})})
     data = load_training_data(config, config.vertices[0])
     state = init_train_state(config, (data,))
     poses = pose_body(load_body(), load_motion(split_clips(config.split)[0]), num_frames=2)
@@ -67,7 +54,7 @@ def main() -> None:
             "whole step": (lambda state: step.__wrapped__(state, data), (state,)),
             "forward, backward, update": (bare, (state.params["params"], state.optimizer, problem)),
         },
-        1 if arguments.smoke else 40,
+        1 if chosen.smoke else 40,
     )
     whole, alone = times.values()
     result = {
@@ -75,14 +62,10 @@ def main() -> None:
         "vertices": config.vertices[0],
         "ms": times,
         "overhead": whole / alone - 1,
-        "device": device_name(),
-        "environment": environment(),
+        **machine(),
     }
-    print(
-        json.dumps(result, indent=1)
-        if arguments.json
-        else f"{result['ms']}, overhead {result['overhead']:.1%}"
-    )
+    keep(chosen.out / "train_throughput.json", result)
+    print(f"{times}, overhead {whole / alone - 1:.1%}")
 
 
 if __name__ == "__main__":

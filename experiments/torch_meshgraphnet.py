@@ -15,13 +15,7 @@ WORLD_SHARE = 0.9  # of the garment's vertices that have a world edge
 
 def perceptron(inputs: int, size: int, outputs: int, norm: bool = True) -> nn.Sequential:
     """Linear-ReLU-Linear-ReLU-Linear, then LayerNorm."""
-    layers = [
-        nn.Linear(inputs, size),
-        nn.ReLU(),
-        nn.Linear(size, size),
-        nn.ReLU(),
-        nn.Linear(size, outputs),
-    ]
+    layers = [nn.Linear(inputs, size), nn.ReLU(), nn.Linear(size, size), nn.ReLU(), nn.Linear(size, outputs)]
     return nn.Sequential(*layers, *([nn.LayerNorm(outputs)] if norm else []))
 
 
@@ -57,27 +51,15 @@ class MeshGraphNet(nn.Module):
 
     def forward(self, cloth, body, mesh, to_cloth, to_body, index):
         """Return the output at the cloth's vertices."""
-        rows = (
-            self.nodes(cloth),
-            self.nodes(body),
-            self.mesh(mesh),
-            self.world(to_cloth),
-            self.world(to_body),
-        )
+        edges = self.mesh(mesh), self.world(to_cloth), self.world(to_body)
+        rows = (self.nodes(cloth), self.nodes(body), *edges)
         for layer in self.layers:
             rows = layer(*rows, index)
         return self.decoder(rows[0])
 
 
 def make_forward(senders, receivers, num_vertices: int, num_layers: int = 15):
-    """Return a function without arguments that runs one forward pass on random features.
-
-    Args:
-        senders: Directed mesh edges, NumPy.
-        receivers: The other ends, NumPy.
-        num_vertices: Of the garment.
-        num_layers: Depth.
-    """
+    """Return a function that runs one forward pass on random features of a mesh of directed edges."""
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     network = MeshGraphNet(num_layers)
@@ -88,16 +70,8 @@ def make_forward(senders, receivers, num_vertices: int, num_layers: int = 15):
         torch.randperm(num_vertices, generator=generator)[:num_world],
         torch.randint(BODY_VERTICES, (num_world,), generator=generator),
     )
-    rows = [
-        torch.randn(count, width, generator=generator)
-        for count, width in (
-            (num_vertices, 20),
-            (BODY_VERTICES, 20),
-            (len(senders), 12),
-            (num_world, 9),
-            (num_world, 9),
-        )
-    ]
+    counts = (num_vertices, 20), (BODY_VERTICES, 20), (len(senders), 12), (num_world, 9), (num_world, 9)
+    rows = [torch.randn(*count, generator=generator) for count in counts]
 
     def forward():
         with torch.inference_mode():

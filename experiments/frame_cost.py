@@ -1,7 +1,7 @@
 """Time the parts of a frame of the solver, by size, with and without self-contact.
 
-    python experiments/benchmarks/frame_cost.py [--sizes 1k 4k 10k] [--out DIR] [--smoke]
-    python experiments/benchmarks/frame_cost.py --sizes 50k 200k --no-self-contact  # joins the sizes in the file
+    python experiments/frame_cost.py [--sizes 1k 4k 10k] [--out DIR] [--smoke]
+    python experiments/frame_cost.py --sizes 50k 200k --no-self-contact  # joins the sizes in the file
 
 A T-shirt in the middle of a walk. The parts are timed alternately, and their least times are also given
 relative to one iteration of the solver, so that figures of a busy machine compare with those of an idle one.
@@ -10,38 +10,32 @@ Writes frame_cost.json.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from harness import keep, kept, machine, parser
 
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import find_both_sides, find_contacts
+from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.numerics import vertex_normals
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.types import Scene
 
-RESULTS = Path(__file__).parents[1] / "results"
 SIZES = ("1k", "4k", "10k", "50k", "200k")
 CASES = {"without self-contact": False, "with self-contact": True}
 RATIO = "whole frame with self-contact / without"
@@ -52,12 +46,7 @@ FEW, MANY = 5, 25  # iterations between which one is timed
 
 
 def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
-    """Return the parts of the frame after a short rollout, as functions with their arguments.
-
-    Args:
-        scene: What is simulated.
-        iterations: Of the rollout before.
-    """
+    """Return the parts of the frame after a short rollout of some iterations, as functions with arguments."""
     run = simulate(None, scene, config=SimConfig(iterations=iterations))
     scene = run.scene  # with buffers that sufficed
     states, inputs = trajectory_states(run.trajectory, scene)
@@ -82,10 +71,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
 
     body = (state.position, step.body.start, step.body.end, surface, blocks)
     parts = {
-        "body normals": (jax.jit(vertex_normals), (step.body.end, surface.faces, surface.face_incidence)),
-        "nearest contact": (jax.jit(find_contacts), body),
         "both contacts": (jax.jit(find_both_sides), body),
-        "frame problem": (jax.jit(frame_problem), (scene, state, step)),
         "guess": (jax.jit(initial_guess), (problem,)),
         "preconditioner": (jax.jit(stretched_stiffness), (problem, start.position)),
         "all before the first iteration": (before, (scene, state, step)),
@@ -100,14 +86,7 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
 
 
 def measure(size: str, turns: int, frames: int, cases: Sequence[str]) -> dict[str, Any]:
-    """Return the milliseconds of every part with and without self-contact, and ratios to one iteration.
-
-    Args:
-        size: Resolution of the T-shirt.
-        turns: Calls of every part.
-        frames: Frames simulated before.
-        cases: Which of CASES are measured.
-    """
+    """Return the milliseconds of every part by case, after some frames, and their ratios to an iteration."""
     poses = pose_body(load_body(), load_motion(CLIP), num_frames=frames + 1)
     garment = load_garment("tshirt", vertices=size)
     calls = {
@@ -129,47 +108,21 @@ def measure(size: str, turns: int, frames: int, cases: Sequence[str]) -> dict[st
     return result
 
 
-def print_table(size: str, result: dict[str, Any]) -> None:
-    """Print one size as a table: milliseconds, and iterations that would take as long."""
-    cases = [result[case] for case in CASES if case in result]
-    names = "".join(f"{case:>25}" for case in CASES if case in result)
-    print(f"{size}: {result['vertices']:8} vertices{'':11}{names}", flush=True)
-    for part in cases[-1]["ms"]:
-        cells = [
-            f"{case['ms'][part]:9.2f} ms {case['iterations'][part]:6.2f} it"
-            if part in case["ms"]
-            else " " * 22
-            for case in cases
-        ]
-        print(f"  {part:32}{'   '.join(cells)}")
-    if RATIO in result:
-        print(f"  {RATIO}: {result[RATIO]:.2f}", flush=True)
-
-
 def main() -> None:
-    """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--sizes", nargs="+", default=list(SIZES[:3]), choices=SIZES)
-    parser.add_argument("--no-self-contact", action="store_true", help="leave out the frame with it")
-    parser.add_argument("--turns", type=int, default=15)
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--smoke", action="store_true", help="1k, two frames, one turn")
-    arguments = parser.parse_args()
-    sizes, turns, frames = (["1k"], 1, 2) if arguments.smoke else (arguments.sizes, arguments.turns, FRAMES)
-    cases = list(CASES)[:1] if arguments.no_self_contact else list(CASES)
-    path = arguments.out / "frame_cost.json"
-    result: dict[str, Any] = {}
-    if path.exists() and not arguments.smoke:
-        result = json.loads(path.read_text())
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    options = parser(__doc__, "1k, two frames, one turn")
+    options.add_argument("--sizes", nargs="+", default=list(SIZES[:3]), choices=SIZES)
+    options.add_argument("--no-self-contact", action="store_true", help="leave out the frame with it")
+    options.add_argument("--turns", type=int, default=15)
+    chosen = options.parse_args()
+    sizes, turns, frames = (["1k"], 1, 2) if chosen.smoke else (chosen.sizes, chosen.turns, FRAMES)
+    cases = list(CASES)[:1] if chosen.no_self_contact else list(CASES)
+    path = chosen.out / "frame_cost.json"
+    result = {} if chosen.smoke else kept(path)
     for size in sizes:
         row = measure(size, turns, frames, cases)
-        print_table(size, row)
-        result[size] = {**row, "clip": CLIP, "device": device_name(), "environment": environment()}
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
+        print(size, json.dumps(row), flush=True)
+        result[size] = {**row, "clip": CLIP, **machine()}
+        keep(path, result)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,84 @@
+"""Time to a share of the initial gap, by this code and by an older commit, timed alternately.
+
+    python experiments/older_code.py                       # 1k, 4k, 10k: half an hour
+    python experiments/older_code.py --commit HEAD --smoke --out DIR
+
+Each code solves the frames of its own near-optimal rollouts of T-shirt, dress and trousers. The iterations that
+count are those after which the median gap is a given share of the initial gap. The cost of a frame and of an
+iteration is timed on the T-shirt. Contacts and fabrics changed too, so the two codes do not solve quite the same
+problem.
+
+Writes older_code.json.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from harness import codes, in_turns, keep, machine, parser
+
+COMMIT = "e6478a3"  # of 22 November, before contacts, preconditioner and iterations were made anew
+SHARES = (0.01, 0.001)  # of the initial gap
+COUNTS = [5, 10, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64, 76, 90, 106]  # of iterations whose gap is measured
+
+# What both codes run. It uses only what has kept its name.
+GAPS = """
+import json, sys
+import numpy as np
+from eslr_jax.evaluation.calibrate import example_scene, simulator_of
+from eslr_jax.evaluation.gap import GapOptions, measure_gap
+from eslr_jax.simulation.rollout import rollout_scene
+size, frames, garments, counts = json.loads(sys.argv[1])
+shares = []
+for garment in garments:
+    scene = example_scene(garment, size, "cmu_016_32", frames)
+    truth = rollout_scene(None, scene, simulator_of("solver")[1], 100)
+    ends = measure_gap(None, truth, scene, None, GapOptions(3, tuple(counts)))
+    shares.append([np.asarray(ends.share(ends.solver[count])) for count in counts])
+print(json.dumps([float(np.median(row)) for row in np.concatenate(shares, axis=1)]))
+"""
+TIMES = """
+import json, sys
+from eslr_jax.evaluation.calibrate import example_scene, fit_costs, simulator_of, time_frames
+size, frames = json.loads(sys.argv[1])
+scene = example_scene("tshirt", size, "cmu_016_32", frames)
+runs = {("solver", count): (*simulator_of("solver"), count) for count in (10, 60)}
+fixed, iteration = fit_costs(time_frames(runs, scene))
+print(json.dumps([fixed["solver"], iteration]))
+"""
+
+
+def main() -> None:
+    options = parser(__doc__, "T-shirt at 1k, few frames, one turn")
+    options.add_argument("--commit", default=COMMIT, help="the older code")
+    options.add_argument("--sizes", nargs="+", default=["1k", "4k", "10k"])
+    chosen = options.parse_args()
+    sizes, garments, frames, turns = chosen.sizes, ["tshirt", "dress", "pants"], 40, 3
+    if chosen.smoke:
+        sizes, garments, frames, turns = ["1k"], ["tshirt"], 8, 1
+    result = {"commit": chosen.commit, "sizes": {}, **machine()}
+    with codes(chosen.commit) as roots:
+        for size in sizes:
+            row = result["sizes"][size] = {}
+            gaps = in_turns(roots, GAPS, [size, frames, garments, COUNTS])
+            for name, costs in in_turns(roots, TIMES, [size, frames], turns).items():
+                # Between counts the logarithm of the share is linear; it descends but for noise.
+                falling = -np.log(np.minimum.accumulate(gaps[name][0]))
+                needed = {
+                    f"{share:.1%}": float(np.interp(-np.log(share), falling, COUNTS)) for share in SHARES
+                }
+                # The least of all turns: what else runs on the machine only ever adds.
+                times = {
+                    share: min(fixed + n * iteration for fixed, iteration in costs)
+                    for share, n in needed.items()
+                }
+                by_turn = [{"fixed_ms": fixed, "iteration_ms": iteration} for fixed, iteration in costs]
+                row[name] = {"iterations": needed, "ms": times, "turns": by_turn}
+            row["ratio"] = {share: ms / row["before"]["ms"][share] for share, ms in row["now"]["ms"].items()}
+            print(f"{size}: {json.dumps(row)}", flush=True)
+    keep(chosen.out / "older_code.json", result)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The paper's networks, and others': `python experiments/paper SCRIPT`."""

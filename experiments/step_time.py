@@ -1,0 +1,220 @@
+"""Time a step of the networks: the package's build against a plain one, reduced precision, and PyTorch.
+
+    python experiments/step_time.py
+
+All builds of a comparison run alternately (A B A B ...) in one process and are compared as ratios of medians.
+Compilation and temporary memory are reported apart. The comparison with PyTorch (extra `bench`) runs in a process
+of its own on one core; without PyTorch it is left out.
+
+Writes step_time.json.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from harness import EXPERIMENTS, keep, parser
+
+from eslr_jax.evaluation.report import environment
+from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.graph.build import build_graph
+from eslr_jax.models.registry import (
+    MODELS,
+    apply_model,
+    init_model,
+    measure_statistics,
+    merge_statistics,
+)
+from eslr_jax.training.memory import keep_memory
+
+sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models
+
+SIZES = {"1k": (32, 32), "4k": (64, 64), "12k": (110, 110), "50k": (224, 224)}
+MODEL = "eslr-15"
+
+
+def take_turns(functions: dict, turns: int) -> dict[str, float]:
+    """Return the median seconds of compiled functions, called in turns after one warm-up."""
+    return {name: 1e-3 * float(np.median(times)) for name, times in time_in_turns(functions, turns).items()}
+
+
+def compile_timed(function, args) -> tuple:
+    """Return the compiled function, and its seconds of compilation and MB of temporary memory."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    return compiled, {
+        "compile_s": round(seconds, 3),
+        "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1) if memory else None,
+    }
+
+
+def load(model: str, size: str) -> tuple:
+    """Return config, weights, graph and garment of a tube of that size."""
+    from reference_models import make_scene
+
+    config = MODELS[model]
+    scene = make_scene(*SIZES[size])
+    graph = jax.jit(lambda *scene: build_graph(*scene, config))(*scene)
+    params = init_model(config)
+    measured = measure_statistics(config, params, graph, scene[0], scene[2].velocity)
+    params = merge_statistics(params, measured)
+    return config, params, graph, scene[0]
+
+
+def networks(config) -> dict:
+    """Return the three builds of a network, each a function of (params, graph, garment)."""
+    from reference_models import plain_network
+
+    reduced = dataclasses.replace(config, precision="bfloat16")
+    return {
+        "plain": lambda *args: plain_network(config, *args, jnp),
+        "exact": lambda *args: apply_model(config, *args),
+        "reduced": lambda *args: apply_model(reduced, *args),
+    }
+
+
+def training_step(network):
+    """Return a step of Adam on a quadratic loss: forward, backward, update."""
+    optimizer = optax.adam(1e-4)
+
+    def step(params, graph, garment, state):
+        def loss(trained):
+            return jnp.sum(network({**params, "params": trained}, graph, garment) ** 2)
+
+        gradient = jax.grad(loss)(params["params"])
+        update, state = optimizer.update(gradient, state)
+        return optax.apply_updates(params["params"], update), state
+
+    return step, optimizer.init
+
+
+def measure_size(size: str, turns: int, training: bool) -> dict:
+    """Return times, compile times and memory of every build at one size."""
+    config, params, graph, garment = load(MODEL, size)
+    result: dict = {
+        "vertices": int(garment.vertex_areas.shape[0]),
+        "edges": int(garment.senders.shape[0]),
+        "builds": {},
+    }
+    forwards = {}
+    for name, network in networks(config).items():
+        args = (params, graph, garment)
+        compiled, result["builds"][f"forward_{name}"] = compile_timed(network, args)
+        forwards[f"forward_{name}"] = (compiled, args)
+    times = take_turns(forwards, turns)
+    if training:
+        steps = {}
+        for name, network in networks(config).items():
+            step, init = training_step(network)
+            args = (params, graph, garment, init(params["params"]))
+            compiled, result["builds"][f"train_{name}"] = compile_timed(step, args)
+            steps[f"train_{name}"] = (compiled, args)
+        times.update(take_turns(steps, max(3, turns // 2)))
+    for name, seconds in times.items():
+        result["builds"][name]["run_ms"] = round(1e3 * seconds, 2)
+        result["builds"][name]["us_per_vertex"] = round(1e6 * seconds / result["vertices"], 2)
+    for kind in ("forward", "train")[: 1 + training]:
+        for build in ("exact", "reduced"):
+            result[f"{kind}_{build}_vs_plain"] = ratio(times, f"{kind}_plain", f"{kind}_{build}")
+    return result
+
+
+def ratio(times: dict[str, float], slow: str, fast: str) -> float:
+    """Return how many times as fast `fast` is."""
+    return round(times[slow] / times[fast], 3)
+
+
+def measure_torch(size: str, turns: int) -> dict:
+    """Return ratios to PyTorch; to be called in a process bound to one core."""
+    import torch
+    import torch_meshgraphnet
+
+    functions, garment = {}, None
+    for model in ("eslr-15", "mgn-15"):
+        config, params, graph, garment = load(model, size)
+        for name, network in networks(config).items():
+            if name != "plain":
+                args = (params, graph, garment)
+                functions[f"{model} {name}"] = (compile_timed(network, args)[0], args)
+    edges = (np.asarray(garment.senders), np.asarray(garment.receivers))
+    functions["torch mgn-15"] = (torch_meshgraphnet.make_forward(*edges, garment.vertex_areas.shape[0]), ())
+    times = take_turns(functions, turns)
+    return {
+        "torch": torch.__version__,
+        "threads": 1,
+        "run_ms": {name: round(1e3 * seconds, 1) for name, seconds in times.items()},
+        **{
+            f"{model}_{build}_vs_torch_mgn15": ratio(times, "torch mgn-15", f"{model[:-2]}-15 {build}")
+            for model in ("eslr15", "mgn15")
+            for build in ("exact", "reduced")
+        },
+    }
+
+
+def torch_in_a_process(size: str, turns: int, keeps_memory: bool) -> dict | None:
+    """Run `measure_torch` on one core, or return None where that is not possible."""
+    if importlib.util.find_spec("torch") is None or not hasattr(os, "sched_setaffinity"):
+        return None
+    core = max(os.sched_getaffinity(0))
+    code = (
+        f"import json, os, sys; os.sched_setaffinity(0, {{{core}}})\n"
+        f"sys.path.insert(0, {str(EXPERIMENTS)!r})\n"
+        f"import step_time; {keeps_memory} and step_time.keep_memory()\n"
+        f"print(json.dumps(step_time.measure_torch({size!r}, {turns})))"
+    )
+    process = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", code], check=False, **process)  # type: ignore[call-overload]
+    if done.returncode:
+        print(done.stderr[-2000:], file=sys.stderr)
+        return None
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> None:
+    parsed = parser(__doc__, "1k, one turn, neither training nor PyTorch")
+    parsed.add_argument("--sizes", nargs="+", default=["1k", "4k"], choices=SIZES, help="vertices")
+    parsed.add_argument("--turns", type=int, default=10, help="turns per comparison")
+    parsed.add_argument("--no-training", action="store_true", help="leave the training steps out")
+    parsed.add_argument("--no-torch", action="store_true", help="leave the comparison with PyTorch out")
+    parsed.add_argument(
+        "--keep-memory", action="store_true", help="keep freed memory, for both sides (glibc)"
+    )
+    options = parsed.parse_args()
+    if options.smoke:
+        options.sizes, options.turns, options.no_training, options.no_torch = ["1k"], 1, True, True
+    if options.keep_memory:
+        keep_memory()
+
+    sizes = {}
+    for size in options.sizes:
+        print(f"{size}: {MODEL} ...", file=sys.stderr)
+        sizes[size] = measure_size(size, options.turns, not options.no_training)
+        if not options.no_torch:
+            print(f"{size}: PyTorch ...", file=sys.stderr)
+            sizes[size]["torch"] = torch_in_a_process(size, options.turns, options.keep_memory)
+    report = {
+        "model": MODEL,
+        "sizes": sizes,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "keeps_memory": options.keep_memory,
+        "load": round(os.getloadavg()[0], 1),
+        **environment(),
+    }
+    keep(options.out / "step_time.json", report)
+    print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()
