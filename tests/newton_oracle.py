@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.physics.potential import potential
-from eslr_jax.terms.problem import FrameProblem, pin, pushed_out_guess, weight_norm
+from eslr_jax.physics.guess import pushed_out_guess
+from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import tree_cast
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
