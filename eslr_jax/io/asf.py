@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.parsing import parsing
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets
 
 FPS = 120.0  # [1/s] of CMU's recordings; the files tell none
@@ -32,7 +33,8 @@ class _Bone:
     parent: str = ""
 
 
-def read_amc(path: str | Path) -> SkeletonMotion:
+@reader("motion", [".amc"])
+def read_amc(path: Path, _clip: str = "") -> SkeletonMotion:
     """Read a motion, and the skeleton that lies beside it.
 
     Args:
@@ -46,17 +48,14 @@ def read_amc(path: str | Path) -> SkeletonMotion:
         AssetError: A file is missing, or is not in this format.
         MotionError: The motion has no usable frames.
     """
-    with parsing(path, "motion") as file:
-        beside = _skeleton_of(file)
-    with parsing(beside, "skeleton") as skeleton:
+    with parsing(_skeleton_of(path), "skeleton") as skeleton:
         bones, in_degrees = _read_bones(_lines(skeleton))
-    with parsing(path, "motion"):
-        values = _read_frames(_lines(file), bones)
-        names = list(bones)
-        parents = [names.index(bone.parent) if bone.parent else -1 for bone in bones.values()]
-        local, shifts = _evaluate(bones, values, parents, in_degrees=in_degrees)
-        rest = np.array([bones[bone.parent].end if bone.parent else np.zeros(3) for bone in bones.values()])
-        return pose_offsets(file.stem, names, parents, rest, local, shifts, FPS)
+    values = _read_frames(_lines(path), bones)
+    names = list(bones)
+    parents = [names.index(bone.parent) if bone.parent else -1 for bone in bones.values()]
+    local, shifts = _evaluate(bones, values, parents, in_degrees=in_degrees)
+    rest = np.array([bones[bone.parent].end if bone.parent else np.zeros(3) for bone in bones.values()])
+    return pose_offsets(path.stem, names, parents, rest, local, shifts, FPS)
 
 
 def _skeleton_of(file: Path) -> Path:

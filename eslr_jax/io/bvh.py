@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.parsing import parsing
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets, whole_rate
 
 _CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
@@ -30,7 +30,8 @@ class _Joint:
     channels: tuple[str, ...] = ()
 
 
-def read_bvh(path: str | Path) -> SkeletonMotion:
+@reader("motion", [".bvh"])
+def read_bvh(path: Path, _clip: str = "") -> SkeletonMotion:
     """Read a BVH file.
 
     A header whose number of frames is off by one is a warning; the frames that are there are read.
@@ -46,13 +47,12 @@ def read_bvh(path: str | Path) -> SkeletonMotion:
         AssetError: The file is missing, or is not BVH; the message names the line.
         MotionError: The motion has no usable frames.
     """
-    with parsing(path, "motion") as file:
-        words = _Words(file)
-        joints = _read_hierarchy(words)
-        values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
+    words = _Words(path)
+    joints = _read_hierarchy(words)
+    values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
     if not 1e-3 <= frame_time <= 1.0:
-        raise MotionError(f"{file}: a frame time of {frame_time:g} s; expected 0.001 to 1")
-    return _pose(file.stem, joints, values, whole_rate(1.0 / frame_time))
+        raise MotionError(f"{path}: a frame time of {frame_time:g} s; expected 0.001 to 1")
+    return _pose(path.stem, joints, values, whole_rate(1.0 / frame_time))
 
 
 class _Words:

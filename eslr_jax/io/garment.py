@@ -17,12 +17,10 @@ from eslr_jax.io.mesh import MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.parsing import split_name
-from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import find_reader, suffixes_of
 
-_SAME_EDGES = (
-    0.5  # share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds
-)
-_HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
+# Share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds.
+_SAME_EDGES = 0.5
 _COPY = re.compile(r"\.\d{3}$")  # what Blender appends to a name that is taken
 _LAYOUT = {
     "rest_positions": ("f", "vertices 3"),
@@ -102,16 +100,17 @@ def is_garment_file(path: str | Path) -> bool:
 
 
 def garment_path(text: str | Path) -> Path:
-    """Return the file of a garment; only that of a pickle is followed by the name of one of its garments."""
+    """Return the file of a garment; only a file of several is followed by the name of one of them."""
     file, _ = split_name(text)
-    return Path(file if Path(file).suffix.lower() == ".pkl" else text)
+    return Path(file if Path(file).suffix.lower() in suffixes_of("garment") else text)
 
 
 def read_garment_source(text: str | Path) -> GarmentSource:
     """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
 
     Args:
-        text: Path of a .obj, .ply, .stl, .glb, .npz or .pkl file; `FILE.pkl#NAME` picks one of several.
+        text: Path of a file of one of `registry.suffixes_of("mesh", "garment")`; `FILE.pkl#NAME`
+            picks one of several.
 
     Returns:
         The mesh in the file's units and axes.
@@ -121,42 +120,10 @@ def read_garment_source(text: str | Path) -> GarmentSource:
         MeshError: It has faces that can't be triangulated.
     """
     path = garment_path(text)
-    if path.suffix.lower() == ".pkl":
-        return _read_hood(str(path), split_name(text)[1])
-    return GarmentSource(read_mesh_file(path), path.stem, is_metric=path.suffix.lower() == ".glb")
-
-
-def _read_hood(path: str, name: str) -> GarmentSource:
-    """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name.
-
-    Source: HOOD, `utils/mesh_creation.py`.
-    """
-    garments = read_pickle(path, content="garment")
-    if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
-        raise AssetError(f"garment file {path} holds no garments by name; give HOOD's garments_dict.pkl")
-    names = [str(key) for key in garments]
-    if not name and len(names) != 1:
-        raise AssetError(f"{path} holds the garments {', '.join(names)[:300]}; name one, as in {path}#NAME")
-    name = name or names[0]
-    if name not in names:
-        raise AssetError(f"{path} has no garment {name!r}; it has {', '.join(names)[:300]}")
-    entry = garments[name]
-    arrays = {}
-    for key in ("rest_pos", "faces"):
-        value = entry.get(key)
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-            raise AssetError(f"garment {name} of {path} has no array {key}; give HOOD's garments_dict.pkl")
-        arrays[key] = value
-    positions = arrays["rest_pos"].astype(np.float64)
-    is_pinned = None
-    if entry.get("node_type") is not None:
-        kinds = np.ravel(entry["node_type"])
-        if kinds.shape != positions.shape[:1]:
-            raise AssetError(
-                f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
-            )
-        is_pinned = kinds == _HOOD_PINNED
-    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
+    if path.suffix.lower() in suffixes_of("garment"):
+        return find_reader("garment", path)(path, split_name(text)[1])
+    mesh = read_mesh_file(path)
+    return GarmentSource(mesh, path.stem, is_metric=mesh.is_metric)
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:

@@ -16,10 +16,20 @@ from pathlib import Path
 import numpy as np
 import pygltflib as gltf
 
-from eslr_jax.io.animated import AnimatedMesh, check_meshes, principal_shapes, split_seams, vertex_normals
+from eslr_jax.io.animated import (
+    AnimatedMesh,
+    Skin,
+    check_meshes,
+    corrections,
+    influences,
+    local_motion,
+    principal_shapes,
+    split_seams,
+    vertex_normals,
+)
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.gltf_builder import GlbBuilder, append
-from eslr_jax.io.skin import Skin, corrections, influences, local_motion
+from eslr_jax.io.registry import writer
 
 TOLERANCE = 5e-4  # [m] by which a vertex may be out of place
 _SMALL = 0.06  # [m]; 16 bits resolve a shape of this size to a micrometre
@@ -27,6 +37,7 @@ _NORMAL_TOLERANCE = 0.02  # root mean square by which normals, of length one, ma
 _INFLUENCES_PER_SET = 4  # glTF stores skin weights in sets of four
 
 
+@writer("scene", [".glb"])
 def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     """Write meshes with their animation as one GLB file, atomically.
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pygltflib as gltf
 
-from eslr_jax.io.color import srgb_to_linear
-from eslr_jax.io.palette import Color
+from eslr_jax.io.palette import Color, srgb_to_linear
 
 _COMPONENT_TYPES = {
     np.dtype(np.float32): gltf.FLOAT,

@@ -1,10 +1,11 @@
-"""Read HOOD's checkpoints: its weights under our names.
+"""Read HOOD's garments, and its checkpoints: its weights under our names.
 
-Three layouts are read: "postcvpr" (levels), "cvpr" (five lists of steps, one encoder for all coarse levels)
-and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from the same graph;
-`models.hood` says in what our graphs differ.
+Three layouts of checkpoints are read: "postcvpr" (levels), "cvpr" (five lists of steps, one encoder for all
+coarse levels) and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from
+the same graph; `models.hood` says in what our graphs differ.
 
-Source: Grigorev, Black and Hilliges, "HOOD" (2023), repository at 9bc1076, models/ and utils/normalization.py.
+Source: Grigorev, Black and Hilliges, "HOOD" (2023), repository at 9bc1076, models/, utils/normalization.py and
+utils/mesh_creation.py.
 """
 
 from __future__ import annotations
@@ -16,14 +17,50 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
-from eslr_jax.errors import CheckpointError
+from eslr_jax.errors import AssetError, CheckpointError
+from eslr_jax.io.garment import GarmentSource
+from eslr_jax.io.mesh import MeshFile
+from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import reader
 from eslr_jax.io.torch_archive import read_torch
 from eslr_jax.types import MIN_DEVIATION, Normalizer
 
 Tensors = Mapping[str, np.ndarray]
 
 _NORMALIZERS = {"garment": "node", "mesh": "mesh_edge", "world": "world_edge", "output": "output"}
+_PINNED = 3  # node_type of a pinned vertex (`NodeType.HANDLE`)
 _CORE = "_learned_model."
+
+
+@reader("garment", [".pkl"])
+def read_hood_garment(path: Path, name: str = "") -> GarmentSource:
+    """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name."""
+    garments = read_pickle(path, content="garment")
+    if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
+        raise AssetError(f"garment file {path} holds no garments by name; give HOOD's garments_dict.pkl")
+    names = [str(key) for key in garments]
+    if not name and len(names) != 1:
+        raise AssetError(f"{path} holds the garments {', '.join(names)[:300]}; name one, as in {path}#NAME")
+    name = name or names[0]
+    if name not in names:
+        raise AssetError(f"{path} has no garment {name!r}; it has {', '.join(names)[:300]}")
+    entry = garments[name]
+    arrays = {}
+    for key in ("rest_pos", "faces"):
+        value = entry.get(key)
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+            raise AssetError(f"garment {name} of {path} has no array {key}; give HOOD's garments_dict.pkl")
+        arrays[key] = value
+    positions = arrays["rest_pos"].astype(np.float64)
+    is_pinned = None
+    if entry.get("node_type") is not None:
+        kinds = np.ravel(entry["node_type"])
+        if kinds.shape != positions.shape[:1]:
+            raise AssetError(
+                f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
+            )
+        is_pinned = kinds == _PINNED
+    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
 
 
 def read_hood(path: str | Path) -> tuple[dict[str, Any], ModelConfig]:

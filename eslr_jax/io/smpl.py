@@ -19,8 +19,8 @@ import scipy.sparse
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.parsing import parsing
 from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import (
     RiggedMesh,
     Skeleton,
@@ -71,12 +71,15 @@ _T_POSE = {
 # ---------------------------------------------------------------- bodies
 
 
-def is_smpl_model(path: str | Path) -> bool:
-    """Tell whether an .npz holds a SMPL model, by its keys."""
-    return {"v_template", "kintree_table"} <= set(read_arrays(path, content="body", names=_MODEL_KEYS))
+def _is_smpl_model(path: Path) -> bool:
+    """Tell a SMPL model from another .npz, by its keys."""
+    return path.suffix.lower() == ".pkl" or {"v_template", "kintree_table"} <= set(
+        read_arrays(path, content="body", names=_MODEL_KEYS)
+    )
 
 
-def read_smpl_body(path: str | Path) -> RiggedMesh:
+@reader("body", [".npz", ".pkl"], accepts=_is_smpl_model)
+def read_smpl_body(path: Path, _meshes: str = "") -> RiggedMesh:
     """Read a body model in the layout of SMPL.
 
     Args:
@@ -90,7 +93,6 @@ def read_smpl_body(path: str | Path) -> RiggedMesh:
     Raises:
         AssetError: The file is missing or damaged, or it lacks a part of a body model.
     """
-    path = Path(path)
     if path.suffix.lower() == ".pkl":
         values = read_pickle(path, content="body")
     else:
@@ -100,12 +102,6 @@ def read_smpl_body(path: str | Path) -> RiggedMesh:
     missing = [key for key in _MODEL_KEYS if key not in values]
     if missing:
         raise AssetError(f"body file {path} lacks {', '.join(missing)}; give a SMPL model")
-    with parsing(path, "body"):
-        return _smpl_body(path, values)
-
-
-def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
-    """Return the body of a model's arrays."""
     positions = _numbers(path, values, "v_template", (None, 3))
     count = len(positions)
     if not 0 < count <= MAX_VERTICES:
@@ -190,7 +186,8 @@ def _regressor(path: Path, value: Any, joints: int, count: int) -> Any:
 # ---------------------------------------------------------------- motions
 
 
-def read_amass(path: str | Path) -> SkeletonMotion:
+@reader("motion", [".npz"])
+def read_amass(path: Path, _clip: str = "") -> SkeletonMotion:
     """Read a motion of AMASS.
 
     Args:
@@ -213,10 +210,11 @@ def read_amass(path: str | Path) -> SkeletonMotion:
         )
     if rates[0].size != 1 or rates[0].dtype.kind not in "fiu":
         raise MotionError(f"motion file {path}: {rates[0].dtype} as the frame rate; expected a number")
-    return _parameters(Path(path), values["poses"], values["trans"], float(rates[0].ravel()[0]), _Z_UP)
+    return _parameters(path, values["poses"], values["trans"], float(rates[0].ravel()[0]), _Z_UP)
 
 
-def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
+@reader("motion", [".pkl"])
+def read_smpl_pickle(path: Path, _clip: str = "") -> SkeletonMotion:
     """Read a motion of HOOD or of the VTO dataset.
 
     Args:
@@ -236,9 +234,8 @@ def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
         "move": next((key for key in ("transl", "translation", "trans") if key in values), None),
     }
     if {"global_orient", "body_pose"} <= values.keys():
-        with parsing(path, "motion"):
-            parts = (np.atleast_2d(np.asarray(values[key])) for key in ("global_orient", "body_pose"))
-            poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        parts = (np.atleast_2d(np.asarray(values[key])) for key in ("global_orient", "body_pose"))
+        poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     elif names["pose"] is not None:
         poses = values[names["pose"]]
     else:
@@ -246,7 +243,7 @@ def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
         raise MotionError(f"motion file {path} has {found}; it needs body_pose and global_orient, or pose")
     if names["move"] is None:
         raise MotionError(f"motion file {path} has no transl or translation; give a motion of HOOD or VTO")
-    return _parameters(Path(path), poses, values[names["move"]], HOOD_FPS, np.eye(3))
+    return _parameters(path, poses, values[names["move"]], HOOD_FPS, np.eye(3))
 
 
 def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray) -> SkeletonMotion:

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.io.skin import Skin
 from eslr_jax.types import Material, Plate, Threads
 
 FORMAT = "eslr-trajectory-2"

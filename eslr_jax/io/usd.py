@@ -14,17 +14,17 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.extras import require
-from eslr_jax.io.animated import AnimatedMesh, check_meshes, vertex_normals
+from eslr_jax.io.animated import AnimatedMesh, Skin, corrections, influences, local_motion, vertex_normals
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.color import srgb_to_linear
-from eslr_jax.io.palette import Color
+from eslr_jax.io.palette import Color, srgb_to_linear
+from eslr_jax.io.registry import writer
 from eslr_jax.io.skeleton import whole_rate
-from eslr_jax.io.skin import Skin, corrections, influences, local_motion
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 TOLERANCE = 1e-4  # [m] by which joints may miss a vertex
 
 
+@writer("scene", SUFFIXES)
 def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     """Write meshes as a USD stage, one whole time code per frame, atomically.
 
@@ -47,7 +47,6 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
 
     if Path(path).suffix.lower() not in SUFFIXES:
         raise AssetError(f"can't write {path} as USD; name it one of {', '.join(SUFFIXES)}")
-    check_meshes(meshes, timestep)
     rate = whole_rate(1.0 / timestep)
     with atomic_write(path) as temporary:
         stage = Usd.Stage.CreateNew(str(temporary))

@@ -14,12 +14,11 @@ import trimesh
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.cli.runs import export
-from eslr_jax.errors import AssetError, MeshError
+from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, in_vertex_order
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
-from eslr_jax.io.point_cache import write_mdd, write_pc2
-from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
 
 FRAMES, STEP = 4, 1 / 30
@@ -376,15 +375,6 @@ def test_formats_that_are_unknown_or_don_t_fit_are_refused(tmp_path, run):
 def test_another_garment_is_refused(tmp_path, run, garment):
     with pytest.raises(AssetError, match="not the one of this run"):
         export_trajectory(run, tmp_path / "a.glb", garment=replace(garment, faces=garment.faces[::-1]))
-
-
-@pytest.mark.parametrize("points", [np.zeros((0, 3, 3)), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)])
-def test_point_caches_of_nothing_are_not_written(tmp_path, points):
-    with pytest.raises(MeshError):
-        write_pc2(tmp_path / "a.pc2", points)
-    with pytest.raises(MeshError):
-        write_mdd(tmp_path / "a.mdd", points, STEP)
-    assert not os.listdir(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["garment.npz", "trajectory.npz", "report.json"])

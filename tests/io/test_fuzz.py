@@ -27,11 +27,10 @@ from eslr_jax.body.rig import make_body, make_motion
 from eslr_jax.body.sequence import pose_sequence
 from eslr_jax.errors import EslrError
 from eslr_jax.io.asf import read_amc
-from eslr_jax.io.body import read_body
+from eslr_jax.io.bundled import read_body, read_motion_archive
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.gltf_rig import read_gltf_body, read_gltf_motion
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
-from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import write_arrays
 from eslr_jax.io.skeleton import Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.io.smpl import read_amass, read_smpl_body, read_smpl_pickle

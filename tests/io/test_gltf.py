@@ -10,10 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import MeshError, MotionError
-from eslr_jax.io.animated import AnimatedMesh, principal_shapes, vertex_normals
+from eslr_jax.io.animated import AnimatedMesh, Skin, principal_shapes, vertex_normals
 from eslr_jax.io.gltf import TOLERANCE as TARGET_TOLERANCE
 from eslr_jax.io.gltf import write_animated_glb
-from eslr_jax.io.skin import Skin
 
 TIMESTEP = 1 / 30
 TOLERANCE = 1e-6  # [m]: float32 positions within two metres of the origin, skinned through a few joints

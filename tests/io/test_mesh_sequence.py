@@ -12,18 +12,17 @@ from scipy.spatial.transform import Rotation
 from eslr_jax.body.sequence import pose_sequence
 from eslr_jax.body.units import UnitsWarning
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.io.animated import AnimatedMesh
+from eslr_jax.io.animated import AnimatedMesh, Skin
 from eslr_jax.io.garment import GarmentFile, in_outfit_order, in_vertex_order
 from eslr_jax.io.gltf import TOLERANCE, write_animated_glb
 from eslr_jax.io.mesh import read_mesh
 from eslr_jax.io.mesh_sequence import (
     MeshSequence,
     is_mesh_sequence,
-    obj_text,
     read_mesh_sequence,
     read_mesh_sequences,
 )
-from eslr_jax.io.skin import Skin
+from eslr_jax.io.obj import obj_text
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
 CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))  # it stands

@@ -5,8 +5,7 @@ import pytest
 from broken import refuses
 
 from eslr_jax.assets.catalog import find_asset
-from eslr_jax.io.body import read_body
-from eslr_jax.io.motion import read_motion_archive
+from eslr_jax.io.bundled import read_body, read_motion_archive
 from eslr_jax.io.npz import read_arrays, write_arrays
 
 CLIP = {

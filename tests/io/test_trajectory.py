@@ -12,8 +12,8 @@ from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.run import ClothTrack, read_run, write_run
-from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.types import Material, Plate, Threads
