@@ -35,6 +35,7 @@ _LAYOUT = {
     "vertex_map": ("iu", "source_vertices"),
     "joined_rows": ("iu", "joined_vertices", "source_vertices"),
 }
+_TYPES = {"skin_indices": np.int16, "pinned": bool}  # stored, where it is not float32 or int32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,9 +146,7 @@ def read_garment_npz(path: str | Path) -> GarmentFile:
 def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> GarmentFile:
     """Return the garment of a file's arrays; see `read_garment_npz`."""
     what = f"garment file {path}"
-    missing = [
-        key for key in ("rest_positions", "faces", "skin_weights", "skin_indices") if key not in arrays
-    ]
+    missing = [key for key in list(_LAYOUT)[:4] if key not in arrays]
     if missing:
         raise AssetError(f"{what} lacks {', '.join(missing)}; it has {', '.join(sorted(arrays))}")
     check_layout(arrays, _LAYOUT, what=what, remedy="write it again")
@@ -155,21 +154,12 @@ def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> Garm
         metadata = json.loads(str(arrays["metadata"])) if "metadata" in arrays else {}
     except (ValueError, RecursionError) as error:
         raise AssetError(f"{what} has damaged metadata; fit the garment again") from error
-    sewn, uvs = arrays.get("sewn_positions"), arrays.get("corner_uvs")
-    return GarmentFile(
-        rest_positions=arrays["rest_positions"].astype(np.float64),
-        faces=arrays["faces"].astype(np.int64),
-        skin_weights=arrays["skin_weights"].astype(np.float64),
-        skin_indices=arrays["skin_indices"].astype(np.int64),
-        is_pinned=arrays.get("pinned", np.zeros(len(arrays["rest_positions"]))).astype(bool),
-        sewn_positions=None if sewn is None else sewn.astype(np.float64),
-        corner_uvs=None if uvs is None else uvs.astype(np.float64),
-        face_parts=arrays.get("face_parts"),
-        part_names=tuple(str(name) for name in arrays.get("part_names", ())),
-        vertex_map=arrays.get("vertex_map"),
-        joined_rows=arrays.get("joined_rows"),
-        metadata=metadata if isinstance(metadata, dict) else {},
-    )
+    wide = {"f": np.float64, "iu": np.int64}  # for the host
+    found = {name: arrays[name] for name in _LAYOUT if name in arrays}
+    values = {name: array.astype(wide.get(_LAYOUT[name][0], array.dtype)) for name, array in found.items()}
+    values["part_names"] = tuple(map(str, found.get("part_names", ())))
+    is_pinned = values.pop("pinned", np.zeros(len(values["rest_positions"]))).astype(bool)
+    return GarmentFile(**values, is_pinned=is_pinned, metadata=metadata if isinstance(metadata, dict) else {})
 
 
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
@@ -183,24 +173,12 @@ def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
 
 def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
     """Return the arrays of a garment file."""
-    arrays: dict[str, np.ndarray] = {
-        "rest_positions": garment.rest_positions.astype(np.float32),
-        "faces": garment.faces.astype(np.int32),
-        "skin_weights": garment.skin_weights.astype(np.float32),
-        "skin_indices": garment.skin_indices.astype(np.int16),
-        "pinned": garment.is_pinned,
-    }
-    if garment.sewn_positions is not None:
-        arrays["sewn_positions"] = garment.sewn_positions.astype(np.float32)
-    if garment.corner_uvs is not None:
-        arrays["corner_uvs"] = garment.corner_uvs.astype(np.float32)
-    if garment.face_parts is not None:
-        arrays["face_parts"] = garment.face_parts.astype(np.int32)
-        arrays["part_names"] = np.array(garment.part_names)
-    if garment.vertex_map is not None:
-        arrays["vertex_map"] = garment.vertex_map.astype(np.int32)
-    if garment.joined_rows is not None:
-        arrays["joined_rows"] = garment.joined_rows.astype(np.int32)
+    values = vars(garment) | {"pinned": garment.is_pinned, "part_names": garment.part_names or None}
+    arrays = {}
+    for name, (kinds, *_) in _LAYOUT.items():
+        if values[name] is not None:
+            usual = {"f": np.float32, "iu": np.int32}.get(kinds)
+            arrays[name] = np.asarray(values[name], _TYPES.get(name, usual))
     if garment.metadata:
         arrays["metadata"] = np.array(json.dumps(garment.metadata))
     return arrays
@@ -237,7 +215,10 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
             orders.append(order[garment.joined_rows])
     fitting = [order for order in orders if len(order) == num_rows]
     if not fitting and num_rows > min(map(len, orders)):
-        sequence = _join_copies(sequence)
+        # PLY splits vertices at seams of textures: those at one place in all frames are one.
+        kept, place = shared_vertices(sequence.positions.swapaxes(0, 1))
+        faces = place[np.asarray(sequence.faces)]
+        sequence = dataclasses.replace(sequence, positions=sequence.positions[:, kept], faces=faces)
         fitting = [order for order in orders if len(order) == sequence.positions.shape[1]]
     if not fitting:
         known = " or ".join(dict.fromkeys(str(len(order)) for order in orders))
@@ -253,14 +234,6 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     raise MeshError(
         f"{sequence.name} has edges between other vertices than the garment: its vertices have another order, or "
         "it is another garment; keep the order of the garment's file"
-    )
-
-
-def _join_copies(sequence: MeshSequence) -> MeshSequence:
-    """Return a mesh whose vertices at one place in all frames are one; PLY splits them at seams of textures."""
-    kept, place = shared_vertices(sequence.positions.swapaxes(0, 1))
-    return dataclasses.replace(
-        sequence, positions=sequence.positions[:, kept], faces=place[np.asarray(sequence.faces)]
     )
 
 
@@ -280,8 +253,20 @@ def in_outfit_order(
     """
     if len(sequences) == 1:
         return in_vertex_order(sequences[0], outfit)
-    garments = garments or _cut_apart(outfit)
-    meshes = {name: _meshes_of(name, sequences) for name in garments}
+    garments = garments or {
+        name: GarmentFile(
+            outfit.rest_positions[rows],
+            outfit.faces[is_own] - rows.start,
+            outfit.skin_weights[rows],
+            outfit.skin_indices[rows],
+            outfit.is_pinned[rows],
+        )
+        for name, rows, is_own in split_outfit(outfit.faces, outfit.outfit)
+    }
+    meshes = {}
+    for name in garments:
+        exact = [sequence for sequence in sequences if sequence.mesh == name]
+        meshes[name] = exact or [mesh for mesh in sequences if _COPY.sub("", mesh.mesh) == name]
     if missing := [name for name, found in meshes.items() if not found]:
         known = ", ".join(sequence.mesh for sequence in sequences)
         raise MeshError(
@@ -294,26 +279,6 @@ def in_outfit_order(
             f"{sequences[0].name}: the meshes {known} may all be {doubled[0]}; give one of them its name"
         )
     return np.concatenate([in_vertex_order(meshes[name][0], worn) for name, worn in garments.items()], axis=1)
-
-
-def _meshes_of(name: str, sequences: Sequence[MeshSequence]) -> list[MeshSequence]:
-    """Return the meshes of a garment's name, or else those that Blender numbered because it was taken."""
-    exact = [sequence for sequence in sequences if sequence.mesh == name]
-    return exact or [sequence for sequence in sequences if _COPY.sub("", sequence.mesh) == name]
-
-
-def _cut_apart(outfit: GarmentFile) -> dict[str, GarmentFile]:
-    """Return the garments of an outfit, without their parts and texture coordinates."""
-    return {
-        name: GarmentFile(
-            outfit.rest_positions[rows],
-            outfit.faces[is_own] - rows.start,
-            outfit.skin_weights[rows],
-            outfit.skin_indices[rows],
-            outfit.is_pinned[rows],
-        )
-        for name, rows, is_own in split_outfit(outfit.faces, outfit.outfit)
-    }
 
 
 def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:

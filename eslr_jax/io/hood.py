@@ -10,10 +10,11 @@ utils/mesh_creation.py.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
@@ -105,7 +106,7 @@ def _convert(tensors: Tensors) -> tuple[dict[str, Any], ModelConfig]:
     size = trained["garment_encoder"]["kernel_0"].shape[1]
     if is_flat:
         steps = _count(tensors, "processor_steps")
-        trained["layers"] = _stack([_flat_step(tensors, f"processor_steps.{k}", size) for k in range(steps)])
+        trained["layers"] = _stack(_flat_step(tensors, f"processor_steps.{k}", size) for k in range(steps))
     else:
         is_cvpr = f"{_CORE}processor_steps1.0.node_processor_dict.node.0.layers.0.weight" in tensors
         steps, counts = 0, set()
@@ -214,8 +215,6 @@ def _count(tensors: Tensors, place: str) -> int:
     return max(len(names), 1)  # a missing list is named by its first weight
 
 
-def _stack(layers: list[dict[str, Any]]) -> dict[str, Any]:
+def _stack(layers: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """Stack the weights of equal layers along a new leading axis."""
-    if isinstance(layers[0], dict):
-        return {name: _stack([layer[name] for layer in layers]) for name in layers[0]}
-    return np.stack(layers)  # type: ignore[return-value]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *layers)

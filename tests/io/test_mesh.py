@@ -210,9 +210,9 @@ def test_garment_file_round_trip(tmp_path):
         is_pinned=np.array([True, False, False, False, True]),
         sewn_positions=POSITIONS * 0.5,
         corner_uvs=np.full((3, 3, 2), 0.25),
-        face_parts=np.array([0, 1, 1], np.int32),
+        face_parts=np.array([0, 1, 1]),
         part_names=("body", "hem"),
-        vertex_map=np.array([0, 1, 2, 3, 4, 0, -1], np.int32),
+        vertex_map=np.array([0, 1, 2, 3, 4, 0, -1]),
         metadata={"name": "scarf", "fabrics": ["silk"]},
     )
     write_garment_npz(tmp_path / "scarf.npz", garment)
