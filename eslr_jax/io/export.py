@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from eslr_jax.errors import AssetError
-from eslr_jax.io.animated import AnimatedMesh, check_meshes
+from eslr_jax.io.animated import AnimatedMesh
 from eslr_jax.io.garment import GarmentFile, first_rows, split_outfit
 from eslr_jax.io.npz import write_arrays
 from eslr_jax.io.palette import SKIN_COLOR, garment_color
@@ -71,7 +71,6 @@ def export_trajectory(
             meshes[:1] = _garments(both["garment"], garment.outfit)
         if kind == "point cache":
             _warn_of_order(garment)
-    check_meshes(meshes, run.timestep)
     write(path, meshes, run.timestep)
     return path
 

@@ -24,10 +24,12 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import eslr_jax.io
 from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import AnimatedMesh, check_meshes
 from eslr_jax.io.parsing import parsing
 
 WRITERS = ("scene", "animation", "point cache", "frames")
 _P, _R = ParamSpec("_P"), TypeVar("_R")
+_Writer = Callable[[Path, Sequence[AnimatedMesh], float], None]
 
 
 class _Format(NamedTuple):
@@ -63,12 +65,17 @@ def reader(
     return register
 
 
-def writer(kind: str, suffixes: Sequence[str]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function the writer of a format, which `eslr export` calls by its suffix without the dot."""
+def writer(kind: str, suffixes: Sequence[str]) -> Callable[[_Writer], _Writer]:
+    """Make a function the writer of a format, which gets sound meshes alone; see `check_meshes`."""
 
-    def register(function: Callable[..., None]) -> Callable[..., None]:
-        _formats.append(_Format(kind, tuple(suffixes), function, None))
-        return function
+    def register(function: _Writer) -> _Writer:
+        @functools.wraps(function)
+        def write(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
+            check_meshes(meshes, timestep)
+            function(Path(path), meshes, timestep)
+
+        _formats.append(_Format(kind, tuple(suffixes), write, None))
+        return write
 
     return register
 
