@@ -17,12 +17,26 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+from eslr_jax.io.npz import check_layout
 from eslr_jax.io.palette import GARMENT_COLORS, Color
 
 _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
 _FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
 # A skin weight that moves a vertex by less than float32 resolves over a body's size.
 _NEGLIGIBLE_WEIGHT = 1e-6
+_LAYOUT = {  # of an AnimatedMesh and its Skin
+    "positions": ("f", "frames vertices 3"),
+    "faces": ("iu", "faces 3", "vertices"),
+    "corner_uvs": ("f", "faces 3 2"),
+    "velocities": ("f", "frames vertices 3"),
+    "rest_positions": ("f", "vertices 3"),
+    "joint_transforms": ("f", "frames joints 3 4"),
+    "joint_rest_positions": ("f", "joints 3"),
+    "parents": ("iu", "joints"),
+    "joint_names": ("U", "joints"),
+    "skin_weights": ("f", "vertices influences"),
+    "skin_indices": ("iu", "vertices influences", "joints"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,62 +83,32 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     for mesh in meshes:
         _check_mesh(mesh)
     frames = {mesh.name: len(mesh.positions) for mesh in meshes}
-    frames |= {f"{mesh.name} joints": len(mesh.skin.joint_transforms) for mesh in meshes if mesh.skin}
     if len(set(frames.values())) > 1:
         raise MotionError(f"meshes need the same number of frames, these have {frames}")
 
 
 def _check_mesh(mesh: AnimatedMesh) -> None:
-    """Raise MeshError unless the arrays of a mesh are finite and fit each other."""
-    points, faces = np.asarray(mesh.positions), np.asarray(mesh.faces)
-    is_mesh = points.ndim == 3 and points.shape[2] == 3 and faces.ndim == 2 and faces.shape[1] == 3
-    if not is_mesh or 0 in points.shape or not len(faces):
-        raise MeshError(
-            f"mesh {mesh.name} has positions {points.shape} and faces {faces.shape}; it needs "
-            "[frames, vertices, 3] and [faces, 3]"
-        )
-    is_finite = np.isfinite(points).all((1, 2))
-    if not is_finite.all():
-        raise MeshError(f"mesh {mesh.name} is not finite in frame {np.argmin(is_finite)}; simulate it again")
-    if faces.min() < 0 or faces.max() >= points.shape[1]:
-        raise MeshError(f"mesh {mesh.name} has a face that names vertex {faces.max()} of {points.shape[1]}")
-    for label, array, shape in (
-        ("texture coordinates", mesh.corner_uvs, (len(faces), 3, 2)),
-        ("velocities", mesh.velocities, points.shape),
-        ("rest positions", mesh.rest_positions, points.shape[1:]),
-    ):
-        if array is not None and np.shape(array) != shape:
-            raise MeshError(f"mesh {mesh.name} has {label} {np.shape(array)}; expected {shape}")
+    """Raise unless a mesh is finite, its parts and its joints fit each other, and these move rigidly."""
+    what, remedy = f"mesh {mesh.name}", "simulate it again"
+    arrays = {
+        key: np.asarray(value) for key, value in vars(mesh).items() if key in _LAYOUT and value is not None
+    }
     if mesh.skin is not None:
-        if mesh.rest_positions is None:
-            raise MeshError(f"mesh {mesh.name} has a skin and no rest positions; give both")
-        _check_skin(mesh.name, mesh.skin, points.shape[1])
-
-
-def _check_skin(name: str, skin: Skin, num_vertices: int) -> None:
-    """Raise unless a skin fits a mesh of so many vertices, and its joints move rigidly."""
-    weights, indices = np.asarray(skin.skin_weights), np.asarray(skin.skin_indices)
-    transforms = np.asarray(skin.joint_transforms)
-    joints = len(skin.parents)
-    if (
-        transforms.shape[1:] != (joints, 3, 4)
-        or np.shape(skin.joint_rest_positions) != (joints, 3)
-        or len(skin.joint_names) != joints
-    ):
-        raise MotionError(
-            f"{name} has joint transforms {transforms.shape}, {len(skin.joint_rest_positions)} rest positions, "
-            f"{joints} parents and {len(skin.joint_names)} names; they must be of the same joints"
-        )
-    if weights.shape != indices.shape or weights.ndim != 2 or len(weights) != num_vertices:
-        raise MeshError(
-            f"mesh {name} has skin weights {weights.shape} and skin indices {indices.shape}; "
-            f"both must be [{num_vertices}, influences]"
-        )
-    if indices.min() < 0 or indices.max() >= joints:
-        raise MeshError(f"mesh {name} has a skin weight for joint {indices.max()} of {joints}")
+        arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+    check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+    if 0 in arrays["positions"].shape or not len(arrays["faces"]):
+        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+    is_finite = np.isfinite(arrays["positions"]).all((1, 2))
+    if not is_finite.all():
+        raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+    if mesh.skin is None:
+        return
+    if mesh.rest_positions is None:
+        raise MeshError(f"{what} has a skin and no rest positions; give both")
+    weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
     if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
         raise MeshError(
-            f"mesh {name} has skin weights that are negative or don't sum to one; normalise them first"
+            f"{what} has skin weights that are negative or don't sum to one; normalise them first"
         )
     matrices = transforms[..., :3]
     gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
@@ -133,7 +117,7 @@ def _check_skin(name: str, skin: Skin, num_vertices: int) -> None:
     if not is_rigid.all():
         frame, joint = np.argwhere(~is_rigid)[0]
         raise MotionError(
-            f"{name}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
+            f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
         )
 
 

@@ -45,18 +45,7 @@ _COMPONENT_TYPES = {
 
 @writer("scene", [".glb"])
 def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Write meshes with their animation as one GLB file, atomically.
-
-    Args:
-        path: Path of the file, `*.glb`.
-        meshes: Meshes with the same number of frames.
-        timestep: Time between frames [s]; frame k is at k * timestep.
-
-    Raises:
-        MeshError: A mesh is empty, not finite, or its parts disagree.
-        MotionError: The numbers of frames differ, or a joint does not move rigidly.
-        AssetError: The file can't be written.
-    """
+    """Write meshes with their animation as one GLB file, atomically; frame k is at k times the timestep [s]."""
     builder = _Builder()
     for mesh in meshes:
         _add_mesh(builder, mesh, timestep)

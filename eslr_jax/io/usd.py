@@ -38,8 +38,6 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
 
     Raises:
         MissingExtraError: The extra is not installed.
-        MeshError: A mesh is empty, not finite, or its parts disagree.
-        MotionError: The numbers of frames differ, or a joint does not move rigidly.
         AssetError: The suffix is unknown, or the file can't be written.
     """
     require("pxr.Usd", extra="usd", purpose="USD")

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 
 import numpy as np
@@ -82,34 +81,6 @@ def test_trajectory_round_trip_is_exact(tmp_path, trajectory):
     found = read_trajectory(tmp_path / "run.npz")
     assert_equal(found, trajectory)
     assert found.num_frames == FRAMES
-
-
-@pytest.mark.parametrize("has_contacts", [False, True])
-def test_trajectory_of_the_first_format_is_converted(tmp_path, has_contacts):
-    arrays = {
-        "format": np.array("eslr-trajectory-1"),
-        "positions": WHOLE.positions,
-        "velocities": WHOLE.velocities,
-        "faces": WHOLE.faces,
-        "timestep": np.array(WHOLE.timestep),
-        "metadata": np.array(json.dumps({"garment": "tshirt", "total": 1.5})),
-        "body_positions": BODY.positions,
-        "body_faces": BODY.faces,
-    }
-    if has_contacts:
-        arrays |= {"body_rest_positions": BODY.rest_positions, "contact_faces": BODY.contact_faces}
-    np.savez(tmp_path / "run.npz", **arrays)
-    found = read_trajectory(tmp_path / "run.npz")
-    np.testing.assert_array_equal(found.positions, WHOLE.positions)
-    assert found.metadata["garment"] == "tshirt"
-    assert found.friction_loads is None
-    assert found.material is None
-    rest, reached = (
-        (BODY.rest_positions, BODY.contact_faces) if has_contacts else (BODY.positions[0], BODY.faces)
-    )
-    np.testing.assert_array_equal(found.body.rest_positions, rest)
-    np.testing.assert_array_equal(found.body.contact_faces, reached)
-    assert found.body.contact_boundary.shape == (0,)
 
 
 def test_run_has_its_report_from_the_json_alone(tmp_path):
