@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -386,21 +385,3 @@ def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name
         export(tmp_path, Path(name), format_="npz", content="garment")
     assert os.listdir(tmp_path) == ["trajectory.npz"]
     assert (tmp_path / "trajectory.npz").read_bytes() == before
-
-
-@pytest.mark.slow
-def test_the_command_exports_a_run(tmp_path, run):
-    write_trajectory(tmp_path / "trajectory.npz", run)
-    command = [
-        sys.executable,
-        "-m",
-        "eslr_jax.cli",
-        "export",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "a.mdd"),
-    ]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
-    assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes

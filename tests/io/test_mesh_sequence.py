@@ -94,27 +94,6 @@ def test_other_units_are_recognised_or_named():
         np.testing.assert_allclose(found.positions, expected.positions, atol=1e-6)
 
 
-BROKEN = {
-    "no faces": ({"faces": None}, "lacks faces"),
-    "no positions": ({"positions": None}, "positions"),
-    "one frame without the axis": ({"positions": MOVING[0]}, "frames, vertices, 3"),
-    "a face beyond": ({"faces": FACES + 10_000}, "vertices"),
-    "not finite": ({"positions": np.full_like(MOVING, np.nan)}, "frame 0"),
-    "no rate": ({"fps": np.array(0.0)}, "frames per second"),
-    "a rate of words": ({"fps": np.array("fast")}, "one number"),
-    "faces of floats": ({"faces": FACES.astype(float)}, "faces"),
-}
-
-
-@pytest.mark.parametrize("kind", BROKEN)
-def test_broken_archives_are_named_in_one_line(tmp_path, kind):
-    changes, word = BROKEN[kind]
-    values = {"positions": MOVING, "faces": FACES} | changes
-    path = tmp_path / "body.npz"
-    np.savez(path, **{key: value for key, value in values.items() if value is not None})
-    refuses(read_mesh_sequence, path, word)
-
-
 def test_polygons_are_cut_alike_in_all_frames(tmp_path):
     """The shorter diagonal of the second frame is the other one."""
     for number, slant in enumerate((0.3, -0.3)):

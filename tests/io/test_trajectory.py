@@ -95,26 +95,14 @@ def test_run_has_its_report_from_the_json_alone(tmp_path):
         read_run(tmp_path)
 
 
-def change_body(**change):
-    return {"body": dataclasses.replace(BODY, **change)}
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"velocities": np.zeros((3, 4, 3))}, "velocities"),
         ({"faces": np.array([[0, 1, 5]])}, "names 5 of 5 vertices"),
-        ({"faces": np.array([[0, 1, -1]])}, "names -1"),
-        ({"positions": np.zeros((5, 3))}, "frames, vertices, 3"),
         ({"positions": np.zeros((0, 5, 3)), "velocities": np.zeros((0, 5, 3)), "body": None,
           "friction_loads": None}, "0 frames"),
-        (change_body(positions=np.zeros((2, 4, 3))), "body_positions"),
-        (change_body(contact_faces=np.array([[0, 1, 4]])), "names 4 of 4 body_vertices"),
-        (change_body(contact_boundary=np.array([9])), "contact_boundary names 9"),
-        (change_body(skin=dataclasses.replace(BODY.skin, parents=(-1,))), "body_parents"),
-        ({"friction_loads": np.zeros((3, 4))}, "friction_loads"),
+        ({"body": dataclasses.replace(BODY, positions=np.zeros((2, 4, 3)))}, "body_positions"),
         ({"material": WHOLE.material.replace(density=np.float32(-1))}, "material_density"),
-        ({"timestep": 0.0}, "timestep"),
         ({"timestep": np.nan}, "timestep"),
         ({"metadata": {"a": object()}}, "JSON"),
         ({"metadata": {"a": np.nan}}, "JSON"),
@@ -124,39 +112,6 @@ def test_write_trajectory_names_what_is_wrong_and_writes_nothing(tmp_path, chang
     with pytest.raises(AssetError, match=message):
         write_trajectory(tmp_path / "run.npz", dataclasses.replace(WHOLE, **change))
     assert not os.listdir(tmp_path)
-
-
-def test_read_trajectory_names_a_missing_or_foreign_file(tmp_path):
-    with pytest.raises(AssetError, match="doesn't exist"):
-        read_trajectory(tmp_path / "none.npz")
-    with pytest.raises(AssetError, match="is a folder"):
-        read_trajectory(tmp_path)
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(AssetError, match="not an npz archive"):
-        read_trajectory(tmp_path / "text.npz")
-    np.savez(tmp_path / "other.npz", positions=np.zeros(3))
-    with pytest.raises(AssetError, match="is no trajectory"):
-        read_trajectory(tmp_path / "other.npz")
-
-
-@pytest.mark.parametrize("name", ["body_rest_positions", "body_parents", "material_thickness"])
-def test_read_trajectory_refuses_half_a_part(tmp_path, name):
-    write_trajectory(tmp_path / "run.npz", WHOLE)
-    with np.load(tmp_path / "run.npz") as archive:
-        arrays = {key: value for key, value in archive.items() if key != name}
-    np.savez(tmp_path / "run.npz", **arrays)
-    with pytest.raises(AssetError, match=f"lacks {name}"):
-        read_trajectory(tmp_path / "run.npz")
-
-
-def test_read_trajectory_runs_no_pickle(tmp_path):
-    write_trajectory(tmp_path / "run.npz", WHOLE)
-    with np.load(tmp_path / "run.npz") as archive:
-        arrays = dict(archive)
-    arrays["metadata"] = np.array([object()], dtype=object)
-    np.savez(tmp_path / "run.npz", **arrays)
-    with pytest.raises(AssetError, match="can't be read as an npz archive"):
-        read_trajectory(tmp_path / "run.npz")
 
 
 @pytest.mark.filterwarnings("ignore")  # a damaged header may look like one from Python 2
