@@ -66,16 +66,7 @@ class AnimatedMesh:
 
 
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Raise unless meshes can be written as one scene.
-
-    Args:
-        meshes: The meshes.
-        timestep: Time between frames [s].
-
-    Raises:
-        MeshError: There is no mesh, or one is empty, not finite, or its parts disagree.
-        MotionError: The timestep is not positive, frames differ in number, or joints don't move rigidly.
-    """
+    """Raise a MeshError or a MotionError unless meshes can be written as one scene with this timestep [s]."""
     if not np.isfinite(timestep) or timestep <= 0:
         raise MotionError(f"timestep is {timestep} s; it must be positive")
     if not meshes:
@@ -286,9 +277,6 @@ def write_frames(
         mesh: The mesh in motion.
         suffix: Of the files.
         content: From the positions of a frame, [vertices, 3] in float32, to the bytes of its file.
-
-    Raises:
-        AssetError: The folder holds files already, or it can't be written.
     """
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):

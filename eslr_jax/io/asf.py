@@ -35,18 +35,10 @@ class _Bone:
 
 @reader("motion", [".amc"])
 def read_amc(path: Path, _clip: str = "") -> SkeletonMotion:
-    """Read a motion, and the skeleton that lies beside it.
+    """Read a motion at 120 frames per second, in the files' own unit and axes, and the skeleton beside it.
 
-    Args:
-        path: Path of the .amc file. Its skeleton is the .asf of the same name, or of the name before the first
-            "_" (CMU's `01.asf` for `01_02.amc`), or the only one in the folder.
-
-    Returns:
-        The motion at 120 frames per second, in the files' own unit and axes.
-
-    Raises:
-        AssetError: A file is missing, or is not in this format.
-        MotionError: The motion has no usable frames.
+    The skeleton is the .asf of the same name, or of the name before the first "_" (CMU's `01.asf` for
+    `01_02.amc`), or the only one in the folder.
     """
     with parsing(_skeleton_of(path), "skeleton") as skeleton:
         bones, in_degrees = _read_bones(_lines(skeleton))

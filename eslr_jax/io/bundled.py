@@ -40,11 +40,7 @@ class Clip(NamedTuple):
 
 @reader("body", [".npz"])
 def read_body(path: Path, _meshes: str = "") -> Body:
-    """Read a rigged body.
-
-    Raises:
-        AssetError: The file is missing or damaged, lacks an array, a vertex follows no joint, or Y is not up.
-    """
+    """Read a rigged body of the bundled format, Y up."""
     arrays = read_arrays(path, content="body")
     what, remedy = f"body file {path}", "give a body npz as documented"
     missing = [key for key in _BODY if key not in arrays]
@@ -79,13 +75,7 @@ def read_body(path: Path, _meshes: str = "") -> Body:
 
 
 def read_motion_archive(path: str | Path) -> dict[str, Clip]:
-    """Read every clip of an archive with `joint_names`, `<clip>/rotations`, `<clip>/translations`, `<clip>/fps`.
-
-    Args:
-        path: Path of the archive.
-
-    Returns:
-        Clips by name.
+    """Read clips by name: `joint_names`, `<clip>/rotations`, `<clip>/translations`, `<clip>/fps`.
 
     Raises:
         AssetError: The file is missing or damaged.

@@ -32,20 +32,10 @@ class _Joint:
 
 @reader("motion", [".bvh"])
 def read_bvh(path: Path, _clip: str = "") -> SkeletonMotion:
-    """Read a BVH file.
+    """Read a BVH file at its own frame rate, in its own unit and axes; errors name the line.
 
-    A header whose number of frames is off by one is a warning; the frames that are there are read.
-
-    Args:
-        path: Path of the file.
-
-    Returns:
-        The motion at its own frame rate, in its own unit and axes; a frame time of 0.0333333 s is a
-            thirtieth of a second.
-
-    Raises:
-        AssetError: The file is missing, or is not BVH; the message names the line.
-        MotionError: The motion has no usable frames.
+    A frame time of 0.0333333 s is a thirtieth of a second. A header whose number of frames is off by one is a
+    warning; the frames that are there are read.
     """
     words = _Words(path)
     joints = _read_hierarchy(words)

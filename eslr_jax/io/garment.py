@@ -71,12 +71,7 @@ class GarmentFile:
 def split_outfit(
     faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]
 ) -> list[tuple[str, slice, Bool[np.ndarray, " faces"]]]:
-    """Return the garments of an outfit: the name, the vertices and which faces.
-
-    Args:
-        faces: Triangles of all of them.
-        outfit: `GarmentFile.outfit`.
-    """
+    """Return of the garments of a `GarmentFile.outfit` the name, the vertices and which of all faces."""
     garments, start = [], 0
     for name, count in outfit.items():
         is_own = (faces[:, 0] >= start) & (faces[:, 0] < start + count)
@@ -128,14 +123,7 @@ def read_garment_source(text: str | Path) -> GarmentSource:
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:
-    """Read a garment file.
-
-    Args:
-        path: Path of an npz archive with rest_positions, faces, skin_weights and skin_indices. Everything else
-            that `write_garment_npz` writes is optional; without `pinned` no vertex is pinned.
-
-    Returns:
-        The garment.
+    """Read a garment file; all but rest_positions, faces, skin_weights and skin_indices is optional.
 
     Raises:
         AssetError: The file is missing or damaged, or its arrays don't fit each other.
@@ -163,11 +151,7 @@ def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> Garm
 
 
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
-    """Write a garment file, atomically.
-
-    Raises:
-        AssetError: The file can't be written.
-    """
+    """Write a garment file, atomically."""
     write_arrays(path, garment_arrays(garment), is_compressed=True)
 
 

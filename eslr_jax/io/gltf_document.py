@@ -333,12 +333,9 @@ def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at:
     Args:
         path: "rotation" (quaternions x, y, z, w), "translation", "scale" or "weights".
         kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
-        times: Times of the keys [s], ascending, shape [keys].
+        times: Times of the keys [s], ascending.
         values: Values of the keys, shape [keys, components], or [3 keys, components] for cubic splines.
-        at: Times of the samples [s], shape [samples].
-
-    Returns:
-        Values, shape [samples, components].
+        at: Times of the samples [s]; the result has shape [samples, components].
 
     Source: glTF 2.0, appendix C.
     """

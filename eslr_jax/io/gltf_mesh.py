@@ -113,13 +113,9 @@ def _check_one_clip(document: GltfDocument, nodes: list[int]) -> None:
 def _moved_by_shapes(
     document: GltfDocument, mesh: int, weights: np.ndarray, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [m] and faces of a mesh; vertices that were split at seams become one again.
+    """Return positions [frames, vertices, 3] and faces of a mesh; vertices that were split at seams become one.
 
-    Args:
-        document: Its file.
-        mesh: Its number.
-        weights: Of its shapes, shape [frames, shapes].
-        world: From its own space to the world's, shape [frames, 4, 4].
+    `weights` are of its shapes, [frames, shapes]; `world` leads from its own space, [frames, 4, 4].
     """
     parts, corners, count = [], [], 0
     for primitive in document.item("meshes", mesh).get("primitives", []):

@@ -49,19 +49,14 @@ def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
 
 @reader("body", GLTF_SUFFIXES)
 def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
-    """Read a skinned character.
+    """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
+
+    It has the shape that the file's weights of morph targets give it.
 
     Args:
         path: Path of a .gltf, .glb or .vrm file.
         meshes: Names of the meshes, or of their nodes, that make up the body, as in "Skin,Hat"; "" is all that
             are skinned.
-
-    Returns:
-        The character in its bind pose, in world axes, with the vertices of the file and the shape that the file's
-        weights of morph targets give it.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it lacks a skinned mesh that is named.
     """
     document = GltfDocument(path)
     joints = _read_joints(document)
@@ -97,19 +92,7 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
 
 @reader("motion", GLTF_SUFFIXES)
 def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
-    """Read an animation of a skinned character's joints.
-
-    Args:
-        path: Path of a .gltf, .glb or .vrm file.
-        clip: Name of the animation; not needed if there is only one.
-
-    Returns:
-        The motion, sampled at the rate of its densest keys.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it has no skin.
-        MotionError: The file has no such animation, or the animation moves nothing.
-    """
+    """Read an animation of a character's joints, at the rate of its densest keys; "" names the only one."""
     document = GltfDocument(path)
     names = _clip_names(document)
     if not names:

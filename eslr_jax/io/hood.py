@@ -65,13 +65,7 @@ def read_hood_garment(path: Path, name: str = "") -> GarmentSource:
 
 
 def read_hood(path: str | Path) -> tuple[dict[str, Any], ModelConfig]:
-    """Read a checkpoint of HOOD.
-
-    Args:
-        path: A file that HOOD's training wrote, or the weights of its runner or of its model alone.
-
-    Returns:
-        Weights and architecture; compare them with `models.registry.check_params` before use.
+    """Read weights and architecture of a checkpoint that HOOD's training wrote, or of its runner or model alone.
 
     Raises:
         AssetError: The file is missing or damaged, or it is no file of PyTorch.
@@ -194,12 +188,7 @@ def _normalizer(tensors: Tensors, name: str) -> Normalizer:
 
 
 def _tensor(tensors: Tensors, name: str) -> np.ndarray:
-    """Return a tensor in float32.
-
-    Raises:
-        KeyError: There is none of this name.
-        CheckpointError: It is no array of finite numbers.
-    """
+    """Return a tensor in float32; raise a KeyError if there is none, a CheckpointError if it is not finite."""
     value = tensors[name]
     if not isinstance(value, np.ndarray) or not value.ndim or not np.isfinite(value).all():
         raise CheckpointError(

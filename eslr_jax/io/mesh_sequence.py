@@ -32,12 +32,7 @@ class MeshSequence:
     mesh: str = ""  # its name in a file that holds several
 
     def __post_init__(self) -> None:
-        """Check the arrays.
-
-        Raises:
-            MeshError: The arrays don't form a moving mesh, or a value is not finite.
-            MotionError: The frame rate is impossible.
-        """
+        """Raise a MeshError unless this is a finite moving mesh, a MotionError at an impossible frame rate."""
         arrays = {"positions": self.positions, "faces": self.faces}
         layout = {"positions": ("f", "frames vertices 3"), "faces": ("iu", "faces 3", "vertices")}
         check_layout(arrays, layout, what=self.name, remedy="export it again", error=MeshError)
@@ -51,7 +46,7 @@ class MeshSequence:
 
 
 def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSequence:
-    """Read a mesh in motion.
+    """Read a mesh in motion, in metres with Y up.
 
     Args:
         path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
@@ -59,9 +54,6 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
             or verts, and optionally `fps` or `timestep`; or of a .glb or .gltf with a mesh that shapes (morph
             targets) move, `FILE#MESH` where there are several.
         fps: Frame rate [1/s]; by default the file's own, or 30.
-
-    Returns:
-        The mesh in motion; positions as in the files, which must be in metres with Y up.
 
     Raises:
         AssetError: The path or one of its files can't be read, or several meshes move.

@@ -60,9 +60,8 @@ class _Reconstructor(_Stub):
 def make_stub(convert: Callable[[Any, _Plain], Any]) -> type:
     """Return a class of stubs for one global.
 
-    Args:
-        convert: Makes plain data of a stub, with its `arguments` and `state`. Its second argument does the same
-            for what the stub holds.
+    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does the same for
+    what the stub holds.
     """
     return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
 
@@ -200,11 +199,6 @@ class _Unpickler(pickle.Unpickler):
 def read_pickle(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> Any:
     """Read a pickle of plain containers, numbers and arrays, also one that Python 2 wrote.
 
-    Args:
-        path: Path of the file.
-        content: What the file should hold, for messages, e.g. "garment".
-        max_bytes: Size of the largest file accepted [bytes].
-
     Returns:
         dict, list, tuple, str, bytes, numbers, None, arrays, and sparse arrays (`csc_array`, `csr_array`). Check
         the shape of a sparse array before you make it dense: the file may claim any. A chumpy object becomes an
@@ -223,15 +217,12 @@ def unpickle(
     stubs: Mapping[str, type] | None = None,
     find_persistent: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """Return the content of a pickle as plain data; see `read_pickle`.
+    """Return the content of a pickle as plain data, see `read_pickle`; for `parsing`: it raises anything.
 
     Args:
         data: The pickle.
         stubs: Further globals that it may name, as `module.name`, each with its class of `make_stub`.
         find_persistent: Returns the stub for a persistent id, where the pickle may refer to data outside of it.
-
-    Raises:
-        Exception: The pickle is damaged or holds anything but data; of any class, so call it within `parsing`.
     """
     puts = (
         argument - count
@@ -246,9 +237,7 @@ def unpickle(
 def _plain(value: Any, done: dict[int, Any]) -> Any:
     """Return plain data for what the unpickler built; shared objects stay shared.
 
-    Args:
-        value: Anything that the unpickler built.
-        done: Results so far by the identity of their source; None while a source is being converted.
+    `done` holds results by the identity of their source; None while a source is being converted.
     """
     if type(value) in _PLAIN:
         return value

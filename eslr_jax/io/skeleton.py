@@ -90,11 +90,11 @@ class RiggedMesh:
 
 
 def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[list[int], list[int]]:
-    """Put parents before children, and every joint under one root.
+    """Put parents before children, and every joint under one root: further ones become children of the first.
 
     Args:
         names: Names of the joints, for messages.
-        parents: Parent of each joint; -1 is a root. Further roots become children of the first one.
+        parents: Parent of each joint; -1 is a root.
         what: What messages call the file.
 
     Returns:
@@ -200,10 +200,6 @@ def pose_offsets(
         local: Rotation of each joint relative to its parent, shape [frames, joints, 3, 3].
         offsets: Position of each joint relative to its parent, shape [frames, joints, 3].
         fps: Frame rate [1/s].
-
-    Raises:
-        AssetError: The joints form no tree.
-        MotionError: The motion is not finite, or its frame rate impossible.
     """
     names = unique_names(joint_names)
     order, new_parents = order_joints(names, parents, what=f"motion {name}")

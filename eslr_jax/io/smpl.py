@@ -87,18 +87,12 @@ def _is_smpl_model(path: Path) -> bool:
 
 @reader("body", [".npz", ".pkl"], accepts=_is_smpl_model)
 def read_smpl_body(path: Path, _meshes: str = "") -> RiggedMesh:
-    """Read a body model in the layout of SMPL.
+    """Read the mean body of a model in the layout of SMPL, with its shape and pose blend shapes.
 
     Args:
         path: Path of an .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and optionally
             shapedirs, posedirs and joint_names. A model with other than 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)
             joints needs joint_names.
-
-    Returns:
-        The mean body at rest, with its shape and pose blend shapes.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it lacks a part of a body model.
     """
     if path.suffix.lower() == ".pkl":
         values = read_pickle(path, content="body")
@@ -171,18 +165,7 @@ def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str
 
 @reader("motion", [".npz"])
 def read_amass(path: Path, _clip: str = "") -> SkeletonMotion:
-    """Read a motion of AMASS.
-
-    Args:
-        path: Path of an .npz with `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`), Z up.
-
-    Returns:
-        The motion, Y up.
-
-    Raises:
-        AssetError: The file is missing or damaged.
-        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
-    """
+    """Read a motion of AMASS, Z up: `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`)."""
     keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
     values = read_arrays(path, content="motion", names=keys)
     rates = [values[key] for key in keys[2:] if key in values]
@@ -197,17 +180,9 @@ def read_amass(path: Path, _clip: str = "") -> SkeletonMotion:
 
 @reader("motion", [".pkl"])
 def read_smpl_pickle(path: Path, _clip: str = "") -> SkeletonMotion:
-    """Read a motion of HOOD or of the VTO dataset.
+    """Read a motion of HOOD or VTO at 30 frames per second.
 
-    Args:
-        path: Path of a .pkl with `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
-
-    Returns:
-        The motion at 30 frames per second.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it holds anything but plain data.
-        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
+    A pickle of `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
     """
     values = read_pickle(path, content="motion")
     values = values if isinstance(values, dict) else {}

@@ -26,19 +26,13 @@ TOLERANCE = 1e-4  # [m] by which joints may miss a vertex
 
 @writer("scene", SUFFIXES)
 def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Write meshes as a USD stage, one whole time code per frame, atomically.
+    """Write meshes as a USD stage, one whole time code per frame, atomically; `.usda` is text.
 
-    Vertices keep their order; texture coordinates are the face-varying primvar `st`. Metres, Y up.
-
-    Args:
-        path: Path of the file; `.usda` is text, `.usd` and `.usdc` are binary.
-        meshes: Meshes with the same number of frames.
-        timestep: Time between frames [s]. A rate that rounding keeps from a whole number is that number:
-            1/30 s in float32 is exactly 30 frames per second.
+    Vertices keep their order; texture coordinates are the face-varying primvar `st`. Metres, Y up. A rate that
+    rounding keeps from a whole number is that number: 1/30 s in float32 is exactly 30 frames per second.
 
     Raises:
         MissingExtraError: The extra is not installed.
-        AssetError: The suffix is unknown, or the file can't be written.
     """
     require("pxr.Usd", extra="usd", purpose="USD")
     from pxr import Usd, UsdGeom  # pyright: ignore[reportMissingImports]

@@ -45,13 +45,7 @@ def write_weights(
 
 
 def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[str, Any]]:
-    """Read a network that `write_weights` wrote.
-
-    Args:
-        path: The npz file; the JSON file lies beside it.
-
-    Returns:
-        Weights, architecture, and the training record.
+    """Read a network that `write_weights` wrote: weights, architecture, and the training record.
 
     Raises:
         AssetError: The archive is missing or damaged.
