@@ -35,29 +35,14 @@ def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Seq
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body is inside out, or in the bundled format not closed.
     """
-    body = _read_body(str(name), units)
-    return shape_body(body, betas) if len(betas) else body
-
-
-def _read_body(text: str, units: str | None) -> Body:
-    """Return a body by name or file, in its average shape."""
+    text = str(name)
     file, meshes = split_name(text)
-    if is_path(text):
-        found = find_reader("body", file)(file, meshes)
-        name = Path(file).name
-    else:
-        found, name = read_body(find_asset("body", text)), text
+    found = find_reader("body", file)(file, meshes) if is_path(text) else read_body(find_asset("body", text))
     if not isinstance(found, Body):
-        return make_body(found, units=units)
-    if units is not None:
+        found = make_body(found, units=units)
+    elif units is not None:
         raise ConfigError(f"body {text} is in metres; leave out its unit")
-    return _closed(found, name)
-
-
-def _closed(body: Body, name: str) -> Body:
-    """Return the body if it has an inside; raise a MeshError if not."""
-    positions, faces, is_obstacle = (
-        np.asarray(leaf) for leaf in (body.rest_positions, body.faces, body.is_obstacle)
-    )
-    validate_body(positions, faces, is_obstacle, name=name)
-    return body
+    else:
+        rest, faces, is_obstacle = map(np.asarray, (found.rest_positions, found.faces, found.is_obstacle))
+        validate_body(rest, faces, is_obstacle, name=Path(file).name)
+    return shape_body(found, betas) if len(betas) else found
