@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -12,10 +11,9 @@ import numpy as np
 from eslr_jax.errors import AssetError
 from eslr_jax.io.animated import AnimatedMesh
 from eslr_jax.io.garment import GarmentFile, first_rows, split_outfit
-from eslr_jax.io.npz import write_arrays
 from eslr_jax.io.palette import SKIN_COLOR, garment_color
 from eslr_jax.io.parsing import split_name
-from eslr_jax.io.registry import WRITERS, find_writer, names_of, suffixes_of, writer
+from eslr_jax.io.registry import WRITERS, find_writer, names_of, suffixes_of
 from eslr_jax.io.trajectory import TrajectoryFile
 
 Content = Literal["garment", "body", "both"]
@@ -142,18 +140,3 @@ def _garments(cloth: AnimatedMesh, outfit: dict[str, int]) -> list[AnimatedMesh]
         )
         for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, outfit))
     ]
-
-
-@writer("animation", [".npz"])
-def write_npz_sequence(path: Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Write a mesh in motion as an archive that `read_mesh_sequence` reads."""
-    mesh = meshes[0]
-    arrays = {
-        "positions": np.asarray(mesh.positions, np.float32),
-        "faces": np.asarray(mesh.faces, np.int32),
-        "timestep": np.array(timestep, np.float64),
-        "name": np.array(mesh.name),
-    }
-    if mesh.corner_uvs is not None:
-        arrays["corner_uvs"] = np.asarray(mesh.corner_uvs, np.float32)
-    write_arrays(path, arrays)

@@ -8,11 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.errors import AssetError
-from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.registry import find_reader, reader
-
-POSITION_KEYS = ("rest_positions", "positions", "vertices")  # accepted in an archive, first match
+from eslr_jax.io.registry import find_reader
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,19 +51,6 @@ def read_mesh_file(path: str | Path, *, like: MeshFile | None = None) -> MeshFil
     return dataclasses.replace(
         mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
     )
-
-
-@reader("mesh", [".npz"])
-def read_npz_mesh(path: Path, _like: MeshFile | None = None) -> MeshFile:
-    """Read `faces` and one of `POSITION_KEYS` from a NumPy archive."""
-    arrays = read_arrays(path, content="mesh")
-    key = next((key for key in POSITION_KEYS if key in arrays), None)
-    if key is None or "faces" not in arrays:
-        raise AssetError(
-            f"mesh file {path} has the arrays {', '.join(sorted(arrays)) or 'none'}; "
-            f"it needs faces and {' or '.join(POSITION_KEYS)}"
-        )
-    return MeshFile(arrays[key], arrays["faces"])
 
 
 def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.io.bundled import read_number
-from eslr_jax.io.mesh import POSITION_KEYS, read_mesh_file
+from eslr_jax.io.mesh import read_mesh_file
 from eslr_jax.io.npz import check_layout, read_arrays
 from eslr_jax.io.parsing import split_name
-from eslr_jax.io.registry import find_reader, reader, suffixes_of
-from eslr_jax.io.skeleton import MAX_FRAMES, whole_rate
+from eslr_jax.io.registry import find_reader, suffixes_of
+from eslr_jax.io.skeleton import MAX_FRAMES
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
 DEFAULT_FPS = 30.0  # [1/s], where the files tell no frame rate
-_POSITION_KEYS = (*POSITION_KEYS, "verts")  # the last is HOOD's
+# Names of positions in an archive, first match; the last is HOOD's.
+POSITION_KEYS = ("rest_positions", "positions", "vertices", "verts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,31 +81,11 @@ def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[M
     return find_reader("mesh sequence", file)(file, mesh, fps)
 
 
-@reader("mesh sequence", [".npz"])
-def read_npz_sequence(path: Path, _mesh: str = "", fps: float | None = None) -> list[MeshSequence]:
-    """Read an archive with `faces`, positions, and optionally `fps` or `timestep`."""
-    keys = (*_POSITION_KEYS, "faces", "fps", "timestep")
-    arrays = read_arrays(path, content="mesh sequence", names=keys)
-    key = next((key for key in _POSITION_KEYS if key in arrays), None)
-    if key is None or "faces" not in arrays:
-        raise AssetError(f"mesh sequence {path} lacks faces or {' or '.join(_POSITION_KEYS)}; add them")
-    positions = arrays[key]
-    if positions.dtype.kind not in "fiu":
-        raise MeshError(f"{path}: {key} of type {positions.dtype}; expected numbers")
-    rate = DEFAULT_FPS if fps is None else fps
-    if fps is None and "fps" in arrays:
-        rate = read_number(arrays["fps"], f"{path}: fps")
-    elif fps is None and "timestep" in arrays:
-        step = read_number(arrays["timestep"], f"{path}: timestep")
-        rate = whole_rate(1.0 / step) if step > 0 else 0.0
-    return [MeshSequence(path.name, positions.astype(np.float64), arrays["faces"], rate)]
-
-
 def is_mesh_sequence(path: str | Path) -> bool:
     """Tell whether a path is a folder or a file of positions over time, and not a rigged body."""
     suffix = Path(path).suffix.lower()
     if suffix == ".npz":
-        arrays = read_arrays(path, content="body", names=_POSITION_KEYS)
+        arrays = read_arrays(path, content="body", names=POSITION_KEYS)
         return any(array.ndim == 3 for array in arrays.values())
     moves, is_rig = (suffix in suffixes_of(kind) for kind in ("mesh sequence", "body"))
     return Path(path).is_dir() or (moves and not is_rig)

@@ -28,7 +28,8 @@ from eslr_jax.io.animated import AnimatedMesh, check_meshes
 from eslr_jax.io.parsing import parsing
 
 WRITERS = ("scene", "animation", "point cache", "frames")
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _Writer = Callable[[Path, Sequence[AnimatedMesh], float], None]
 
 

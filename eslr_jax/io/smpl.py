@@ -229,7 +229,8 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
 
 def _standing_skeleton(joints: int) -> Skeleton:
     """Return SMPL's joints of a person in a T-pose."""
-    names, parents, rest = JOINT_NAMES[joints], list(_BODY_PARENTS), []
+    names, rest = JOINT_NAMES[joints], []
+    parents: list[int] = list(_BODY_PARENTS)
     for place, name in enumerate(names[len(_BODY) :], len(_BODY)):
         end = "head" if name in _FACE else f"{name.split('_')[0]}_wrist"
         parents.append(place - 1 if name.endswith(("2", "3")) else _BODY.index(end))

@@ -54,13 +54,11 @@ def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[st
     path = Path(path)
     try:
         record = json.loads(path.with_suffix(".json").read_text())
-        version, values, training = record["format"], record["model"], record["training"]
+        version, values, training = int(record["format"]), dict(record["model"]), record["training"]
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} has no {path.stem}.json beside it; copy both files") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path.with_suffix('.json')} is damaged; export the model again") from error
-    if not isinstance(values, dict) or not isinstance(version, int):
-        raise CheckpointError(f"{path.with_suffix('.json')} is damaged; export the model again")
     if version > FORMAT:
         raise CheckpointError(
             f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax"
