@@ -22,7 +22,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
 
-import eslr_jax.io
 from eslr_jax.errors import AssetError
 from eslr_jax.io.animated import AnimatedMesh, check_meshes
 from eslr_jax.io.parsing import parsing
@@ -122,5 +121,5 @@ def _all(*kinds: str) -> list[_Format]:
 @functools.cache
 def _import_formats() -> None:
     """Import all files of this folder, which registers their formats."""
-    for module in pkgutil.iter_modules(eslr_jax.io.__path__):
-        importlib.import_module(f"eslr_jax.io.{module.name}")
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        importlib.import_module(f"{__package__}.{module.name}")
