@@ -32,6 +32,7 @@ from newton_cloth import prepare_cloth, springs, strip_stiffness
 
 from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.evaluation.foreign import foreign_trajectory
+from eslr_jax.io.animated import AnimatedMesh
 from eslr_jax.io.point_cache import write_pc2
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
@@ -94,11 +95,12 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
         below = np.stack([start, cloth.rest])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_pc2(folder / "cloth.pc2", below)
+        timestep = float(scene.timestep)
+        write_pc2(folder / "cloth.pc2", [AnimatedMesh("cloth", below, cloth.faces)], timestep)
         if scene.body is not None:
-            body = np.asarray(scene.body.positions)
-            write_pc2(folder / "body.pc2", body)
-            arrays |= {"body_start": body[0], "body_faces": np.asarray(scene.body.surface.faces)}
+            body, faces = np.asarray(scene.body.positions), np.asarray(scene.body.surface.faces)
+            write_pc2(folder / "body.pc2", [AnimatedMesh("body", body, faces)], timestep)
+            arrays |= {"body_start": body[0], "body_faces": faces}
         np.savez(folder / "scene.npz", **arrays)  # type: ignore[arg-type]
         command = [str(blender_python()), str(Path(__file__).with_name("blender_worker.py")), name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -38,7 +38,7 @@ from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.garment import read_garment_source
-from eslr_jax.io.mesh_sequence import obj_text
+from eslr_jax.io.obj import obj_text
 from eslr_jax.io.palette import outfit_colors
 from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.physics.materials import WOVEN, fabric_names

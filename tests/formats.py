@@ -11,7 +11,7 @@ from eslr_jax.assets import load_motion
 from eslr_jax.assets.catalog import find_asset
 from eslr_jax.body.rig import body_skeleton, skeleton_motion
 from eslr_jax.io.garment import read_garment_npz
-from eslr_jax.io.mesh_sequence import obj_text
+from eslr_jax.io.obj import obj_text
 
 SMPL_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",

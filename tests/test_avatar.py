@@ -10,7 +10,7 @@ from formats import write_smpl, write_walker
 from other_bodies import smpl_female
 
 from eslr_jax.assets import load_motion
-from eslr_jax.io.mesh_sequence import obj_text
+from eslr_jax.io.obj import obj_text
 from eslr_jax.io.trajectory import read_trajectory
 
 

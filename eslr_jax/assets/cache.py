@@ -36,11 +36,7 @@ _CODE = (
     "body/motion.py",
     "body/retarget.py",
     "body/rig.py",
-    "io/mesh.py",
-    "io/gltf_document.py",
-    "io/garment.py",
-    "io/parsing.py",
-    "io/skeleton.py",
+    "io",
     "numerics.py",
     "types.py",
 )

@@ -13,20 +13,18 @@ import numpy as np
 
 from eslr_jax.assets.bodies import load_body
 from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path, unknown_suffix
+from eslr_jax.assets.names import is_path
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_motion, skeleton_motion
 from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.asf import read_amc
-from eslr_jax.io.bvh import read_bvh
-from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_motion
-from eslr_jax.io.motion import read_motion_archive
+from eslr_jax.io.bundled import read_motion_archive
+from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names
 from eslr_jax.io.npz import read_arrays
 from eslr_jax.io.parsing import split_name
+from eslr_jax.io.registry import find_reader
 from eslr_jax.io.skeleton import SkeletonMotion
-from eslr_jax.io.smpl import read_amass, read_smpl_pickle
 from eslr_jax.types import Body
 
 DEFAULT_MOTION = "cmu_016_32"
@@ -118,7 +116,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
     """Read a motion with the skeleton of its file.
 
     Args:
-        file: .bvh, .amc with its .asf, .npz of AMASS, .pkl of HOOD or VTO, .gltf, .glb or .vrm.
+        file: Path of a file of one of `registry.suffixes_of("motion")`; an .amc has its .asf beside it.
         clip: Which of several animations.
 
     Raises:
@@ -126,13 +124,7 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
         MotionError: The file holds no usable motion.
         MissingExtraError: The file needs an extra that is not installed.
     """
-    suffix = Path(file).suffix.lower()
-    if suffix in GLTF_SUFFIXES:
-        return read_gltf_motion(file, clip)
-    readers = {".bvh": read_bvh, ".amc": read_amc, ".npz": read_amass, ".pkl": read_smpl_pickle}
-    if suffix not in readers:
-        raise unknown_suffix("motion", file, (*readers, *GLTF_SUFFIXES))
-    return readers[suffix](file)
+    return find_reader("motion", file)(file, clip)
 
 
 def _is_archived(text: str) -> bool:

@@ -17,7 +17,7 @@ from eslr_jax.errors import MotionError
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import unique_edges
 from eslr_jax.geometry.validate import check_outward
-from eslr_jax.io.body import UPRIGHT
+from eslr_jax.io.bundled import UPRIGHT
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.skeleton import nearest_rotations
 from eslr_jax.types import Body, BodyMotion

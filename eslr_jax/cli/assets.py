@@ -97,7 +97,7 @@ def _export_body(path: Path, name: str) -> None:
 
     from eslr_jax.cli.actor import load_wearer
     from eslr_jax.io.atomic import atomic_write
-    from eslr_jax.io.mesh_sequence import obj_text
+    from eslr_jax.io.obj import obj_text
 
     if path.suffix.lower() != ".obj":
         raise AssetError(

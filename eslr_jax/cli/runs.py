@@ -167,13 +167,20 @@ def _counted(items: Iterator[Any], total: int, advance: Callable[[int, int], Any
         advance(done, total)
 
 
+def _formats() -> str:
+    """Return the names of all formats that are written; only `--help` asks, since it imports them all."""
+    from eslr_jax.io.registry import WRITERS, names_of
+
+    return names_of(*WRITERS)
+
+
 @app.command
 def export(
     run: tyro.conf.Positional[Path],
     out: Path,
     format_: Annotated[
-        Literal["glb", "usd", "usda", "usdc", "obj", "ply", "pc2", "mdd", "npz"] | None,
-        tyro.conf.arg(name="format"),
+        str | None,
+        tyro.conf.arg(name="format", metavar="FORMAT", help_behavior_hint=lambda _: f"(one of {_formats()})"),
     ] = None,
     content: Literal["garment", "body", "both"] | None = None,
 ) -> None:
@@ -184,7 +191,7 @@ def export(
     Args:
         run: Folder that `eslr simulate` wrote, or the trajectory in it.
         out: File to write; with --format obj or ply a new folder, one file a frame.
-        format_: glb, usd, usda, usdc, obj, ply, pc2, mdd or npz; by default what the suffix says.
+        format_: Format of the file; by default what the suffix says.
         content: garment, body, or both; by default both to glb and usd, and the garment to all others.
     """
     from eslr_jax.io.export import export_trajectory

@@ -2,7 +2,8 @@
 
 A shortcut is a straight segment between two vertices that crosses up to three hinges after their faces are
 unfolded into a plane. It is a path on the surface, so distances are upper bounds and form a metric; those of
-the heat method do neither. The mean error is 0.4 % on garments and 1.1 % on a tube of right triangles. With
+the heat method do neither. An exact solver (pygeodesic) takes a hundred times as long a source, and joins no
+components. The mean error is 0.4 % on garments and 1.1 % on a tube of right triangles. With
 shortcuts over one hinge it is 1.3 % and 3.9 %, with edges alone 6 % and 16 %.
 """
 

@@ -1,4 +1,7 @@
-"""Finer meshes of a garment by subdivision, for sizes that are not bundled (host)."""
+"""Finer meshes of a garment by subdivision, for sizes that are not bundled (host).
+
+`trimesh.remesh` has Loop's scheme alone, and no matrices: what belongs to vertices could not follow.
+"""
 
 from __future__ import annotations
 

@@ -1,15 +1,54 @@
-"""Meshes that move, as scene formats want them: checked, one texture coordinate a vertex, few shapes."""
+"""Meshes that move, and the joints that move them, as the formats of other programs want them.
+
+Checked; one texture coordinate a vertex; few shapes; local motions of joints, and what these leave of a motion.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+import scipy.sparse
+from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import MeshError, MotionError
+from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.io.atomic import atomic_write, ensure_output_dir
+from eslr_jax.io.npz import check_layout
 from eslr_jax.io.palette import GARMENT_COLORS, Color
-from eslr_jax.io.skin import Skin, check_skin
+
+_RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
+_FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
+# A skin weight that moves a vertex by less than float32 resolves over a body's size.
+_NEGLIGIBLE_WEIGHT = 1e-6
+_LAYOUT = {  # of an AnimatedMesh and its Skin
+    "positions": ("f", "frames vertices 3"),
+    "faces": ("iu", "faces 3", "vertices"),
+    "corner_uvs": ("f", "faces 3 2"),
+    "velocities": ("f", "frames vertices 3"),
+    "rest_positions": ("f", "vertices 3"),
+    "joint_transforms": ("f", "frames joints 3 4"),
+    "joint_rest_positions": ("f", "joints 3"),
+    "parents": ("iu", "joints"),
+    "joint_names": ("U", "joints"),
+    "skin_weights": ("f", "vertices influences"),
+    "skin_indices": ("iu", "vertices influences", "joints"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Skin:
+    """Joints that move, and how a mesh is bound to them: posed = sum_j weight_j (R_j rest + t_j)."""
+
+    skin_weights: np.ndarray  # [vertices, influences], rows sum to one
+    skin_indices: np.ndarray  # [vertices, influences]
+    joint_transforms: np.ndarray  # [frames, joints, 3, 4], rest point -> posed point [m]
+    joint_rest_positions: np.ndarray  # [joints, 3] [m]
+    parents: Sequence[int]  # -1 is a root
+    joint_names: Sequence[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,16 +66,7 @@ class AnimatedMesh:
 
 
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Raise unless meshes can be written as one scene.
-
-    Args:
-        meshes: The meshes.
-        timestep: Time between frames [s].
-
-    Raises:
-        MeshError: There is no mesh, or one is empty, not finite, or its parts disagree.
-        MotionError: The timestep is not positive, frames differ in number, or joints don't move rigidly.
-    """
+    """Raise a MeshError or a MotionError unless meshes can be written as one scene with this timestep [s]."""
     if not np.isfinite(timestep) or timestep <= 0:
         raise MotionError(f"timestep is {timestep} s; it must be positive")
     if not meshes:
@@ -44,36 +74,42 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     for mesh in meshes:
         _check_mesh(mesh)
     frames = {mesh.name: len(mesh.positions) for mesh in meshes}
-    frames |= {f"{mesh.name} joints": len(mesh.skin.joint_transforms) for mesh in meshes if mesh.skin}
     if len(set(frames.values())) > 1:
         raise MotionError(f"meshes need the same number of frames, these have {frames}")
 
 
 def _check_mesh(mesh: AnimatedMesh) -> None:
-    """Raise MeshError unless the arrays of a mesh are finite and fit each other."""
-    points, faces = np.asarray(mesh.positions), np.asarray(mesh.faces)
-    is_mesh = points.ndim == 3 and points.shape[2] == 3 and faces.ndim == 2 and faces.shape[1] == 3
-    if not is_mesh or 0 in points.shape or not len(faces):
-        raise MeshError(
-            f"mesh {mesh.name} has positions {points.shape} and faces {faces.shape}; it needs "
-            "[frames, vertices, 3] and [faces, 3]"
-        )
-    is_finite = np.isfinite(points).all((1, 2))
-    if not is_finite.all():
-        raise MeshError(f"mesh {mesh.name} is not finite in frame {np.argmin(is_finite)}; simulate it again")
-    if faces.min() < 0 or faces.max() >= points.shape[1]:
-        raise MeshError(f"mesh {mesh.name} has a face that names vertex {faces.max()} of {points.shape[1]}")
-    for label, array, shape in (
-        ("texture coordinates", mesh.corner_uvs, (len(faces), 3, 2)),
-        ("velocities", mesh.velocities, points.shape),
-        ("rest positions", mesh.rest_positions, points.shape[1:]),
-    ):
-        if array is not None and np.shape(array) != shape:
-            raise MeshError(f"mesh {mesh.name} has {label} {np.shape(array)}; expected {shape}")
+    """Raise unless a mesh is finite, its parts and its joints fit each other, and these move rigidly."""
+    what, remedy = f"mesh {mesh.name}", "simulate it again"
+    arrays = {
+        key: np.asarray(value) for key, value in vars(mesh).items() if key in _LAYOUT and value is not None
+    }
     if mesh.skin is not None:
-        if mesh.rest_positions is None:
-            raise MeshError(f"mesh {mesh.name} has a skin and no rest positions; give both")
-        check_skin(mesh.name, mesh.skin, points.shape[1])
+        arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+    check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+    if 0 in arrays["positions"].shape or not len(arrays["faces"]):
+        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+    is_finite = np.isfinite(arrays["positions"]).all((1, 2))
+    if not is_finite.all():
+        raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+    if mesh.skin is None:
+        return
+    if mesh.rest_positions is None:
+        raise MeshError(f"{what} has a skin and no rest positions; give both")
+    weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
+    if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
+        raise MeshError(
+            f"{what} has skin weights that are negative or don't sum to one; normalise them first"
+        )
+    matrices = transforms[..., :3]
+    gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
+    is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
+    is_rigid &= np.isfinite(transforms).all((2, 3))
+    if not is_rigid.all():
+        frame, joint = np.argwhere(~is_rigid)[0]
+        raise MotionError(
+            f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
+        )
 
 
 def split_seams(
@@ -158,3 +194,106 @@ def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray,
         if away <= tolerance or count >= len(table):
             return basis[:, :count], shapes.reshape(count, *np.shape(offsets)[1:])
         count = min(len(table), count + max(1, count // 8))
+
+
+def influences(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+    """Return skin weights that matter, largest first, and their joints, both [vertices, influences]."""
+    weights, indices = np.asarray(skin.skin_weights, np.float64), np.asarray(skin.skin_indices)
+    order = np.argsort(-weights, axis=1, kind="stable")
+    weights, indices = np.take_along_axis(weights, order, 1), np.take_along_axis(indices, order, 1)
+    used = max(1, int((weights > _NEGLIGIBLE_WEIGHT).any(0).sum()))
+    weights, indices = weights[:, :used], indices[:, :used]
+    return weights / weights.sum(1, keepdims=True), np.where(weights > 0, indices, 0)
+
+
+def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+    """Split joint transforms into rotations and translations relative to each joint's parent.
+
+    Returns:
+        Quaternions (x, y, z, w), shape [frames, joints, 4], which never take the long way round from one frame to
+        the next, and translations [m], shape [frames, joints, 3]. At rest no joint is rotated.
+    """
+    transforms = np.asarray(skin.joint_transforms, np.float64)
+    matrices, rest = transforms[..., :3], np.asarray(skin.joint_rest_positions, np.float64)
+    origins = np.einsum("tjab,jb->tja", matrices, rest) + transforms[..., 3]
+    rotations, translations = np.empty((*transforms.shape[:2], 4)), np.empty((*transforms.shape[:2], 3))
+    for joint, parent in enumerate(skin.parents):
+        local, shift = matrices[:, joint], origins[:, joint]
+        if parent >= 0:
+            local = np.einsum("tba,tbc->tac", matrices[:, parent], local)
+            shift = np.einsum("tba,tb->ta", matrices[:, parent], shift - origins[:, parent])
+        quaternions = Rotation.from_matrix(local).as_quat()
+        flips = np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]) < 0
+        signs = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
+        rotations[:, joint], translations[:, joint] = quaternions * signs[:, None], shift
+    return rotations.astype(np.float32), translations.astype(np.float32)
+
+
+def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """Return what to add to the rest vertices so that the joints move them to given positions.
+
+    Args:
+        skin: The skin.
+        rest: Vertex positions at rest [m], shape [vertices, 3].
+        positions: Vertex positions [m], shape [frames, vertices, 3].
+        tolerance: Distance that needs no correction [m].
+
+    Returns:
+        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance.
+    """
+    weights, indices = influences(skin)
+    rows = np.repeat(np.arange(len(rest)), weights.shape[1])
+    blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), (len(rest), len(skin.parents)))
+    transforms = np.asarray(skin.joint_transforms, np.float64).reshape(len(positions), -1, 12)
+
+    def blended(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return each vertex's matrix, and what the joints leave of its way."""
+        matrices = (blend @ transforms[frame]).reshape(-1, 3, 4)
+        moved = np.einsum("vab,vb->va", matrices[..., :3], rest) + matrices[..., 3]
+        return matrices[..., :3], positions[frame] - moved
+
+    frames = range(len(positions))
+    if all(np.linalg.norm(blended(frame)[1], axis=1).max() <= tolerance for frame in frames):
+        return None
+    result = np.zeros(np.shape(positions), np.float32)
+    for frame in frames:
+        matrices, away = blended(frame)
+        # Where opposite rotations cancel, no offset helps: a blend of rotations near zero counts as the identity.
+        is_flat = np.abs(np.linalg.det(matrices)) < _FLAT
+        matrices[is_flat] = np.eye(3)
+        result[frame] = np.linalg.solve(matrices, away[..., None])[..., 0]
+    return result
+
+
+def write_frames(
+    folder: str | Path, mesh: AnimatedMesh, suffix: str, content: Callable[[np.ndarray], bytes]
+) -> None:
+    """Write one file per frame into a new folder, which appears when it is complete.
+
+    Names sort alphabetically in the order of the frames.
+
+    Args:
+        folder: Path of the folder, which must be empty or not exist.
+        mesh: The mesh in motion.
+        suffix: Of the files.
+        content: From the positions of a frame, [vertices, 3] in float32, to the bytes of its file.
+    """
+    target = Path(folder)
+    if target.is_file() or (target.is_dir() and any(target.iterdir())):
+        raise AssetError(f"{target} exists already; name a new folder for the sequence")
+    ensure_output_dir(target.parent)
+    parts = target.with_name(f".{target.name}.part")
+    shutil.rmtree(parts, ignore_errors=True)  # of an export that was killed
+    digits = max(4, len(str(len(mesh.positions) - 1)))
+    try:
+        ensure_output_dir(parts)
+        for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
+            with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
+                temporary.write_bytes(content(positions))
+        if target.is_dir():
+            target.rmdir()
+        os.replace(parts, target)
+    except OSError as error:
+        raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
+    finally:
+        shutil.rmtree(parts, ignore_errors=True)

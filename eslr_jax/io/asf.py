@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError
 from eslr_jax.io.parsing import parsing
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets
 
 FPS = 120.0  # [1/s] of CMU's recordings; the files tell none
@@ -32,31 +33,31 @@ class _Bone:
     parent: str = ""
 
 
-def read_amc(path: str | Path) -> SkeletonMotion:
-    """Read a motion, and the skeleton that lies beside it.
+@reader("motion", [".amc"])
+def read_amc(path: Path, _clip: str = "") -> SkeletonMotion:
+    """Read a motion at 120 frames per second, in the files' own unit and axes, and the skeleton beside it.
 
-    Args:
-        path: Path of the .amc file. Its skeleton is the .asf of the same name, or of the name before the first
-            "_" (CMU's `01.asf` for `01_02.amc`), or the only one in the folder.
-
-    Returns:
-        The motion at 120 frames per second, in the files' own unit and axes.
-
-    Raises:
-        AssetError: A file is missing, or is not in this format.
-        MotionError: The motion has no usable frames.
+    The skeleton is the .asf of the same name, or of the name before the first "_" (CMU's `01.asf` for
+    `01_02.amc`), or the only one in the folder.
     """
-    with parsing(path, "motion") as file:
-        beside = _skeleton_of(file)
-    with parsing(beside, "skeleton") as skeleton:
+    with parsing(_skeleton_of(path), "skeleton") as skeleton:
         bones, in_degrees = _read_bones(_lines(skeleton))
-    with parsing(path, "motion"):
-        values = _read_frames(_lines(file), bones)
-        names = list(bones)
-        parents = [names.index(bone.parent) if bone.parent else -1 for bone in bones.values()]
-        local, shifts = _evaluate(bones, values, parents, in_degrees=in_degrees)
-        rest = np.array([bones[bone.parent].end if bone.parent else np.zeros(3) for bone in bones.values()])
-        return pose_offsets(file.stem, names, parents, rest, local, shifts, FPS)
+    values = _read_frames(_lines(path), bones)
+    names = list(bones)
+    parents = [names.index(bone.parent) if bone.parent else -1 for bone in bones.values()]
+    rest = np.array([bones[bone.parent].end if bone.parent else np.zeros(3) for bone in bones.values()])
+    shifts = np.tile(rest, (len(values["root"]), 1, 1))
+    local = np.tile(np.eye(3), (*shifts.shape[:2], 1, 1))
+    for index, (name, bone) in enumerate(bones.items()):
+        turns = [place for place, channel in enumerate(bone.channels) if channel[0] == "r"]
+        for place, channel in enumerate(bone.channels):
+            if channel[0] == "t":
+                shifts[:, index, "xyz".index(channel[1])] = values[name][:, place]
+        if turns:
+            order = "".join(bone.channels[place][1] for place in turns)  # lower case: about axes that stay
+            turned = Rotation.from_euler(order, values[name][:, turns], degrees=in_degrees).as_matrix()
+            local[:, index] = bone.axes @ turned @ bone.axes.T
+    return pose_offsets(path.stem, names, parents, rest, local, shifts, FPS)
 
 
 def _skeleton_of(file: Path) -> Path:
@@ -115,8 +116,8 @@ def _read_bones(lines: list[tuple[int, list[str]]]) -> tuple[dict[str, _Bone], b
     return bones, in_degrees
 
 
-def _read_frames(lines: list[tuple[int, list[str]]], bones: dict[str, _Bone]) -> np.ndarray:
-    """Return the values of all bones' channels, side by side, [frames, channels]."""
+def _read_frames(lines: list[tuple[int, list[str]]], bones: dict[str, _Bone]) -> dict[str, np.ndarray]:
+    """Return the values of every bone's channels, [frames, channels]."""
     starts, width = {}, 0
     for name, bone in bones.items():
         starts[name], width = width, width + len(bone.channels)
@@ -132,31 +133,8 @@ def _read_frames(lines: list[tuple[int, list[str]]], bones: dict[str, _Bone]) ->
             frames[-1][starts[key] : starts[key] + len(rest)] = _numbers(number, rest)
     if not frames:
         raise ValueError("it has no frames")
-    return np.stack(frames)
-
-
-def _evaluate(
-    bones: dict[str, _Bone], values: np.ndarray, parents: list[int], *, in_degrees: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotations relative to the parent [frames, bones, 3, 3], and offsets from it [frames, bones, 3]."""
-    ends = [bone.end for bone in bones.values()]
-    local = np.tile(np.eye(3), (len(values), len(bones), 1, 1))
-    shifts = np.tile(
-        [ends[parent] if parent >= 0 else np.zeros(3) for parent in parents], (len(values), 1, 1)
-    )
-    column = 0
-    for index, bone in enumerate(bones.values()):
-        part = values[:, column : column + len(bone.channels)]
-        column += len(bone.channels)
-        turns = [place for place, channel in enumerate(bone.channels) if channel[0] == "r"]
-        for place, channel in enumerate(bone.channels):
-            if channel[0] == "t":
-                shifts[:, index, "xyz".index(channel[1])] = part[:, place]
-        if turns:
-            order = "".join(bone.channels[place][1] for place in turns)  # lower case: about axes that stay
-            turned = Rotation.from_euler(order, part[:, turns], degrees=in_degrees).as_matrix()
-            local[:, index] = bone.axes @ turned @ bone.axes.T
-    return local, shifts
+    table = np.stack(frames)
+    return {name: table[:, start : start + len(bones[name].channels)] for name, start in starts.items()}
 
 
 def _numbers(number: int, words: list[str]) -> list[float]:

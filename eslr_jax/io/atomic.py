@@ -18,12 +18,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     The temporary path keeps the suffix of `path`, because many writers choose their format by it. If the block
     raises, the temporary file is removed and `path` is as before.
 
-    Args:
-        path: Path of the file; its folder must exist.
-
-    Yields:
-        The path to write to, in the same folder.
-
     Raises:
         AssetError: The folder is missing, or the file can't be written.
     """
@@ -50,12 +44,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 def ensure_output_dir(path: str | Path) -> Path:
     """Create a folder with its parents if it is missing, and check that a file can be written in it.
-
-    Args:
-        path: Path of the folder.
-
-    Returns:
-        The path.
 
     Raises:
         AssetError: The folder can't be created or written, or the path is a file.

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.parsing import parsing
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets, whole_rate
 
 _CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in "XYZ")
@@ -30,29 +30,19 @@ class _Joint:
     channels: tuple[str, ...] = ()
 
 
-def read_bvh(path: str | Path) -> SkeletonMotion:
-    """Read a BVH file.
+@reader("motion", [".bvh"])
+def read_bvh(path: Path, _clip: str = "") -> SkeletonMotion:
+    """Read a BVH file at its own frame rate, in its own unit and axes; errors name the line.
 
-    A header whose number of frames is off by one is a warning; the frames that are there are read.
-
-    Args:
-        path: Path of the file.
-
-    Returns:
-        The motion at its own frame rate, in its own unit and axes; a frame time of 0.0333333 s is a
-            thirtieth of a second.
-
-    Raises:
-        AssetError: The file is missing, or is not BVH; the message names the line.
-        MotionError: The motion has no usable frames.
+    A frame time of 0.0333333 s is a thirtieth of a second. A header whose number of frames is off by one is a
+    warning; the frames that are there are read.
     """
-    with parsing(path, "motion") as file:
-        words = _Words(file)
-        joints = _read_hierarchy(words)
-        values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
+    words = _Words(path)
+    joints = _read_hierarchy(words)
+    values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
     if not 1e-3 <= frame_time <= 1.0:
-        raise MotionError(f"{file}: a frame time of {frame_time:g} s; expected 0.001 to 1")
-    return _pose(file.stem, joints, values, whole_rate(1.0 / frame_time))
+        raise MotionError(f"{path}: a frame time of {frame_time:g} s; expected 0.001 to 1")
+    return _pose(path.stem, joints, values, whole_rate(1.0 / frame_time))
 
 
 class _Words:
@@ -85,14 +75,14 @@ class _Words:
         return word
 
     def number_of(self, kind: type) -> float:
-        """Return the next word as a number."""
+        """Return the next word as a finite number."""
         word = self.next()
         try:
             value = kind(word)
         except ValueError:
-            raise self.fail(f"{word[:40]!r} is no number") from None
+            value = np.nan
         if not np.isfinite(value):
-            raise self.fail(f"{word[:40]!r} is not finite")
+            raise self.fail(f"{word[:40]!r} is no finite number")
         return value
 
 
@@ -101,13 +91,10 @@ def _read_hierarchy(words: _Words) -> list[_Joint]:
     words.expect("HIERARCHY")
     joints: list[_Joint] = []
     opened: list[int] = []  # joints whose brace is open; -1 is an end site
-    while True:
-        word = words.next().upper()
+    while (word := words.next().upper()) != "MOTION":
         if word in ("ROOT", "JOINT"):
-            if (word == "ROOT") == bool(opened):
-                raise words.fail(f"{word} in the wrong place")
-            if len(joints) == MAX_JOINTS:
-                raise words.fail(f"more than {MAX_JOINTS} joints")
+            if (word == "ROOT") == bool(opened) or len(joints) == MAX_JOINTS:
+                raise words.fail(f"{word} in the wrong place, or more than {MAX_JOINTS} joints")
             name = " ".join(words.rest[::-1]) or words.next()
             words.rest = []
             joints.append(_Joint(name.rstrip("{ "), opened[-1] if opened else -1))
@@ -130,16 +117,13 @@ def _read_hierarchy(words: _Words) -> list[_Joint]:
             if len(set(names)) != count:
                 raise words.fail("a channel twice")
             joints[opened[-1]].channels = names
-        elif word == "}":
-            if not opened:
-                raise words.fail("a brace that closes nothing")
+        elif word == "}" and opened:
             opened.pop()
-        elif word == "MOTION":
-            if opened or not joints:
-                raise words.fail("MOTION inside the hierarchy")
-            return joints
         else:
-            raise words.fail(f"{word[:40]!r} is unknown")
+            raise words.fail("a brace that closes nothing" if word == "}" else f"{word[:40]!r} is unknown")
+    if opened or not joints:
+        raise words.fail("MOTION inside the hierarchy")
+    return joints
 
 
 def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
@@ -175,23 +159,20 @@ def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
 
 def _pose(name: str, joints: list[_Joint], values: np.ndarray, fps: float) -> SkeletonMotion:
     """Return the motion that the values of the channels tell."""
-    num_frames, num_joints = len(values), len(joints)
-    local = np.tile(np.eye(3), (num_frames, num_joints, 1, 1))
-    offsets = np.tile(np.array([joint.offset for joint in joints]), (num_frames, 1, 1))
-    column = 0
+    rest = np.array([joint.offset for joint in joints])
+    local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
+    offsets = np.tile(rest, (len(values), 1, 1))
+    columns = iter(values.T)
     for index, joint in enumerate(joints):
         angles, axes = [], ""
         for channel in joint.channels:
-            axis = "XYZ".index(channel[0])
             if channel.endswith("position"):
                 # A position replaces the offset: that is what exporters write and importers expect.
-                offsets[:, index, axis] = values[:, column]
+                offsets[:, index, "XYZ".index(channel[0])] = next(columns)
             else:
-                angles.append(np.remainder(values[:, column] + 180.0, 360.0) - 180.0)
+                angles.append(np.remainder(next(columns) + 180.0, 360.0) - 180.0)
                 axes += channel[0]
-            column += 1
         if axes:
             local[:, index] = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix()
-    rest = np.array([joint.offset for joint in joints])
     names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
     return pose_offsets(name, names, parents, rest, local, offsets, fps)

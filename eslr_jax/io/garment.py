@@ -17,12 +17,10 @@ from eslr_jax.io.mesh import MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.io.mesh_sequence import MeshSequence
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.io.parsing import split_name
-from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import find_reader, suffixes_of
 
-_SAME_EDGES = (
-    0.5  # share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds
-)
-_HOOD_PINNED = 3  # node_type of a pinned vertex (HOOD's `NodeType.HANDLE`)
+# Share of edges that tells the same mesh: quads cut along the other diagonal keep two thirds.
+_SAME_EDGES = 0.5
 _COPY = re.compile(r"\.\d{3}$")  # what Blender appends to a name that is taken
 _LAYOUT = {
     "rest_positions": ("f", "vertices 3"),
@@ -37,6 +35,7 @@ _LAYOUT = {
     "vertex_map": ("iu", "source_vertices"),
     "joined_rows": ("iu", "joined_vertices", "source_vertices"),
 }
+_TYPES = {"skin_indices": np.int16, "pinned": bool}  # stored, where it is not float32 or int32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,12 +71,7 @@ class GarmentFile:
 def split_outfit(
     faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]
 ) -> list[tuple[str, slice, Bool[np.ndarray, " faces"]]]:
-    """Return the garments of an outfit: the name, the vertices and which faces.
-
-    Args:
-        faces: Triangles of all of them.
-        outfit: `GarmentFile.outfit`.
-    """
+    """Return of the garments of a `GarmentFile.outfit` the name, the vertices and which of all faces."""
     garments, start = [], 0
     for name, count in outfit.items():
         is_own = (faces[:, 0] >= start) & (faces[:, 0] < start + count)
@@ -102,16 +96,17 @@ def is_garment_file(path: str | Path) -> bool:
 
 
 def garment_path(text: str | Path) -> Path:
-    """Return the file of a garment; only that of a pickle is followed by the name of one of its garments."""
+    """Return the file of a garment; only a file of several is followed by the name of one of them."""
     file, _ = split_name(text)
-    return Path(file if Path(file).suffix.lower() == ".pkl" else text)
+    return Path(file if Path(file).suffix.lower() in suffixes_of("garment") else text)
 
 
 def read_garment_source(text: str | Path) -> GarmentSource:
     """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
 
     Args:
-        text: Path of a .obj, .ply, .stl, .glb, .npz or .pkl file; `FILE.pkl#NAME` picks one of several.
+        text: Path of a file of one of `registry.suffixes_of("mesh", "garment")`; `FILE.pkl#NAME`
+            picks one of several.
 
     Returns:
         The mesh in the file's units and axes.
@@ -121,53 +116,14 @@ def read_garment_source(text: str | Path) -> GarmentSource:
         MeshError: It has faces that can't be triangulated.
     """
     path = garment_path(text)
-    if path.suffix.lower() == ".pkl":
-        return _read_hood(str(path), split_name(text)[1])
-    return GarmentSource(read_mesh_file(path), path.stem, is_metric=path.suffix.lower() == ".glb")
-
-
-def _read_hood(path: str, name: str) -> GarmentSource:
-    """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name.
-
-    Source: HOOD, `utils/mesh_creation.py`.
-    """
-    garments = read_pickle(path, content="garment")
-    if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
-        raise AssetError(f"garment file {path} holds no garments by name; give HOOD's garments_dict.pkl")
-    names = [str(key) for key in garments]
-    if not name and len(names) != 1:
-        raise AssetError(f"{path} holds the garments {', '.join(names)[:300]}; name one, as in {path}#NAME")
-    name = name or names[0]
-    if name not in names:
-        raise AssetError(f"{path} has no garment {name!r}; it has {', '.join(names)[:300]}")
-    entry = garments[name]
-    arrays = {}
-    for key in ("rest_pos", "faces"):
-        value = entry.get(key)
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-            raise AssetError(f"garment {name} of {path} has no array {key}; give HOOD's garments_dict.pkl")
-        arrays[key] = value
-    positions = arrays["rest_pos"].astype(np.float64)
-    is_pinned = None
-    if entry.get("node_type") is not None:
-        kinds = np.ravel(entry["node_type"])
-        if kinds.shape != positions.shape[:1]:
-            raise AssetError(
-                f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
-            )
-        is_pinned = kinds == _HOOD_PINNED
-    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
+    if path.suffix.lower() in suffixes_of("garment"):
+        return find_reader("garment", path)(path, split_name(text)[1])
+    mesh = read_mesh_file(path)
+    return GarmentSource(mesh, path.stem, is_metric=mesh.is_metric)
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:
-    """Read a garment file.
-
-    Args:
-        path: Path of an npz archive with rest_positions, faces, skin_weights and skin_indices. Everything else
-            that `write_garment_npz` writes is optional; without `pinned` no vertex is pinned.
-
-    Returns:
-        The garment.
+    """Read a garment file; all but rest_positions, faces, skin_weights and skin_indices is optional.
 
     Raises:
         AssetError: The file is missing or damaged, or its arrays don't fit each other.
@@ -178,9 +134,7 @@ def read_garment_npz(path: str | Path) -> GarmentFile:
 def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> GarmentFile:
     """Return the garment of a file's arrays; see `read_garment_npz`."""
     what = f"garment file {path}"
-    missing = [
-        key for key in ("rest_positions", "faces", "skin_weights", "skin_indices") if key not in arrays
-    ]
+    missing = [key for key in list(_LAYOUT)[:4] if key not in arrays]
     if missing:
         raise AssetError(f"{what} lacks {', '.join(missing)}; it has {', '.join(sorted(arrays))}")
     check_layout(arrays, _LAYOUT, what=what, remedy="write it again")
@@ -188,52 +142,27 @@ def garment_from_arrays(arrays: dict[str, np.ndarray], path: str | Path) -> Garm
         metadata = json.loads(str(arrays["metadata"])) if "metadata" in arrays else {}
     except (ValueError, RecursionError) as error:
         raise AssetError(f"{what} has damaged metadata; fit the garment again") from error
-    sewn, uvs = arrays.get("sewn_positions"), arrays.get("corner_uvs")
-    return GarmentFile(
-        rest_positions=arrays["rest_positions"].astype(np.float64),
-        faces=arrays["faces"].astype(np.int64),
-        skin_weights=arrays["skin_weights"].astype(np.float64),
-        skin_indices=arrays["skin_indices"].astype(np.int64),
-        is_pinned=arrays.get("pinned", np.zeros(len(arrays["rest_positions"]))).astype(bool),
-        sewn_positions=None if sewn is None else sewn.astype(np.float64),
-        corner_uvs=None if uvs is None else uvs.astype(np.float64),
-        face_parts=arrays.get("face_parts"),
-        part_names=tuple(str(name) for name in arrays.get("part_names", ())),
-        vertex_map=arrays.get("vertex_map"),
-        joined_rows=arrays.get("joined_rows"),
-        metadata=metadata if isinstance(metadata, dict) else {},
-    )
+    wide = {"f": np.float64, "iu": np.int64}  # for the host
+    found = {name: arrays[name] for name in _LAYOUT if name in arrays}
+    values = {name: array.astype(wide.get(_LAYOUT[name][0], array.dtype)) for name, array in found.items()}
+    values["part_names"] = tuple(map(str, found.get("part_names", ())))
+    is_pinned = values.pop("pinned", np.zeros(len(values["rest_positions"]))).astype(bool)
+    return GarmentFile(**values, is_pinned=is_pinned, metadata=metadata if isinstance(metadata, dict) else {})
 
 
 def write_garment_npz(path: str | Path, garment: GarmentFile) -> None:
-    """Write a garment file, atomically.
-
-    Raises:
-        AssetError: The file can't be written.
-    """
+    """Write a garment file, atomically."""
     write_arrays(path, garment_arrays(garment), is_compressed=True)
 
 
 def garment_arrays(garment: GarmentFile) -> dict[str, np.ndarray]:
     """Return the arrays of a garment file."""
-    arrays: dict[str, np.ndarray] = {
-        "rest_positions": garment.rest_positions.astype(np.float32),
-        "faces": garment.faces.astype(np.int32),
-        "skin_weights": garment.skin_weights.astype(np.float32),
-        "skin_indices": garment.skin_indices.astype(np.int16),
-        "pinned": garment.is_pinned,
-    }
-    if garment.sewn_positions is not None:
-        arrays["sewn_positions"] = garment.sewn_positions.astype(np.float32)
-    if garment.corner_uvs is not None:
-        arrays["corner_uvs"] = garment.corner_uvs.astype(np.float32)
-    if garment.face_parts is not None:
-        arrays["face_parts"] = garment.face_parts.astype(np.int32)
-        arrays["part_names"] = np.array(garment.part_names)
-    if garment.vertex_map is not None:
-        arrays["vertex_map"] = garment.vertex_map.astype(np.int32)
-    if garment.joined_rows is not None:
-        arrays["joined_rows"] = garment.joined_rows.astype(np.int32)
+    values = vars(garment) | {"pinned": garment.is_pinned, "part_names": garment.part_names or None}
+    arrays = {}
+    for name, (kinds, *_) in _LAYOUT.items():
+        if values[name] is not None:
+            usual = {"f": np.float32, "iu": np.int32}.get(kinds)
+            arrays[name] = np.asarray(values[name], _TYPES.get(name, usual))
     if garment.metadata:
         arrays["metadata"] = np.array(json.dumps(garment.metadata))
     return arrays
@@ -270,7 +199,10 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
             orders.append(order[garment.joined_rows])
     fitting = [order for order in orders if len(order) == num_rows]
     if not fitting and num_rows > min(map(len, orders)):
-        sequence = _join_copies(sequence)
+        # PLY splits vertices at seams of textures: those at one place in all frames are one.
+        kept, place = shared_vertices(sequence.positions.swapaxes(0, 1))
+        faces = place[np.asarray(sequence.faces)]
+        sequence = dataclasses.replace(sequence, positions=sequence.positions[:, kept], faces=faces)
         fitting = [order for order in orders if len(order) == sequence.positions.shape[1]]
     if not fitting:
         known = " or ".join(dict.fromkeys(str(len(order)) for order in orders))
@@ -286,14 +218,6 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     raise MeshError(
         f"{sequence.name} has edges between other vertices than the garment: its vertices have another order, or "
         "it is another garment; keep the order of the garment's file"
-    )
-
-
-def _join_copies(sequence: MeshSequence) -> MeshSequence:
-    """Return a mesh whose vertices at one place in all frames are one; PLY splits them at seams of textures."""
-    kept, place = shared_vertices(sequence.positions.swapaxes(0, 1))
-    return dataclasses.replace(
-        sequence, positions=sequence.positions[:, kept], faces=place[np.asarray(sequence.faces)]
     )
 
 
@@ -313,8 +237,20 @@ def in_outfit_order(
     """
     if len(sequences) == 1:
         return in_vertex_order(sequences[0], outfit)
-    garments = garments or _cut_apart(outfit)
-    meshes = {name: _meshes_of(name, sequences) for name in garments}
+    garments = garments or {
+        name: GarmentFile(
+            outfit.rest_positions[rows],
+            outfit.faces[is_own] - rows.start,
+            outfit.skin_weights[rows],
+            outfit.skin_indices[rows],
+            outfit.is_pinned[rows],
+        )
+        for name, rows, is_own in split_outfit(outfit.faces, outfit.outfit)
+    }
+    meshes = {}
+    for name in garments:
+        exact = [sequence for sequence in sequences if sequence.mesh == name]
+        meshes[name] = exact or [mesh for mesh in sequences if _COPY.sub("", mesh.mesh) == name]
     if missing := [name for name, found in meshes.items() if not found]:
         known = ", ".join(sequence.mesh for sequence in sequences)
         raise MeshError(
@@ -327,26 +263,6 @@ def in_outfit_order(
             f"{sequences[0].name}: the meshes {known} may all be {doubled[0]}; give one of them its name"
         )
     return np.concatenate([in_vertex_order(meshes[name][0], worn) for name, worn in garments.items()], axis=1)
-
-
-def _meshes_of(name: str, sequences: Sequence[MeshSequence]) -> list[MeshSequence]:
-    """Return the meshes of a garment's name, or else those that Blender numbered because it was taken."""
-    exact = [sequence for sequence in sequences if sequence.mesh == name]
-    return exact or [sequence for sequence in sequences if _COPY.sub("", sequence.mesh) == name]
-
-
-def _cut_apart(outfit: GarmentFile) -> dict[str, GarmentFile]:
-    """Return the garments of an outfit, without their parts and texture coordinates."""
-    return {
-        name: GarmentFile(
-            outfit.rest_positions[rows],
-            outfit.faces[is_own] - rows.start,
-            outfit.skin_weights[rows],
-            outfit.skin_indices[rows],
-            outfit.is_pinned[rows],
-        )
-        for name, rows, is_own in split_outfit(outfit.faces, outfit.outfit)
-    }
 
 
 def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:

@@ -16,32 +16,37 @@ from pathlib import Path
 import numpy as np
 import pygltflib as gltf
 
-from eslr_jax.io.animated import AnimatedMesh, check_meshes, principal_shapes, split_seams, vertex_normals
+from eslr_jax.io.animated import (
+    AnimatedMesh,
+    Skin,
+    corrections,
+    influences,
+    local_motion,
+    principal_shapes,
+    split_seams,
+    vertex_normals,
+)
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.gltf_builder import GlbBuilder, append
-from eslr_jax.io.skin import Skin, corrections, influences, local_motion
+from eslr_jax.io.palette import Color, srgb_to_linear
+from eslr_jax.io.registry import writer
 
 TOLERANCE = 5e-4  # [m] by which a vertex may be out of place
 _SMALL = 0.06  # [m]; 16 bits resolve a shape of this size to a micrometre
 _NORMAL_TOLERANCE = 0.02  # root mean square by which normals, of length one, may be off
 _INFLUENCES_PER_SET = 4  # glTF stores skin weights in sets of four
+_COMPONENT_TYPES = {
+    np.dtype(np.float32): gltf.FLOAT,
+    np.dtype(np.int16): gltf.SHORT,
+    np.dtype(np.uint8): gltf.UNSIGNED_BYTE,
+    np.dtype(np.uint16): gltf.UNSIGNED_SHORT,
+    np.dtype(np.uint32): gltf.UNSIGNED_INT,
+}
 
 
+@writer("scene", [".glb"])
 def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Write meshes with their animation as one GLB file, atomically.
-
-    Args:
-        path: Path of the file, `*.glb`.
-        meshes: Meshes with the same number of frames.
-        timestep: Time between frames [s]; frame k is at k * timestep.
-
-    Raises:
-        MeshError: A mesh is empty, not finite, or its parts disagree.
-        MotionError: The numbers of frames differ, or a joint does not move rigidly.
-        AssetError: The file can't be written.
-    """
-    check_meshes(meshes, timestep)
-    builder = GlbBuilder()
+    """Write meshes with their animation as one GLB file, atomically; frame k is at k times the timestep [s]."""
+    builder = _Builder()
     for mesh in meshes:
         _add_mesh(builder, mesh, timestep)
     content = builder.to_bytes()
@@ -49,7 +54,7 @@ def write_animated_glb(path: str | Path, meshes: Sequence[AnimatedMesh], timeste
         temporary.write_bytes(content)
 
 
-def _add_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float) -> None:
+def _add_mesh(builder: _Builder, mesh: AnimatedMesh, timestep: float) -> None:
     """Add a mesh with its skin, its morph targets and their animation."""
     positions, faces = np.asarray(mesh.positions, np.float32), np.asarray(mesh.faces)
     base, offsets = positions[0], positions - positions[0]
@@ -83,7 +88,7 @@ def _add_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float) -> None:
         weights=[0.0] * len(targets),
         extras=names if targets else {},
     )
-    index = append(builder.document.meshes, content)
+    index = _append(builder.document.meshes, content)
     node = builder.add_node(gltf.Node(name=mesh.name, mesh=index, skin=skin))
     if targets:
         values = builder.add_accessor(weights.reshape(-1), gltf.SCALAR)
@@ -91,7 +96,7 @@ def _add_mesh(builder: GlbBuilder, mesh: AnimatedMesh, timestep: float) -> None:
 
 
 def _add_targets(
-    builder: GlbBuilder, base: np.ndarray, offsets: np.ndarray, faces: np.ndarray, vertices: np.ndarray
+    builder: _Builder, base: np.ndarray, offsets: np.ndarray, faces: np.ndarray, vertices: np.ndarray
 ) -> tuple[list[gltf.Attributes], np.ndarray]:
     """Add the principal shapes of offsets [frames, vertices, 3] and of the normals that go with them.
 
@@ -126,9 +131,7 @@ def _add_targets(
     return targets, (basis / largest).astype(np.float32)
 
 
-def _add_influences(
-    builder: GlbBuilder, attributes: gltf.Attributes, skin: Skin, vertices: np.ndarray
-) -> None:
+def _add_influences(builder: _Builder, attributes: gltf.Attributes, skin: Skin, vertices: np.ndarray) -> None:
     """Add skin weights in as many sets of four as it takes to keep them all."""
     weights, indices = (array[vertices] for array in influences(skin))
     padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
@@ -142,7 +145,7 @@ def _add_influences(
             setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
 
 
-def _add_skin(builder: GlbBuilder, name: str, skin: Skin, timestep: float) -> int:
+def _add_skin(builder: _Builder, name: str, skin: Skin, timestep: float) -> int:
     """Add one animated node per joint under a common root, and return the skin that binds them."""
     rotations, translations = local_motion(skin)
     parents, first = list(skin.parents), len(builder.document.nodes)
@@ -169,4 +172,124 @@ def _add_skin(builder: GlbBuilder, name: str, skin: Skin, timestep: float) -> in
     bind[:, 3, :3] = -np.asarray(skin.joint_rest_positions)  # column-major: this row is the translation
     inverse_bind = builder.add_accessor(bind.reshape(-1, 16), gltf.MAT4)
     content = gltf.Skin(name=name, joints=nodes, skeleton=armature, inverseBindMatrices=inverse_bind)
-    return append(builder.document.skins, content)
+    return _append(builder.document.skins, content)
+
+
+class _Builder:
+    """Collects the tables of a glTF document and the bytes that they point into."""
+
+    def __init__(self) -> None:
+        self._scene_nodes: list[int] = []
+        self.document = gltf.GLTF2(
+            asset=gltf.Asset(version="2.0", generator="eslr_jax"),
+            scene=0,
+            scenes=[gltf.Scene(nodes=self._scene_nodes)],
+        )
+        self.animation = gltf.Animation(name="simulation")
+        self._chunks: list[bytes] = []
+        self._size = 0
+
+    def add_accessor(
+        self, array: np.ndarray, kind: str, *, target: int | None = None, has_bounds: bool = False
+    ) -> int:
+        """Append an array to the binary chunk and return the index of its accessor."""
+        values = np.ascontiguousarray(array)
+        payload = values.tobytes()
+        payload += b"\0" * (-len(payload) % 4)  # every accessor starts at a multiple of its component size
+        self.document.bufferViews.append(
+            gltf.BufferView(buffer=0, byteOffset=self._size, byteLength=values.nbytes, target=target)
+        )
+        self._chunks.append(payload)
+        self._size += len(payload)
+        columns = values.reshape(len(values), -1)
+        accessor = gltf.Accessor(
+            bufferView=len(self.document.bufferViews) - 1,
+            componentType=_COMPONENT_TYPES[values.dtype],
+            count=len(values),
+            type=kind,
+            min=columns.min(0).tolist() if has_bounds else None,
+            max=columns.max(0).tolist() if has_bounds else None,
+        )
+        return _append(self.document.accessors, accessor)
+
+    def add_points(self, points: np.ndarray) -> int:
+        """Add positions, or differences of positions, with the bounds that glTF asks of them."""
+        return self.add_accessor(points, gltf.VEC3, target=gltf.ARRAY_BUFFER, has_bounds=True)
+
+    def add_small_points(self, points: np.ndarray) -> int:
+        """Add differences of positions between -1 and 1 as 16-bit integers: a third of the size."""
+        steps = np.iinfo(np.int16).max
+        rounded = np.zeros((len(points), 4), np.int16)  # vertices start at multiples of four bytes
+        rounded[:, :3] = np.round(points * steps)
+        index = self.add_vertices(rounded, gltf.VEC3)
+        accessor = self.document.accessors[index]
+        accessor.normalized = True
+        accessor.min = rounded[:, :3].min(axis=0).tolist()
+        accessor.max = rounded[:, :3].max(axis=0).tolist()
+        self.document.bufferViews[accessor.bufferView].byteStride = rounded.itemsize * rounded.shape[1]
+        self.document.extensionsUsed = self.document.extensionsRequired = ["KHR_mesh_quantization"]
+        return index
+
+    def add_zeros(self, num_vertices: int) -> int:
+        """Add vectors of zeros, which take no room."""
+        accessor = gltf.Accessor(componentType=gltf.FLOAT, count=num_vertices, type=gltf.VEC3)
+        return _append(self.document.accessors, accessor)
+
+    def add_vertices(self, values: np.ndarray, kind: str) -> int:
+        """Add other values per vertex, such as normals."""
+        return self.add_accessor(values, kind, target=gltf.ARRAY_BUFFER)
+
+    def add_indices(self, faces: np.ndarray, num_vertices: int) -> int:
+        """Add the triangles, in the smallest type that can't be taken for a primitive restart."""
+        dtype = np.uint16 if num_vertices < np.iinfo(np.uint16).max else np.uint32
+        return self.add_accessor(
+            faces.reshape(-1).astype(dtype), gltf.SCALAR, target=gltf.ELEMENT_ARRAY_BUFFER
+        )
+
+    def add_material(self, name: str, color: Color) -> int:
+        """Append a rough two-sided material and return its index."""
+        linear = [float(value) for value in srgb_to_linear(color)]
+        surface = gltf.PbrMetallicRoughness(
+            baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9
+        )
+        material = gltf.Material(
+            name=name,
+            pbrMetallicRoughness=surface,
+            doubleSided=True,
+            alphaMode=gltf.OPAQUE,
+            alphaCutoff=None,
+        )
+        return _append(self.document.materials, material)
+
+    def add_node(self, node: gltf.Node, *, is_root: bool = True) -> int:
+        """Append a node, to the scene too when it is a root, and return its index."""
+        index = _append(self.document.nodes, node)
+        if is_root:
+            self._scene_nodes.append(index)
+        return index
+
+    def add_channel(self, node: int, path: str, times: int, values: int) -> None:
+        """Animate one property of a node, linear between key frames."""
+        sampler = gltf.AnimationSampler(input=times, output=values, interpolation=gltf.ANIM_LINEAR)
+        index = _append(self.animation.samplers, sampler)
+        target = gltf.AnimationChannelTarget(node=node, path=path)
+        self.animation.channels.append(gltf.AnimationChannel(sampler=index, target=target))
+
+    def add_times(self, num_frames: int, timestep: float) -> int:
+        """Append the key frame times [s] and return their accessor."""
+        times = np.arange(num_frames) * timestep
+        return self.add_accessor(times.astype(np.float32), gltf.SCALAR, has_bounds=True)
+
+    def to_bytes(self) -> bytes:
+        """Assemble the file."""
+        if self.animation.channels:
+            self.document.animations = [self.animation]
+        self.document.buffers = [gltf.Buffer(byteLength=self._size)]
+        self.document.set_binary_blob(b"".join(self._chunks))
+        return b"".join(self.document.save_to_bytes())
+
+
+def _append(items: list, item: object) -> int:
+    """Append and return the new item's index."""
+    items.append(item)
+    return len(items) - 1

@@ -7,7 +7,6 @@ disagree on how that space lies in the world: see `_bind_space`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.gltf_document import GltfDocument, sample_keys
 from eslr_jax.io.parsing import parsing
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import (
     MAX_POSES,
     RiggedMesh,
@@ -47,31 +47,30 @@ def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
         return _clip_names(GltfDocument(file))
 
 
-def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
-    """Read a skinned character.
+@reader("body", GLTF_SUFFIXES)
+def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
+    """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
+
+    It has the shape that the file's weights of morph targets give it.
 
     Args:
         path: Path of a .gltf, .glb or .vrm file.
-        meshes: Names of the meshes, or of their nodes, that make up the body; all skinned ones if empty.
-
-    Returns:
-        The character in its bind pose, in world axes, with the vertices of the file and the shape that the file's
-        weights of morph targets give it.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it lacks a skinned mesh that is named.
+        meshes: Names of the meshes, or of their nodes, that make up the body, as in "Skin,Hat"; "" is all that
+            are skinned.
     """
-    with parsing(path, "body") as file:
-        document = GltfDocument(file)
-        joints = _read_joints(document)
-        found = _skinned_nodes(document)
-        if meshes:
-            unknown = [name for name in meshes if not any(name in names for _, names in found)]
-            if unknown:
-                known = ", ".join(names[0] for _, names in found)
-                raise AssetError(f"{path} has no skinned mesh {unknown[0]!r}; it has {known}")
-            found = [(node, names) for node, names in found if set(names) & set(meshes)]
-        parts = [part for node, _ in found for part in _read_node(document, joints, node)]
+    document = GltfDocument(path)
+    joints = _read_joints(document)
+    found = {}  # skinned nodes, and the names they go by
+    for index, node in enumerate(document.items("nodes")):
+        if "mesh" in node and "skin" in node:
+            entries = (node, document.item("meshes", node["mesh"]))
+            found[index] = [str(entry["name"]) for entry in entries if entry.get("name")] or [f"mesh{index}"]
+    wanted = set(filter(None, meshes.split(",")))
+    if unknown := sorted(wanted.difference(*found.values())):
+        known = ", ".join(names[0] for names in found.values())
+        raise AssetError(f"{path} has no skinned mesh {unknown[0]!r}; it has {known}")
+    nodes = [node for node, names in found.items() if not wanted or wanted & set(names)]
+    parts = [part for node in nodes for part in _read_node(document, joints, node)]
     if not parts:
         raise AssetError(f"{path} has a skin, but no triangles bound to it; export the mesh with its skin")
     offsets = np.cumsum([0, *(len(part[0]) for part in parts)])
@@ -82,7 +81,7 @@ def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
         return np.pad(array, ((0, 0), (0, influences - array.shape[1])))
 
     return RiggedMesh(
-        name=file.name,
+        name=path.name,
         positions=np.concatenate(positions),
         faces=np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=False)]),
         skin_weights=np.concatenate([widen(part) for part in weights]),
@@ -91,62 +90,39 @@ def read_gltf_body(path: str | Path, meshes: Sequence[str] = ()) -> RiggedMesh:
     )
 
 
-def read_gltf_motion(path: str | Path, clip: str = "") -> SkeletonMotion:
-    """Read an animation of a skinned character's joints.
-
-    Args:
-        path: Path of a .gltf, .glb or .vrm file.
-        clip: Name of the animation; not needed if there is only one.
-
-    Returns:
-        The motion, sampled at the rate of its densest keys.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it has no skin.
-        MotionError: The file has no such animation, or the animation moves nothing.
-    """
-    with parsing(path, "motion") as file:
-        document = GltfDocument(file)
-        names = _clip_names(document)
-        if not names:
-            raise MotionError(f"{path} has no animation; export the character with one")
-        if not clip and len(names) > 1:
-            raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
-        if clip and clip not in names:
-            raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
-        joints = _read_joints(document)
-        index = names.index(clip) if clip else 0
-        keys = document.key_frames(document.items("animations")[index])
-        if not keys:
-            raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")
-        times, fps = document.sample_times([key[3] for key in keys])
-        if len(times) * len(document.parents) > MAX_POSES:
-            raise MotionError(f"{path}: {len(times)} frames of {len(document.parents)} nodes; cut the clip")
-        animated = {
-            (node, what): sample_keys(what, kind, at, values, times) for node, what, kind, at, values in keys
-        }
-        world = document.world_matrices(animated, len(times))[:, joints.nodes]
-        since_rest = world @ np.linalg.inv(joints.rest_frames)
-        return SkeletonMotion(
-            names[index], joints.skeleton, nearest_rotations(since_rest[..., :3, :3]), world[..., :3, 3], fps
-        )
+@reader("motion", GLTF_SUFFIXES)
+def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
+    """Read an animation of a character's joints, at the rate of its densest keys; "" names the only one."""
+    document = GltfDocument(path)
+    names = _clip_names(document)
+    if not names:
+        raise MotionError(f"{path} has no animation; export the character with one")
+    if not clip and len(names) > 1:
+        raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
+    if clip and clip not in names:
+        raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+    joints = _read_joints(document)
+    index = names.index(clip) if clip else 0
+    keys = document.key_frames(document.items("animations")[index])
+    if not keys:
+        raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")
+    times, fps = document.sample_times([key[3] for key in keys])
+    if len(times) * len(document.parents) > MAX_POSES:
+        raise MotionError(f"{path}: {len(times)} frames of {len(document.parents)} nodes; cut the clip")
+    animated = {
+        (node, what): sample_keys(what, kind, at, values, times) for node, what, kind, at, values in keys
+    }
+    world = document.world_matrices(animated, len(times))[:, joints.nodes]
+    since_rest = world @ np.linalg.inv(joints.rest_frames)
+    return SkeletonMotion(
+        names[index], joints.skeleton, nearest_rotations(since_rest[..., :3, :3]), world[..., :3, 3], fps
+    )
 
 
 def _clip_names(document: GltfDocument) -> tuple[str, ...]:
     """Return the names of the animations; those without a name are numbered."""
     entries = document.items("animations")
     return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
-
-
-def _skinned_nodes(document: GltfDocument) -> list[tuple[int, list[str]]]:
-    """Return the nodes that carry a skinned mesh, with the names they go by."""
-    found = []
-    for index, node in enumerate(document.items("nodes")):
-        if "mesh" in node and "skin" in node:
-            mesh = document.item("meshes", node["mesh"])
-            names = [str(entry["name"]) for entry in (node, mesh) if entry.get("name")]
-            found.append((index, names or [f"mesh{index}"]))
-    return found
 
 
 def _read_joints(document: GltfDocument) -> _Joints:

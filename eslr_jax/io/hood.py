@@ -1,39 +1,71 @@
-"""Read HOOD's checkpoints: its weights under our names.
+"""Read HOOD's garments, and its checkpoints: its weights under our names.
 
-Three layouts are read: "postcvpr" (levels), "cvpr" (five lists of steps, one encoder for all coarse levels)
-and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from the same graph;
-`models.hood` says in what our graphs differ.
+Three layouts of checkpoints are read: "postcvpr" (levels), "cvpr" (five lists of steps, one encoder for all
+coarse levels) and the MeshGraphNets "fine15" and "fine48". A converted network computes the same as HOOD's from
+the same graph; `models.hood` says in what our graphs differ.
 
-Source: Grigorev, Black and Hilliges, "HOOD" (2023), repository at 9bc1076, models/ and utils/normalization.py.
+Source: Grigorev, Black and Hilliges, "HOOD" (2023), repository at 9bc1076, models/, utils/normalization.py and
+utils/mesh_creation.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
-from eslr_jax.errors import CheckpointError
+from eslr_jax.errors import AssetError, CheckpointError
+from eslr_jax.io.garment import GarmentSource
+from eslr_jax.io.mesh import MeshFile
+from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import reader
 from eslr_jax.io.torch_archive import read_torch
 from eslr_jax.types import MIN_DEVIATION, Normalizer
 
 Tensors = Mapping[str, np.ndarray]
 
 _NORMALIZERS = {"garment": "node", "mesh": "mesh_edge", "world": "world_edge", "output": "output"}
+_PINNED = 3  # node_type of a pinned vertex (`NodeType.HANDLE`)
 _CORE = "_learned_model."
 
 
+@reader("garment", [".pkl"])
+def read_hood_garment(path: Path, name: str = "") -> GarmentSource:
+    """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name."""
+    garments = read_pickle(path, content="garment")
+    if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
+        raise AssetError(f"garment file {path} holds no garments by name; give HOOD's garments_dict.pkl")
+    names = [str(key) for key in garments]
+    if not name and len(names) != 1:
+        raise AssetError(f"{path} holds the garments {', '.join(names)[:300]}; name one, as in {path}#NAME")
+    name = name or names[0]
+    if name not in names:
+        raise AssetError(f"{path} has no garment {name!r}; it has {', '.join(names)[:300]}")
+    entry = garments[name]
+    arrays = {}
+    for key in ("rest_pos", "faces"):
+        value = entry.get(key)
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+            raise AssetError(f"garment {name} of {path} has no array {key}; give HOOD's garments_dict.pkl")
+        arrays[key] = value
+    positions = arrays["rest_pos"].astype(np.float64)
+    is_pinned = None
+    if entry.get("node_type") is not None:
+        kinds = np.ravel(entry["node_type"])
+        if kinds.shape != positions.shape[:1]:
+            raise AssetError(
+                f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
+            )
+        is_pinned = kinds == _PINNED
+    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
+
+
 def read_hood(path: str | Path) -> tuple[dict[str, Any], ModelConfig]:
-    """Read a checkpoint of HOOD.
-
-    Args:
-        path: A file that HOOD's training wrote, or the weights of its runner or of its model alone.
-
-    Returns:
-        Weights and architecture; compare them with `models.registry.check_params` before use.
+    """Read weights and architecture of a checkpoint that HOOD's training wrote, or of its runner or model alone.
 
     Raises:
         AssetError: The file is missing or damaged, or it is no file of PyTorch.
@@ -68,7 +100,7 @@ def _convert(tensors: Tensors) -> tuple[dict[str, Any], ModelConfig]:
     size = trained["garment_encoder"]["kernel_0"].shape[1]
     if is_flat:
         steps = _count(tensors, "processor_steps")
-        trained["layers"] = _stack([_flat_step(tensors, f"processor_steps.{k}", size) for k in range(steps)])
+        trained["layers"] = _stack(_flat_step(tensors, f"processor_steps.{k}", size) for k in range(steps))
     else:
         is_cvpr = f"{_CORE}processor_steps1.0.node_processor_dict.node.0.layers.0.weight" in tensors
         steps, counts = 0, set()
@@ -156,12 +188,7 @@ def _normalizer(tensors: Tensors, name: str) -> Normalizer:
 
 
 def _tensor(tensors: Tensors, name: str) -> np.ndarray:
-    """Return a tensor in float32.
-
-    Raises:
-        KeyError: There is none of this name.
-        CheckpointError: It is no array of finite numbers.
-    """
+    """Return a tensor in float32; raise a KeyError if there is none, a CheckpointError if it is not finite."""
     value = tensors[name]
     if not isinstance(value, np.ndarray) or not value.ndim or not np.isfinite(value).all():
         raise CheckpointError(
@@ -177,8 +204,6 @@ def _count(tensors: Tensors, place: str) -> int:
     return max(len(names), 1)  # a missing list is named by its first weight
 
 
-def _stack(layers: list[dict[str, Any]]) -> dict[str, Any]:
+def _stack(layers: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """Stack the weights of equal layers along a new leading axis."""
-    if isinstance(layers[0], dict):
-        return {name: _stack([layer[name] for layer in layers]) for name in layers[0]}
-    return np.stack(layers)  # type: ignore[return-value]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *layers)

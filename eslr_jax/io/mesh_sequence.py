@@ -9,18 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.io.gltf_document import MOVES, GltfDocument, sample_keys
-from eslr_jax.io.mesh import POSITION_KEYS, read_mesh_file, shared_vertices
-from eslr_jax.io.motion import read_number
+from eslr_jax.io.mesh import read_mesh_file
 from eslr_jax.io.npz import check_layout, read_arrays
-from eslr_jax.io.parsing import parsing, split_name
-from eslr_jax.io.skeleton import MAX_FRAMES, whole_rate
+from eslr_jax.io.parsing import split_name
+from eslr_jax.io.registry import find_reader, suffixes_of
+from eslr_jax.io.skeleton import MAX_FRAMES
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
-SUFFIXES = (".obj", ".ply")
-GLTF_SUFFIXES = (".glb", ".gltf")
 DEFAULT_FPS = 30.0  # [1/s], where the files tell no frame rate
-_POSITION_KEYS = (*POSITION_KEYS, "verts")  # the last is HOOD's
+# Names of positions in an archive, first match; the last is HOOD's.
+POSITION_KEYS = ("rest_positions", "positions", "vertices", "verts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,12 +32,7 @@ class MeshSequence:
     mesh: str = ""  # its name in a file that holds several
 
     def __post_init__(self) -> None:
-        """Check the arrays.
-
-        Raises:
-            MeshError: The arrays don't form a moving mesh, or a value is not finite.
-            MotionError: The frame rate is impossible.
-        """
+        """Raise a MeshError unless this is a finite moving mesh, a MotionError at an impossible frame rate."""
         arrays = {"positions": self.positions, "faces": self.faces}
         layout = {"positions": ("f", "frames vertices 3"), "faces": ("iu", "faces 3", "vertices")}
         check_layout(arrays, layout, what=self.name, remedy="export it again", error=MeshError)
@@ -53,7 +46,7 @@ class MeshSequence:
 
 
 def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSequence:
-    """Read a mesh in motion.
+    """Read a mesh in motion, in metres with Y up.
 
     Args:
         path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
@@ -61,9 +54,6 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
             or verts, and optionally `fps` or `timestep`; or of a .glb or .gltf with a mesh that shapes (morph
             targets) move, `FILE#MESH` where there are several.
         fps: Frame rate [1/s]; by default the file's own, or 30.
-
-    Returns:
-        The mesh in motion; positions as in the files, which must be in metres with Y up.
 
     Raises:
         AssetError: The path or one of its files can't be read, or several meshes move.
@@ -85,55 +75,33 @@ def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[M
 
     Arguments and errors are those of `read_mesh_sequence`.
     """
+    if Path(path).is_dir():
+        return [_read_folder(Path(path), DEFAULT_FPS if fps is None else fps)]
     file, mesh = split_name(path)
-    if Path(file).suffix.lower() in GLTF_SUFFIXES:
-        return _read_gltf(Path(file), mesh, fps)
-    path = Path(path)
-    return [
-        _read_folder(path, DEFAULT_FPS if fps is None else fps) if path.is_dir() else _read_archive(path, fps)
-    ]
-
-
-def _read_archive(path: Path, fps: float | None) -> MeshSequence:
-    """Read an npz file."""
-    keys = (*_POSITION_KEYS, "faces", "fps", "timestep")
-    arrays = read_arrays(path, content="mesh sequence", names=keys)
-    key = next((key for key in _POSITION_KEYS if key in arrays), None)
-    if key is None or "faces" not in arrays:
-        raise AssetError(f"mesh sequence {path} lacks faces or {' or '.join(_POSITION_KEYS)}; add them")
-    positions, faces = arrays[key], arrays["faces"]
-    if positions.dtype.kind not in "fiu":
-        raise MeshError(f"{path}: {key} of type {positions.dtype}; expected numbers")
-    rate = fps
-    if rate is None and "fps" in arrays:
-        rate = read_number(arrays["fps"], f"{path}: fps")
-    elif rate is None and "timestep" in arrays:
-        step = read_number(arrays["timestep"], f"{path}: timestep")
-        rate = whole_rate(1.0 / step) if step > 0 else 0.0
-    return MeshSequence(path.name, positions.astype(np.float64), faces, DEFAULT_FPS if rate is None else rate)
+    return find_reader("mesh sequence", file)(file, mesh, fps)
 
 
 def is_mesh_sequence(path: str | Path) -> bool:
-    """Tell whether a path is a folder or an archive of positions over time, and not a rigged body."""
-    path = Path(path)
-    if path.is_dir():
-        return True
-    if path.suffix.lower() != ".npz":
-        return False
-    arrays = read_arrays(path, content="body", names=_POSITION_KEYS)
-    return any(array.ndim == 3 for array in arrays.values())
+    """Tell whether a path is a folder or a file of positions over time, and not a rigged body."""
+    suffix = Path(path).suffix.lower()
+    if suffix == ".npz":
+        arrays = read_arrays(path, content="body", names=POSITION_KEYS)
+        return any(array.ndim == 3 for array in arrays.values())
+    moves, is_rig = (suffix in suffixes_of(kind) for kind in ("mesh sequence", "body"))
+    return Path(path).is_dir() or (moves and not is_rig)
 
 
 def _read_folder(folder: Path, fps: float) -> MeshSequence:
-    """Read one mesh file per frame."""
+    """Read one mesh file per frame, in a format that writes as many."""
+    known = suffixes_of("frames")
     files = sorted(
-        (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()),
+        (file for file in folder.iterdir() if file.suffix.lower() in known and file.is_file()),
         key=lambda file: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)],
     )
     if not files:
-        raise AssetError(f"folder {folder} holds no {' or '.join(SUFFIXES)} files; give one a frame")
+        raise AssetError(f"folder {folder} holds no {' or '.join(known)} files; give one a frame")
     if len({file.suffix.lower() for file in files}) > 1:
-        raise AssetError(f"folder {folder} holds both {' and '.join(SUFFIXES)} files; keep one kind")
+        raise AssetError(f"folder {folder} holds both {' and '.join(known)} files; keep one kind")
     if len(files) > MAX_FRAMES:
         raise AssetError(f"folder {folder} holds {len(files)} files; {MAX_FRAMES} at most are read")
     frames, faces, first = [], np.empty((0, 3), np.int64), None
@@ -151,123 +119,3 @@ def _read_folder(folder: Path, fps: float) -> MeshSequence:
         if len(frames) * len(points) > MAX_POINTS:
             raise AssetError(f"folder {folder} holds more than {MAX_POINTS} points; reduce the mesh")
     return MeshSequence(folder.name, np.stack(frames), faces, fps)
-
-
-def _read_gltf(path: Path, name: str, fps: float | None) -> list[MeshSequence]:
-    """Read the meshes that morph targets and nodes move, all or those of a name."""
-    with parsing(path, "mesh sequence") as file:
-        document = GltfDocument(file)
-        animations = document.items("animations")
-        shapes = {key[0]: key for entry in animations for key in document.key_frames(entry, ("weights",))}
-        nodes = {node: document.item("nodes", node) for node in shapes}
-        found = {
-            node: str(entry.get("name") or document.item("meshes", entry.get("mesh")).get("name"))
-            for node, entry in nodes.items()
-            if "skin" not in entry  # a body
-        }
-        chosen = [node for node, known in found.items() if name in ("", known)]
-        if not chosen:
-            known = ", ".join(found.values()) or "none"
-            raise AssetError(
-                f"{path}: no mesh{name and f' named {name!r}'} is moved by shapes; it has {known}; export the "
-                "garment with its shape keys"
-            )
-        _check_one_clip(document, chosen)
-        at, rate = document.sample_times([shapes[node][3] for node in chosen], fps)
-        moves = [key for entry in animations for key in document.key_frames(entry)]
-        moved = {
-            (node, path): sample_keys(path, how, keys, at_keys, at)
-            for node, path, how, keys, at_keys in moves
-        }
-        world = document.world_matrices(moved, len(at))
-        sequences = []
-        for node in chosen:
-            _, _, kind, times, values = shapes[node]
-            weights = sample_keys("weights", kind, times, values, at)
-            positions, faces = _moved_by_shapes(document, nodes[node]["mesh"], weights, world[:, node])
-            label = path.name if len(found) == 1 else f"{path.name}#{found[node]}"
-            sequences.append(MeshSequence(label, positions, faces, rate, found[node]))
-        return sequences
-
-
-def _check_one_clip(document: GltfDocument, nodes: list[int]) -> None:
-    """Raise an AssetError if several animations give a mesh, or what carries it, the same values.
-
-    Animations of other nodes, such as a character's, may be as many as they like.
-    """
-    carriers = set()
-    for node in nodes:
-        while node >= 0 and node not in carriers:
-            carriers.add(node)
-            node = document.parents[node]
-    clips = [
-        {key[:2] for key in document.key_frames(entry, (*MOVES, "weights")) if key[0] in carriers}
-        for entry in document.items("animations")
-    ]
-    clips = [keyed for keyed in clips if keyed]
-    if sum(map(len, clips)) > len(set().union(*clips)):
-        raise AssetError(f"{document.path} holds {len(clips)} clips; export one")
-
-
-def _moved_by_shapes(
-    document: GltfDocument, index: int, weights: np.ndarray, world: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [m] and faces of a mesh; vertices that were split at seams become one again.
-
-    Args:
-        document: Its file.
-        index: Its number.
-        weights: Of its shapes, shape [frames, shapes].
-        world: From its own space to the world's, shape [frames, 4, 4].
-    """
-    shapes, faces = _read_shapes(document, index)
-    if weights.shape[1] != len(shapes) - 1 or len(weights) * shapes.shape[1] > MAX_POINTS:
-        raise document.fail(f"has {weights.shape[1]} weights for {len(shapes) - 1} shapes of a mesh")
-    kept, place = shared_vertices(shapes.swapaxes(0, 1))
-    local = shapes[0, kept] + np.tensordot(weights, shapes[1:, kept], axes=1)
-    return np.einsum("fij,fvj->fvi", world[:, :3, :3], local) + world[:, None, :3, 3], place[faces]
-
-
-def _read_shapes(document: GltfDocument, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mesh and the offsets of its shapes, [1 + shapes, vertices, 3], and its faces."""
-    parts, faces, count = [], [], 0
-    for primitive in document.item("meshes", index).get("primitives", []):
-        points, triangles = document.triangles(primitive)
-        offsets = [document.offsets(target, points.shape) for target in primitive.get("targets", [])]
-        parts.append(np.stack([points, *offsets]))
-        faces.append(triangles + count)
-        count += len(points)
-    return np.concatenate(parts, axis=1), np.concatenate(faces)
-
-
-def frame_name(stem: str, frame: int, num_frames: int, suffix: str) -> str:
-    """Return a file name; names sort alphabetically in the order of the frames."""
-    digits = max(4, len(str(max(num_frames - 1, 0))))
-    return f"{stem}_{frame:0{digits}d}{suffix}"
-
-
-def obj_text(
-    name: str,
-    positions: np.ndarray,
-    faces: np.ndarray,
-    *,
-    uvs: np.ndarray | None = None,
-    uv_faces: np.ndarray | None = None,
-) -> str:
-    """Return the text of an OBJ file; nine digits keep float32 positions exactly.
-
-    Args:
-        name: Name of the object.
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        uvs: Texture coordinates, shape [uvs, 2].
-        uv_faces: Row of `uvs` for each corner, shape [faces, 3].
-    """
-    lines = [f"o {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(positions, np.float64))]
-    if uvs is not None and uv_faces is not None:
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in np.asarray(uvs, np.float64)]
-        corners = zip((np.asarray(faces) + 1).tolist(), (np.asarray(uv_faces) + 1).tolist(), strict=True)
-        lines += ["f " + " ".join(f"{v}/{t}" for v, t in zip(*corner, strict=True)) for corner in corners]
-    else:
-        lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(faces) + 1).tolist()]
-    return "\n".join(lines) + "\n"

@@ -37,3 +37,15 @@ def byte_color(color: Color) -> tuple[int, int, int]:
     """Return sRGB in [0, 1] as bytes."""
     red, green, blue = (round(255 * value) for value in color)
     return red, green, blue
+
+
+def srgb_to_linear(color: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """Decode sRGB values in [0, 1] to linear ones, float32 (IEC 61966-2-1)."""
+    value = np.clip(np.asarray(color, np.float32), 0.0, 1.0)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(color: np.ndarray) -> np.ndarray:
+    """Encode linear values as sRGB, float32; the inverse of `srgb_to_linear`."""
+    value = np.clip(np.asarray(color, np.float32), 0.0, 1.0)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)

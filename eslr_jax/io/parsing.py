@@ -23,14 +23,11 @@ def parsing(
     """Check that a file exists, and turn whatever its parser raises into one named error.
 
     Args:
-        path: Path of the file.
+        path: Path of the file, which is yielded.
         content: What the file should hold, for messages, e.g. "motion".
         max_bytes: Size of the largest file accepted [bytes].
         form: Format for messages where the suffix does not tell it, e.g. " as a pickle".
         remedy: What the user should do about a damaged file.
-
-    Yields:
-        The path.
 
     Raises:
         AssetError: The file is missing, too large, or its parser failed.

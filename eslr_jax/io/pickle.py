@@ -57,6 +57,15 @@ class _Reconstructor(_Stub):
         return arguments[0]()
 
 
+def make_stub(convert: Callable[[Any, _Plain], Any]) -> type:
+    """Return a class of stubs for one global.
+
+    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does the same for
+    what the stub holds.
+    """
+    return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
+
+
 def _attributes(stub: _Stub, plain: _Plain, *names: str) -> dict[str, Any]:
     """Return those of the named attributes that an object was stored with."""
     state = stub.state
@@ -91,16 +100,6 @@ def _buffer(stub: _Stub, plain: _Plain) -> np.ndarray:
     """Convert numpy's _frombuffer(data, dtype, shape, order), of protocol 5."""
     data, dtype, shape, order = stub.arguments
     return _values(data, plain(dtype), shape, _text(order), plain)
-
-
-def _scalar(stub: _Stub, plain: _Plain) -> Any:
-    """Convert numpy's scalar(dtype, data)."""
-    return _values(stub.arguments[1], plain(stub.arguments[0]), (), "C", plain)[()]
-
-
-def _chumpy(stub: _Stub, plain: _Plain) -> np.ndarray:
-    """Convert chumpy.ch.Ch, an array in the attribute `x`."""
-    return np.asarray(_attributes(stub, plain, "x")["x"])
 
 
 def _chumpy_select(stub: _Stub, plain: _Plain) -> np.ndarray:
@@ -150,16 +149,6 @@ def _text(value: Any) -> str:
     return value.decode("latin1") if isinstance(value, bytes) else value
 
 
-def make_stub(convert: Callable[[Any, Callable[[Any], Any]], Any]) -> type:
-    """Return a class of stubs for one global.
-
-    Args:
-        convert: Makes plain data of a stub, with its `arguments` and `state`. Its second argument does the same
-            for what the stub holds.
-    """
-    return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
-
-
 _ALLOWED: dict[str, type] = {
     "copyreg._reconstructor": _Reconstructor,
     "builtins.object": _Stub,  # the base that _reconstructor names
@@ -169,11 +158,13 @@ _ALLOWED: dict[str, type] = {
     "numpy.dtype": make_stub(_dtype),
     "numpy.ndarray": make_stub(_array),
     "numpy._core.multiarray._reconstruct": make_stub(_array),  # an array that gets its state later
-    "numpy._core.multiarray.scalar": make_stub(_scalar),
+    "numpy._core.multiarray.scalar": make_stub(  # scalar(dtype, data)
+        lambda stub, plain: _values(stub.arguments[1], plain(stub.arguments[0]), (), "C", plain)[()]
+    ),
     "numpy._core.numeric._frombuffer": make_stub(_buffer),
     "scipy.sparse.csc.csc_matrix": make_stub(_sparse(scipy.sparse.csc_array)),
     "scipy.sparse.csr.csr_matrix": make_stub(_sparse(scipy.sparse.csr_array)),
-    "chumpy.ch.Ch": make_stub(_chumpy),
+    "chumpy.ch.Ch": make_stub(lambda stub, plain: np.asarray(_attributes(stub, plain, "x")["x"])),
     "chumpy.reordering.Select": make_stub(_chumpy_select),
 }
 _RENAMED = {  # modules of Python 2, of NumPy before 2 and of SciPy since 1.8
@@ -208,11 +199,6 @@ class _Unpickler(pickle.Unpickler):
 def read_pickle(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> Any:
     """Read a pickle of plain containers, numbers and arrays, also one that Python 2 wrote.
 
-    Args:
-        path: Path of the file.
-        content: What the file should hold, for messages, e.g. "garment".
-        max_bytes: Size of the largest file accepted [bytes].
-
     Returns:
         dict, list, tuple, str, bytes, numbers, None, arrays, and sparse arrays (`csc_array`, `csr_array`). Check
         the shape of a sparse array before you make it dense: the file may claim any. A chumpy object becomes an
@@ -231,36 +217,27 @@ def unpickle(
     stubs: Mapping[str, type] | None = None,
     find_persistent: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """Return the content of a pickle as plain data; see `read_pickle`.
+    """Return the content of a pickle as plain data, see `read_pickle`; for `parsing`: it raises anything.
 
     Args:
         data: The pickle.
         stubs: Further globals that it may name, as `module.name`, each with its class of `make_stub`.
         find_persistent: Returns the stub for a persistent id, where the pickle may refer to data outside of it.
-
-    Raises:
-        Exception: The pickle is damaged or holds anything but data; of any class, so call it within `parsing`.
     """
-    _check_memo(data)
-    return _plain(_Unpickler(data, {**_ALLOWED, **(stubs or {})}, find_persistent).load(), {})
-
-
-def _check_memo(data: bytes) -> None:
-    """Raise on a memo index beyond the number of opcodes: the unpickler would allocate a table of that size."""
-    puts = [0]
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(data), 1):
-        if opcode.name.endswith("PUT") and isinstance(argument, int):
-            puts.append(argument - count)
-    if max(puts) > 0:
+    puts = (
+        argument - count
+        for count, (opcode, argument, _) in enumerate(pickletools.genops(data), 1)
+        if opcode.name.endswith("PUT") and isinstance(argument, int)
+    )
+    if max(puts, default=0) > 0:  # the unpickler would allocate a table of that size
         raise ValueError("a memo index beyond the number of opcodes")
+    return _plain(_Unpickler(data, {**_ALLOWED, **(stubs or {})}, find_persistent).load(), {})
 
 
 def _plain(value: Any, done: dict[int, Any]) -> Any:
     """Return plain data for what the unpickler built; shared objects stay shared.
 
-    Args:
-        value: Anything that the unpickler built.
-        done: Results so far by the identity of their source; None while a source is being converted.
+    `done` holds results by the identity of their source; None while a source is being converted.
     """
     if type(value) in _PLAIN:
         return value

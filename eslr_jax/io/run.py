@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir, move_files
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.types import Body, BodyMotion, Scene
 

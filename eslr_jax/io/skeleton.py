@@ -90,11 +90,11 @@ class RiggedMesh:
 
 
 def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[list[int], list[int]]:
-    """Put parents before children, and every joint under one root.
+    """Put parents before children, and every joint under one root: further ones become children of the first.
 
     Args:
         names: Names of the joints, for messages.
-        parents: Parent of each joint; -1 is a root. Further roots become children of the first one.
+        parents: Parent of each joint; -1 is a root.
         what: What messages call the file.
 
     Returns:
@@ -143,15 +143,7 @@ def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
 
 
 def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-    """Multiply local rotations down the chain of joints.
-
-    Args:
-        local: Rotations relative to the parent, shape [frames, joints, 3, 3].
-        parents: Parent of each joint, which comes before it; -1 is a root.
-
-    Returns:
-        Rotations in world axes, shape [frames, joints, 3, 3].
-    """
+    """Return rotations in world axes of local ones, both [frames, joints, 3, 3]; parents come before children."""
     result = np.array(local, np.float64)
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -160,15 +152,12 @@ def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
 
 
 def chain_offsets(rotations: np.ndarray, offsets: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-    """Add offsets, turned as the parents have turned, down the chain of joints.
+    """Return the positions [frames, joints, 3] of joints at turned offsets from their parents.
 
     Args:
         rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
         offsets: Position of each joint relative to its parent in the rest pose's axes, shape [frames, joints, 3].
         parents: Parent of each joint, which comes before it; -1 is a root.
-
-    Returns:
-        Joint positions, shape [frames, joints, 3].
     """
     result = np.array(offsets, np.float64)
     for joint, parent in enumerate(parents):
@@ -179,15 +168,12 @@ def chain_offsets(rotations: np.ndarray, offsets: np.ndarray, parents: tuple[int
 
 
 def chain_positions(rotations: np.ndarray, root: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return the posed joints of rigid bones.
+    """Return the positions [frames, joints, 3] of the joints of rigid bones.
 
     Args:
         rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
         root: Position of joint 0, shape [frames, 3].
         skeleton: Joints at rest.
-
-    Returns:
-        Joint positions, shape [frames, joints, 3].
     """
     rest = skeleton.rest_positions
     offsets = np.tile(rest - rest[np.maximum(skeleton.parents, 0)], (len(rotations), 1, 1))
@@ -214,10 +200,6 @@ def pose_offsets(
         local: Rotation of each joint relative to its parent, shape [frames, joints, 3, 3].
         offsets: Position of each joint relative to its parent, shape [frames, joints, 3].
         fps: Frame rate [1/s].
-
-    Raises:
-        AssetError: The joints form no tree.
-        MotionError: The motion is not finite, or its frame rate impossible.
     """
     names = unique_names(joint_names)
     order, new_parents = order_joints(names, parents, what=f"motion {name}")

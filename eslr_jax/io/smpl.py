@@ -18,9 +18,10 @@ import numpy as np
 import scipy.sparse
 
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.parsing import parsing
+from eslr_jax.io.bundled import read_number
+from eslr_jax.io.npz import check_layout, read_arrays
 from eslr_jax.io.pickle import read_pickle
+from eslr_jax.io.registry import reader
 from eslr_jax.io.skeleton import (
     RiggedMesh,
     Skeleton,
@@ -54,8 +55,14 @@ JOINT_NAMES = {  # by number of joints
     52: (*_BODY, *_HANDS),  # SMPL-H
     55: (*_BODY, *_FACE, *_HANDS),  # SMPL-X
 }
-_MODEL_KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table")
-_OPTIONAL_KEYS = ("shapedirs", "posedirs", "joint_names")
+_MODEL = {
+    "v_template": ("fiu", "vertices 3"),
+    "f": ("fiu", "faces 3"),
+    "weights": ("fiu", "vertices joints"),
+    "J_regressor": ("fiu", "joints vertices"),
+    "kintree_table": ("fiu", "2 joints"),
+}
+_BLENDS = {"shapedirs": ("fiu", "vertices 3 shapes"), "posedirs": ("fiu", "vertices 3 entries")}
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # to Y up
 
 # A person of 1.7 m in a T-pose [m], for motions that come without a body: straight limbs with the segments of
@@ -71,68 +78,65 @@ _T_POSE = {
 # ---------------------------------------------------------------- bodies
 
 
-def is_smpl_model(path: str | Path) -> bool:
-    """Tell whether an .npz holds a SMPL model, by its keys."""
-    return {"v_template", "kintree_table"} <= set(read_arrays(path, content="body", names=_MODEL_KEYS))
+def _is_smpl_model(path: Path) -> bool:
+    """Tell a SMPL model from another .npz, by its keys."""
+    return path.suffix.lower() == ".pkl" or {"v_template", "kintree_table"} <= set(
+        read_arrays(path, content="body", names=tuple(_MODEL))
+    )
 
 
-def read_smpl_body(path: str | Path) -> RiggedMesh:
-    """Read a body model in the layout of SMPL.
+@reader("body", [".npz", ".pkl"], accepts=_is_smpl_model)
+def read_smpl_body(path: Path, _meshes: str = "") -> RiggedMesh:
+    """Read the mean body of a model in the layout of SMPL, with its shape and pose blend shapes.
 
     Args:
         path: Path of an .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and optionally
             shapedirs, posedirs and joint_names. A model with other than 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)
             joints needs joint_names.
-
-    Returns:
-        The mean body at rest, with its shape and pose blend shapes.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it lacks a part of a body model.
     """
-    path = Path(path)
     if path.suffix.lower() == ".pkl":
         values = read_pickle(path, content="body")
     else:
-        values = read_arrays(path, content="body", names=(*_MODEL_KEYS, *_OPTIONAL_KEYS))
+        values = read_arrays(path, content="body", names=(*_MODEL, *_BLENDS, "joint_names"))
     if not isinstance(values, dict):
         raise AssetError(f"body file {path} holds no table; give a SMPL model")
-    missing = [key for key in _MODEL_KEYS if key not in values]
+    missing = [key for key in _MODEL if key not in values]
     if missing:
         raise AssetError(f"body file {path} lacks {', '.join(missing)}; give a SMPL model")
-    with parsing(path, "body"):
-        return _smpl_body(path, values)
-
-
-def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
-    """Return the body of a model's arrays."""
-    positions = _numbers(path, values, "v_template", (None, 3))
-    count = len(positions)
+    arrays = {
+        key: values[key] if scipy.sparse.issparse(values[key]) else np.asarray(values[key])
+        for key in (*_MODEL, *_BLENDS)
+        if key in values
+    }
+    check_layout(arrays, _MODEL | _BLENDS, what=f"body file {path}", remedy="fetch the file again")
+    positions, weights = arrays["v_template"].astype(np.float64), arrays["weights"].astype(np.float64)
+    count, joints = weights.shape
     if not 0 < count <= MAX_VERTICES:
         raise AssetError(f"body file {path} has {count} vertices; expected 1 to {MAX_VERTICES}")
-    weights = _numbers(path, values, "weights", (count, None))
-    joints = weights.shape[1]
     names = _joint_names(path, values, joints)
-    tree = _numbers(path, values, "kintree_table", (2, joints)).astype(np.int64)
+    tree = arrays["kintree_table"].astype(np.int64)
     numbers = {int(number): place for place, number in enumerate(tree[1])}
     parents = [-1, *(numbers.get(int(parent), -2) for parent in tree[0, 1:])]
     order, new_parents = order_joints(names, parents, what=f"body file {path}")
     if order != list(range(joints)):
         raise AssetError(f"body file {path} has joints before their parents; give a SMPL model")
-    regressor = _regressor(path, values["J_regressor"], joints, count)
+    regressor = arrays["J_regressor"].astype(np.float64)
     shapes = joint_shapes = pose = None
-    if "shapedirs" in values:
-        shapes = _numbers(path, values, "shapedirs", (count, 3, None))[:, :, :NUM_SHAPES]
+    if "shapedirs" in arrays:
+        shapes = arrays["shapedirs"].astype(np.float64)[:, :, :NUM_SHAPES]
         joint_shapes = (regressor @ shapes.reshape(count, -1)).reshape(joints, 3, -1)
-    if "posedirs" in values:
-        pose = _numbers(path, values, "posedirs", (count, 3, 9 * (joints - 1)))
-        _check_finite(path, "posedirs", pose)
+    if "posedirs" in arrays:
+        pose = arrays["posedirs"].astype(np.float64)
+        if pose.shape[2] != 9 * (joints - 1) or not np.isfinite(pose).all():
+            raise AssetError(
+                f"{path}: posedirs {pose.shape} must be finite, {9 * (joints - 1)} a vertex; fetch the file again"
+            )
     used = max(1, int((weights > 0).sum(1).max()))
     indices = np.argsort(-weights, axis=1, kind="stable")[:, :used]
     return RiggedMesh(
         name=path.name,
         positions=positions,
-        faces=_numbers(path, values, "f", (None, 3)).astype(np.int64),
+        faces=arrays["f"].astype(np.int64),
         skin_weights=np.take_along_axis(weights, indices, axis=1),
         skin_indices=indices,
         skeleton=Skeleton(tuple(names), tuple(new_parents), regressor @ positions),
@@ -140,27 +144,6 @@ def _smpl_body(path: Path, values: Mapping[str, Any]) -> RiggedMesh:
         joint_shape_directions=joint_shapes,
         pose_directions=pose,
     )
-
-
-def _numbers(path: Path, values: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return an array of numbers of a shape, in which None is any length."""
-    array = np.asarray(values[key])
-    fits = array.ndim == len(shape) and all(
-        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind not in "fiu" or not fits:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise AssetError(
-            f"{path}: {key} has shape {array.shape} and type {array.dtype}, not numbers of shape [{wanted}]; "
-            "fetch the file again"
-        )
-    return array if array.dtype.kind in "iu" else array.astype(np.float64)
-
-
-def _check_finite(path: Path, key: str, array: np.ndarray) -> None:
-    """Raise on NaN and infinity."""
-    if not np.isfinite(array).all():
-        raise AssetError(f"{path}: {key} is not finite; fetch the file again")
 
 
 def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str]:
@@ -177,32 +160,12 @@ def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str
     return list(JOINT_NAMES[joints])
 
 
-def _regressor(path: Path, value: Any, joints: int, count: int) -> Any:
-    """Return the matrix from vertices to joints, dense or sparse as in the file."""
-    matrix = value if scipy.sparse.issparse(value) else np.asarray(value)
-    if matrix.shape != (joints, count) or matrix.dtype.kind not in "fiu":
-        raise AssetError(
-            f"{path}: J_regressor has shape {matrix.shape}, not [{joints}, {count}]; fetch the file again"
-        )
-    return matrix.astype(np.float64)
-
-
 # ---------------------------------------------------------------- motions
 
 
-def read_amass(path: str | Path) -> SkeletonMotion:
-    """Read a motion of AMASS.
-
-    Args:
-        path: Path of an .npz with `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`), Z up.
-
-    Returns:
-        The motion, Y up.
-
-    Raises:
-        AssetError: The file is missing or damaged.
-        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
-    """
+@reader("motion", [".npz"])
+def read_amass(path: Path, _clip: str = "") -> SkeletonMotion:
+    """Read a motion of AMASS, Z up: `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`)."""
     keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
     values = read_arrays(path, content="motion", names=keys)
     rates = [values[key] for key in keys[2:] if key in values]
@@ -211,54 +174,35 @@ def read_amass(path: str | Path) -> SkeletonMotion:
         raise MotionError(
             f"motion file {path} lacks {', '.join(missing)}; give a motion of AMASS, not its shape"
         )
-    if rates[0].size != 1 or rates[0].dtype.kind not in "fiu":
-        raise MotionError(f"motion file {path}: {rates[0].dtype} as the frame rate; expected a number")
-    return _parameters(Path(path), values["poses"], values["trans"], float(rates[0].ravel()[0]), _Z_UP)
+    fps = read_number(rates[0], f"motion file {path}: the frame rate")
+    return _parameters(path, values["poses"], values["trans"], fps, _Z_UP)
 
 
-def read_smpl_pickle(path: str | Path) -> SkeletonMotion:
-    """Read a motion of HOOD or of the VTO dataset.
+@reader("motion", [".pkl"])
+def read_smpl_pickle(path: Path, _clip: str = "") -> SkeletonMotion:
+    """Read a motion of HOOD or VTO at 30 frames per second.
 
-    Args:
-        path: Path of a .pkl with `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
-
-    Returns:
-        The motion at 30 frames per second.
-
-    Raises:
-        AssetError: The file is missing or damaged, or it holds anything but plain data.
-        MotionError: An array is missing, or the motion is not of 22, 24, 52 or 55 joints.
+    A pickle of `global_orient`, `body_pose`, `transl` (HOOD) or `pose`, `translation` (VTO).
     """
     values = read_pickle(path, content="motion")
     values = values if isinstance(values, dict) else {}
-    names = {
-        "pose": next((key for key in ("pose", "poses") if key in values), None),
-        "move": next((key for key in ("transl", "translation", "trans") if key in values), None),
-    }
+    pose = next((key for key in ("pose", "poses") if key in values), None)
+    move = next((key for key in ("transl", "translation", "trans") if key in values), None)
     if {"global_orient", "body_pose"} <= values.keys():
-        with parsing(path, "motion"):
-            parts = (np.atleast_2d(np.asarray(values[key])) for key in ("global_orient", "body_pose"))
-            poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-    elif names["pose"] is not None:
-        poses = values[names["pose"]]
+        parts = (np.atleast_2d(np.asarray(values[key])) for key in ("global_orient", "body_pose"))
+        poses = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    elif pose is not None:
+        poses = values[pose]
     else:
         found = ", ".join(str(key)[:30] for key in list(values)[:6]) or "no table"
         raise MotionError(f"motion file {path} has {found}; it needs body_pose and global_orient, or pose")
-    if names["move"] is None:
+    if move is None:
         raise MotionError(f"motion file {path} has no transl or translation; give a motion of HOOD or VTO")
-    return _parameters(Path(path), poses, values[names["move"]], HOOD_FPS, np.eye(3))
+    return _parameters(path, poses, values[move], HOOD_FPS, np.eye(3))
 
 
 def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray) -> SkeletonMotion:
-    """Return the motion of a table of rotations and translations.
-
-    Args:
-        path: Path of the file, for messages.
-        poses: Axis-angle rotations [rad], shape [frames, 3 joints].
-        moves: Translations of the root [m], shape [frames, 3].
-        fps: Frame rate [1/s].
-        axes: Rotation matrix from the file's axes to ours, shape [3, 3].
-    """
+    """Return the motion of rotations [frames, 3 joints] [rad] and root translations [m], turned to our axes."""
     poses, moves = np.asarray(poses), np.asarray(moves)
     is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
     if (
@@ -272,12 +216,9 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
             f"motion file {path}: rotations {poses.shape} and translations {moves.shape}; expected [frames, 3 "
             f"times {', '.join(map(str, JOINT_NAMES))} joints] and [frames, 3]"
         )
-    for label, table in (("rotations", poses), ("translations", moves)):
-        if not np.isfinite(table).all():
-            frame = int(np.argmin(np.isfinite(table).all(axis=1)))
-            raise MotionError(
-                f"motion file {path}: {label} of frame {frame} are not finite; cut or repair it"
-            )
+    is_finite = np.isfinite(poses).all(axis=1) & np.isfinite(moves).all(axis=1)
+    if not is_finite.all():
+        raise MotionError(f"motion file {path}: frame {np.argmin(is_finite)} is not finite; cut or repair it")
     skeleton = _standing_skeleton(poses.shape[1] // 3)
     local = rotation_matrices(poses.reshape(len(poses), -1, 3))
     local[:, 0] = axes @ local[:, 0]
@@ -288,16 +229,11 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
 
 def _standing_skeleton(joints: int) -> Skeleton:
     """Return SMPL's joints of a person in a T-pose."""
-    names = JOINT_NAMES[joints]
-    parents = list(_BODY_PARENTS)
-    for place in range(len(_BODY), joints):
-        name = names[place]
-        side = name.split("_")[0]
-        if name.endswith(("2", "3")):
-            parents.append(place - 1)
-        else:
-            parents.append(_BODY.index("head" if name in _FACE else f"{side}_wrist"))
-    rest = []
+    names, rest = JOINT_NAMES[joints], []
+    parents: list[int] = list(_BODY_PARENTS)
+    for place, name in enumerate(names[len(_BODY) :], len(_BODY)):
+        end = "head" if name in _FACE else f"{name.split('_')[0]}_wrist"
+        parents.append(place - 1 if name.endswith(("2", "3")) else _BODY.index(end))
     for name, parent in zip(names, parents, strict=True):
         side, _, word = name.rpartition("_")
         if word in _T_POSE:

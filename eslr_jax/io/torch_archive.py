@@ -33,12 +33,7 @@ _STORAGES = {
 
 
 def read_torch(path: str | Path, *, content: str, max_bytes: int = 4 << 30) -> Any:
-    """Read a file that `torch.save` wrote (PyTorch 1.6 or later).
-
-    Args:
-        path: Path of the file.
-        content: What the file should hold, for messages, e.g. "checkpoint".
-        max_bytes: Largest unpacked size accepted [bytes].
+    """Read a file that `torch.save` wrote (PyTorch 1.6 or later) and that unpacks to at most `max_bytes`.
 
     Returns:
         dict, list, tuple, str, numbers and None, with NumPy arrays in the place of tensors and parameters.
@@ -74,13 +69,7 @@ def _refuse(stub: Any, plain: Any) -> Any:
 def _storage_finder(
     archive: zipfile.ZipFile, root: str, dtypes: Mapping[type, np.dtype[Any]]
 ) -> Callable[[Any], Any]:
-    """Return the function from a persistent id to the stub of a storage.
-
-    Args:
-        archive: The open file.
-        root: Folder of its members.
-        dtypes: Type of the numbers of every class of storages.
-    """
+    """Return the function from a persistent id to the stub of a storage in a folder of the open file."""
     order = f"{root}byteorder"
     is_big = order in archive.namelist() and archive.read(order) == b"big"
 

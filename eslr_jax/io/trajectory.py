@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.io.skin import Skin
 from eslr_jax.types import Material, Plate, Threads
 
 FORMAT = "eslr-trajectory-2"
-_OLD_FORMAT = "eslr-trajectory-1"  # its metadata is the run's report
 _REQUIRED = ("format", "positions", "velocities", "faces", "timestep", "metadata")
 _BODY = {  # field of BodyTrack -> array
     "positions": "body_positions",
@@ -161,21 +160,18 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def read_trajectory(path: str | Path) -> TrajectoryFile:
-    """Read what `write_trajectory` wrote, now or in an older version.
+    """Read what `write_trajectory` wrote.
 
     Args:
         path: Path of the file.
 
     Returns:
-        The trajectory. An older file may lack the body's rest pose and contact faces; its first frame and all of
-        its faces take their place.
+        The trajectory.
 
     Raises:
         AssetError: The file is missing, truncated, damaged, or no trajectory.
     """
     arrays = read_arrays(path, content="trajectory")
-    if str(arrays.get("format")) == _OLD_FORMAT:
-        arrays = _converted(arrays)
     _check(arrays, path)
     try:
         metadata = json.loads(str(arrays["metadata"]))
@@ -209,17 +205,6 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         float(arrays["ground"]) if "ground" in arrays else None,
         arrays.get("residuals"),
     )
-
-
-def _converted(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays of a file of the first format as those of today."""
-    result = {**arrays, "format": np.array(FORMAT)}
-    positions, faces = arrays.get("body_positions"), arrays.get("body_faces")
-    if positions is not None and faces is not None and len(positions):
-        result.setdefault("body_rest_positions", positions[0])
-        result.setdefault("contact_faces", faces)
-        result.setdefault("contact_boundary", np.empty(0, np.int32))
-    return result
 
 
 def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:

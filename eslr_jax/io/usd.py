@@ -14,40 +14,31 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.extras import require
-from eslr_jax.io.animated import AnimatedMesh, check_meshes, vertex_normals
+from eslr_jax.io.animated import AnimatedMesh, Skin, corrections, influences, local_motion, vertex_normals
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.color import srgb_to_linear
-from eslr_jax.io.palette import Color
+from eslr_jax.io.palette import Color, srgb_to_linear
+from eslr_jax.io.registry import writer
 from eslr_jax.io.skeleton import whole_rate
-from eslr_jax.io.skin import Skin, corrections, influences, local_motion
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 TOLERANCE = 1e-4  # [m] by which joints may miss a vertex
 
 
+@writer("scene", SUFFIXES)
 def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float) -> None:
-    """Write meshes as a USD stage, one whole time code per frame, atomically.
+    """Write meshes as a USD stage, one whole time code per frame, atomically; `.usda` is text.
 
-    Vertices keep their order; texture coordinates are the face-varying primvar `st`. Metres, Y up.
-
-    Args:
-        path: Path of the file; `.usda` is text, `.usd` and `.usdc` are binary.
-        meshes: Meshes with the same number of frames.
-        timestep: Time between frames [s]. A rate that rounding keeps from a whole number is that number:
-            1/30 s in float32 is exactly 30 frames per second.
+    Vertices keep their order; texture coordinates are the face-varying primvar `st`. Metres, Y up. A rate that
+    rounding keeps from a whole number is that number: 1/30 s in float32 is exactly 30 frames per second.
 
     Raises:
         MissingExtraError: The extra is not installed.
-        MeshError: A mesh is empty, not finite, or its parts disagree.
-        MotionError: The numbers of frames differ, or a joint does not move rigidly.
-        AssetError: The suffix is unknown, or the file can't be written.
     """
     require("pxr.Usd", extra="usd", purpose="USD")
     from pxr import Usd, UsdGeom  # pyright: ignore[reportMissingImports]
 
     if Path(path).suffix.lower() not in SUFFIXES:
         raise AssetError(f"can't write {path} as USD; name it one of {', '.join(SUFFIXES)}")
-    check_meshes(meshes, timestep)
     rate = whole_rate(1.0 / timestep)
     with atomic_write(path) as temporary:
         stage = Usd.Stage.CreateNew(str(temporary))

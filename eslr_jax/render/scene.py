@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.extras import require
-from eslr_jax.io.color import linear_to_srgb, srgb_to_linear
+from eslr_jax.io.palette import linear_to_srgb, srgb_to_linear
 from eslr_jax.render.camera import Camera
 from eslr_jax.render.denoise import smooth_grain
 

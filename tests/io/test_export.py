@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +13,11 @@ import trimesh
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.cli.runs import export
-from eslr_jax.errors import AssetError, MeshError
+from eslr_jax.errors import AssetError
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, in_vertex_order
 from eslr_jax.io.mesh_sequence import read_mesh_sequence
-from eslr_jax.io.point_cache import write_mdd, write_pc2
-from eslr_jax.io.skin import Skin
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
 
 FRAMES, STEP = 4, 1 / 30
@@ -378,15 +376,6 @@ def test_another_garment_is_refused(tmp_path, run, garment):
         export_trajectory(run, tmp_path / "a.glb", garment=replace(garment, faces=garment.faces[::-1]))
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3, 3)), np.zeros((2, 3)), np.full((2, 3, 3), np.nan)])
-def test_point_caches_of_nothing_are_not_written(tmp_path, points):
-    with pytest.raises(MeshError):
-        write_pc2(tmp_path / "a.pc2", points)
-    with pytest.raises(MeshError):
-        write_mdd(tmp_path / "a.mdd", points, STEP)
-    assert not os.listdir(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["garment.npz", "trajectory.npz", "report.json"])
 def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name):
     write_trajectory(tmp_path / "trajectory.npz", run)
@@ -396,21 +385,3 @@ def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name
         export(tmp_path, Path(name), format_="npz", content="garment")
     assert os.listdir(tmp_path) == ["trajectory.npz"]
     assert (tmp_path / "trajectory.npz").read_bytes() == before
-
-
-@pytest.mark.slow
-def test_the_command_exports_a_run(tmp_path, run):
-    write_trajectory(tmp_path / "trajectory.npz", run)
-    command = [
-        sys.executable,
-        "-m",
-        "eslr_jax.cli",
-        "export",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "a.mdd"),
-    ]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
-    assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from garment_bytes import FACES, POSITIONS, whole_file
+from whole_files import FACES, POSITIONS, whole_garment
 
 from eslr_jax.assets import load_motion
 from eslr_jax.errors import AssetError
@@ -57,7 +57,7 @@ def test_a_folder_may_have_the_sign_of_names_in_its_own(hood, tmp_path):
     assert read_garment_source(f"{folder}/garments_dict.pkl#dress").name == "dress"
     np.savez(folder / "a.npz", positions=np.tile(POSITIONS, (3, 1, 1)), faces=FACES)
     assert len(read_mesh_sequence(folder / "a.npz").positions) == 3
-    (folder / "a.glb").write_bytes(whole_file("glb", tmp_path))
+    whole_garment("glb", folder / "a.glb")
     with pytest.raises(AssetError, match="no mesh is moved by shapes"):  # found, and read
         read_mesh_sequence(folder / "a.glb")
     (folder / "a.bvh").write_text("HIERARCHY")
@@ -69,9 +69,9 @@ def test_a_folder_may_have_the_sign_of_names_in_its_own(hood, tmp_path):
 def test_formats_that_prescribe_metres_are_known(tmp_path):
     for kind, is_metric in (("glb", True), ("obj", False), ("ply", False)):
         path = tmp_path / f"scarf.{kind}"
-        path.write_bytes(whole_file(kind, tmp_path))
+        whole_garment(kind, path)
         assert read_garment_source(path).is_metric is is_metric
         assert not is_garment_file(path)
     path = tmp_path / "fitted.npz"
-    path.write_bytes(whole_file("fitted.npz", tmp_path))
+    whole_garment("fitted.npz", path)
     assert is_garment_file(path)

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pygltflib as gltf
 import pytest
-from broken import refuses
+from broken import pack, refuses
 from formats import GlbWriter, write_character
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.assets import load_body, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.body.rig import make_body, make_motion
 from eslr_jax.io.gltf_document import GltfDocument, sample_keys
@@ -197,92 +196,13 @@ def with_targets(document, offsets, of_node, of_mesh):
     return pack(tables, blob)
 
 
-def edit(path, change):
-    document = gltf.GLTF2().load(str(path))
-    change(document)
-    document.save(str(path))
-
-
-def unbind(document):
-    for node in document.nodes:
-        node.skin = None
-
-
-BROKEN = {
-    "no skin": (lambda d: setattr(d, "skins", []), "skin"),
-    "no bound mesh": (unbind, "no triangles"),
-    "a joint beyond": (lambda d: d.skins[0].joints.append(99), "99"),
-    "a cycle": (lambda d: d.nodes[2].children.append(0), "node"),
-    "an accessor beyond": (lambda d: setattr(d.accessors[1], "count", 10**9), "values"),
-    "a view beyond": (lambda d: setattr(d.bufferViews[0], "byteOffset", 10**9), "values"),
-    "compressed": (lambda d: setattr(d, "extensionsRequired", ["KHR_draco_mesh_compression"]), "draco"),
-    "strips": (lambda d: setattr(d.meshes[0].primitives[0], "mode", 5), "strips"),
-    "no size": (lambda d: setattr(d.nodes[0], "rotation", [0.0, 0.0, 0.0, 0.0]), "rotation"),
-    "a file elsewhere": (lambda d: setattr(d.buffers[0], "uri", "../../secret.bin"), "beside"),
-    "a file that is missing": (lambda d: setattr(d.buffers[0], "uri", "other.bin"), "not there"),
-}
-
-
-@pytest.mark.parametrize("kind", BROKEN)
-def test_broken_characters_are_named_in_one_line(tmp_path, kind):
-    change, word = BROKEN[kind]
-    path = tmp_path / "avatar.glb"
-    write(path, np.random.default_rng(0))
-    document = gltf.GLTF2().load(str(path))
-    change(document)
-    blob, uri = document.binary_blob(), document.buffers[0].uri
-    document.buffers[0].uri = None
-    document.set_binary_blob(blob)
-    text = json.loads(document.gltf_to_json())
-    if uri:
-        text["buffers"][0]["uri"] = uri
-    path.write_bytes(pack(text, blob))
-    refuses(read_gltf_body, path, word)
-
-
-def pack(tables, blob):
-    """A GLB of JSON tables and a binary chunk."""
-    text = json.dumps(tables).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = (
-        len(text).to_bytes(4, "little") + b"JSON" + text + len(blob).to_bytes(4, "little") + b"BIN\0" + blob
-    )
-    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks
-
-
-@pytest.mark.parametrize(
-    ("content", "word"),
-    [
-        (b"", "avatar"),
-        (b"glTF", "avatar"),
-        (b"{}", "no glTF"),
-        (b"[1, 2]", "no glTF"),
-        (b"{" * 5000, "avatar"),
-    ],
-)
-def test_what_is_no_gltf_is_refused(tmp_path, content, word):
-    path = tmp_path / "avatar.glb"
-    path.write_bytes(content)
-    for read in (read_gltf_body, read_gltf_motion):
-        refuses(read, path, word)
-
-
-def test_truncated_files_are_refused(tmp_path):
-    path = tmp_path / "avatar.glb"
-    write(path, np.random.default_rng(0))
-    data = path.read_bytes()
-    for share in (0.2, 0.6, 0.95):
-        path.write_bytes(data[: int(share * len(data))])
-        refuses(read_gltf_body, path)
-
-
 def test_clips_and_meshes_are_picked_by_name(tmp_path):
     path = tmp_path / "avatar.glb"
     write(path, np.random.default_rng(0), clip="dance", mesh_name="Skin")
     assert read_gltf_motion(path, "dance").name == "dance"
     refuses(lambda file: read_gltf_motion(file, "walk"), path, "dance")
-    assert len(read_gltf_body(path, ["Skin"]).positions) == 40
-    refuses(lambda file: read_gltf_body(file, ["Hat"]), path, "Skin")
+    assert len(read_gltf_body(path, "Skin").positions) == 40
+    refuses(lambda file: read_gltf_body(file, "Hat"), path, "Skin")
 
 
 def test_a_sparse_accessor_overwrites_its_base(tmp_path):
@@ -300,10 +220,3 @@ def test_a_sparse_accessor_overwrites_its_base(tmp_path):
     from eslr_jax.io.gltf_document import GltfDocument
 
     np.testing.assert_array_equal(GltfDocument(tmp_path / "a.glb").array(base)[:, 0], [0, 1, 0, 1])
-
-
-@pytest.mark.parametrize("load", [load_body, load_motion])
-def test_fbx_is_refused_with_the_way_out(tmp_path, load):
-    path = tmp_path / "avatar.fbx"
-    path.write_bytes(b"Kaydara FBX Binary  \0")
-    refuses(load, path, "export it as glTF", "File > Export > glTF 2.0")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 
 import jax
 import jax.numpy as jnp
@@ -184,27 +183,6 @@ def test_a_network_with_statistics_answers_as_before_its_export(tmp_path):
     assert not np.allclose(before, expected)  # statistics count
     loaded = assert_round_trip(tmp_path, FAITHFUL, params)
     np.testing.assert_array_equal(run(loaded, inputs)[1], expected)
-
-
-def edit_record(path, **fields):
-    record = json.loads(path.read_text())
-    record["model"].update(fields)
-    path.write_text(json.dumps(record))
-
-
-def test_files_with_frozen_options_load_where_the_value_remained(tmp_path):
-    write_weights(tmp_path / "model.npz", new(SMALL), SMALL, {})
-    edit_record(
-        tmp_path / "model.json",
-        residual=True,
-        readd_edges=True,
-        smooth_world_edges=True,
-        world_edge_capacity=None,
-    )
-    assert read_weights(tmp_path / "model.npz")[1] == SMALL
-    edit_record(tmp_path / "model.json", residual=False)
-    with pytest.raises(CheckpointError, match="residual = false is no longer an option"):
-        read_weights(tmp_path / "model.npz")
 
 
 @pytest.mark.parametrize("names", [("params/a", "params/a/b"), ("statistics/mesh/mean",)])
