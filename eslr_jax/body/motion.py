@@ -19,6 +19,7 @@ from eslr_jax.io.skeleton import Skeleton
 from eslr_jax.numerics import product
 from eslr_jax.types import Body, BodyMotion, BodySurface
 
+SHOULDERS = 0.8  # of the body's height, for a body without arms
 _MAX_ABDUCTION = 90.0  # [degrees]; arms lifted further are above the shoulders
 _ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is taken to face it
 
