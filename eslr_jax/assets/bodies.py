@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path, unknown_suffix
+from eslr_jax.assets.catalog import find_asset, is_path, unknown_suffix
 from eslr_jax.body.motion import shape_body
 from eslr_jax.body.rig import make_body
 from eslr_jax.errors import ConfigError
@@ -36,32 +35,19 @@ def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Seq
         MissingExtraError: The file needs an extra that is not installed.
         MeshError: A body is inside out, or in the bundled format not closed.
     """
-    body = _read_body(str(name), units)
-    return shape_body(body, betas) if len(betas) else body
-
-
-def _read_body(text: str, units: str | None) -> Body:
-    """Return a body by name or file, in its average shape."""
+    text = str(name)
     file, meshes = split_name(text)
     suffix = Path(file).suffix.lower()
-    is_bundled = not is_path(text) or (suffix == ".npz" and not is_smpl_model(file))
-    if is_bundled and units is not None:
-        raise ConfigError(f"body {text} is in metres; leave out its unit")
-    if not is_path(text):
-        return _closed(read_body(find_asset("body", text)), text)
-    if suffix in GLTF_SUFFIXES:
-        return make_body(read_gltf_body(file, list(filter(None, meshes.split(",")))), units=units)
-    if suffix == ".pkl" or (suffix == ".npz" and is_smpl_model(file)):
-        return make_body(read_smpl_body(file), units=units)
-    if suffix == ".npz":
-        return _closed(read_body(file), Path(file).name)
-    raise unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
-
-
-def _closed(body: Body, name: str) -> Body:
-    """Return the body if it has an inside; raise a MeshError if not."""
-    positions, faces, is_obstacle = (
-        np.asarray(leaf) for leaf in (body.rest_positions, body.faces, body.is_obstacle)
-    )
-    validate_body(positions, faces, is_obstacle, name=name)
-    return body
+    if not is_path(text) or (suffix == ".npz" and not is_smpl_model(file)):
+        if units is not None:
+            raise ConfigError(f"body {text} is in metres; leave out its unit")
+        body = read_body(file if is_path(text) else find_asset("body", text))
+        rest, faces, is_obstacle = map(np.asarray, (body.rest_positions, body.faces, body.is_obstacle))
+        validate_body(rest, faces, is_obstacle, name=Path(file).name)
+    elif suffix in GLTF_SUFFIXES:
+        body = make_body(read_gltf_body(file, list(filter(None, meshes.split(",")))), units=units)
+    elif suffix in (".npz", ".pkl"):
+        body = make_body(read_smpl_body(file), units=units)
+    else:
+        raise unknown_suffix("body", file, (".npz", ".pkl", *GLTF_SUFFIXES))
+    return shape_body(body, betas) if len(betas) else body

@@ -1,4 +1,4 @@
-"""The catalogue of bundled files, with licence and checksum."""
+"""The catalogue of bundled files, with licence and checksum; names of assets, and paths in their place."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -93,3 +94,23 @@ def split_clips(split: str) -> tuple[str, ...]:
 def load_splits() -> dict[str, Any]:
     """Return the split of clips and garments into train, validation, test and unseen."""
     return json.loads((data_folder() / "splits.json").read_text())
+
+
+def is_path(name: str) -> bool:
+    """Tell a path from a name: it has a separator or a suffix, or is a file.
+
+    A folder is none, such as the one of a run that has the name of its garment.
+    """
+    return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).is_file()
+
+
+def unknown_suffix(content: str, file: str | Path, known: Iterable[str]) -> AssetError:
+    """Return the error for a file of an unknown kind."""
+    suffix = Path(file).suffix.lower()
+    if suffix == ".fbx":
+        return AssetError(
+            f"{content} file {file}: FBX is not read; export it as glTF (in Blender: File > Export > glTF 2.0)"
+        )
+    return AssetError(
+        f"{content} file {file} has the unknown suffix {suffix!r}; give one of {', '.join(known)}"
+    )

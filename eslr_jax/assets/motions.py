@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 
 from eslr_jax.assets.bodies import load_body
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path, unknown_suffix
+from eslr_jax.assets.catalog import find_asset, is_path, unknown_suffix
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_motion, skeleton_motion
@@ -137,13 +136,12 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
 
 def _is_archived(text: str) -> bool:
     """Tell a clip of the bundled format, by its name or in a user's archive, from a motion with its skeleton."""
+    if not is_path(text):
+        return True
     file, _ = split_name(text)
-    return not is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file))
-
-
-def _is_amass(file: str) -> bool:
-    """Tell an archive of AMASS from one in the bundled format."""
-    return "poses" in read_arrays(file, content="motion", names=("poses",))
+    if Path(file).suffix.lower() != ".npz":
+        return False
+    return "poses" not in read_arrays(file, content="motion", names=("poses",))  # those of AMASS
 
 
 def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:

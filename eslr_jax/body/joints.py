@@ -140,16 +140,11 @@ def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
     has_legs = ("left", "upper_leg") in parts and ("right", "upper_leg") in parts
     if not has_legs or len(below) < 3:
         return parts.get(("", "hips"), parts.get(("", "root"), [0]))[0]
-    chains = [_ancestors(skeleton, joint) for joint in below]
-    return max(set.intersection(*map(set, chains)), default=0)
-
-
-def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    """Return a joint and all joints above it, up to the root."""
-    chain = [joint]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(skeleton.parents[chain[-1]])
-    return chain
+    chains = [{joint} for joint in below]
+    for chain, joint in zip(chains, below, strict=True):
+        while (joint := skeleton.parents[joint]) >= 0:
+            chain.add(joint)
+    return max(set.intersection(*chains), default=0)
 
 
 def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarray | None:
@@ -241,9 +236,12 @@ def change_map(
     if same_names:
         result = {ours: theirs for ours, theirs in result.items() if ours == theirs}
     for ours, theirs in (changes or {}).items():
-        _check_name(ours, target.joint_names, "the body")
-        if theirs:
-            _check_name(theirs, source.joint_names, "the motion")
+        for name, rig, owner in ((ours, target, "the body"), (theirs, source, "the motion")):
+            if name not in rig.joint_names and (name or rig is target):
+                close = difflib.get_close_matches(name, rig.joint_names, n=1)
+                known = ", ".join(rig.joint_names[:6])
+                hint = f"; did you mean {close[0]}?" if close else f"; it has {known}, ..."
+                raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")
         result[ours] = theirs
     return {name: result[name] for name in target.joint_names if result.get(name)}
 
@@ -255,7 +253,7 @@ def complete_map(
     *,
     same_names: bool = False,
 ) -> dict[str, str]:
-    """Return the joint map by which one rig follows another; see `change_map`.
+    """Return the joint map by which one rig follows another; see `change_map` for the arguments.
 
     Raises:
         MotionError: A changed joint is not there, or nothing maps.
@@ -268,11 +266,3 @@ def complete_map(
             "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
         )
     return result
-
-
-def _check_name(name: str, known: Sequence[str], owner: str) -> None:
-    """Raise MotionError unless a name of a joint map exists; `owner` is what messages call the rig."""
-    if name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(known[:6])}, ..."
-        raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -132,7 +132,7 @@ def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> 
     """Return the vertices of a body whose joints are turned [m], and the map of every joint.
 
     Args:
-        body: A rigged body.
+        body: A rigged body; it may have pose blend shapes.
         rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
         translations: Root positions [m], shape [frames, 3].
 
@@ -140,7 +140,10 @@ def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> 
         Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4].
     """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    return _skin_body(body, rotations, transforms), transforms
+    skin = body.rest_positions, body.skin_weights, body.skin_indices, transforms
+    if body.pose_directions is None:
+        return _skin_frames(*skin), transforms
+    return _skin_bent(*skin, body.pose_directions, jnp.asarray(rotations[:, 1:], jnp.float32)), transforms
 
 
 def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
@@ -170,6 +173,18 @@ def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *
     )
 
 
+def check_length(poses: BodyMotion) -> None:
+    """Check that a body in motion has frames to simulate.
+
+    Raises:
+        MotionError: It has fewer than two.
+    """
+    if len(poses.joint_transforms) < 2:
+        raise MotionError(
+            f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
+        )
+
+
 def obstacle_surface(body: Body) -> BodySurface:
     """Return the search tables of all faces of a body that cloth may touch."""
     faces = np.asarray(body.faces)[np.asarray(body.is_obstacle)]
@@ -177,9 +192,8 @@ def obstacle_surface(body: Body) -> BodySurface:
     return _search_tables(rest.tobytes(), np.asarray(faces, np.int32).tobytes())
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # once per body
 def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
-    """Build search tables once per body."""
     return prepare_surface(
         np.frombuffer(rest_positions, np.float32).reshape(-1, 3),
         np.frombuffer(faces, np.int32).reshape(-1, 3),
@@ -208,13 +222,6 @@ def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
     )
 
 
-@partial(jax.jit, static_argnames="parents")
-def _joint_transforms(rotations, translations, joints, parents):
-    return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(
-        rotations, translations, joints, parents
-    )
-
-
 def joint_transforms(
     rotations: np.ndarray, translations: np.ndarray, joints: jax.Array, parents: tuple[int, ...]
 ) -> jax.Array:
@@ -226,9 +233,11 @@ def joint_transforms(
         joints: Joint rest positions [m], shape [joints, 3].
         parents: Parent of every joint; -1 for the root.
     """
-    return _joint_transforms(
-        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, parents
-    )
+    turns, places = (jnp.asarray(values, jnp.float32) for values in (rotations, translations))
+    return _joint_transforms(turns, places, joints, parents)
+
+
+_joint_transforms = jax.jit(jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None)), static_argnums=3)
 
 
 def chest_direction(body: Body) -> np.ndarray:
@@ -240,20 +249,11 @@ def chest_direction(body: Body) -> np.ndarray:
     return axes[:, 2]
 
 
-def _skin_body(body: Body, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
-    """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
-    rest = body.rest_positions
-    if body.pose_directions is None:
-        return _skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
-    bends = jnp.asarray(rotations[:, 1:], jnp.float32)
-    return _skin_bent(rest, body.pose_directions, body.skin_weights, body.skin_indices, bends, transforms)
-
-
 _skin_frames = jax.jit(lbs.skin_frames)
 
 
 @jax.jit
-def _skin_bent(rest, directions, weights, indices, rotations, transforms):
+def _skin_bent(rest, weights, indices, transforms, directions, rotations):
     """Return posed vertices of every frame, with pose blend shapes added at rest.
 
     Source: Loper et al. 2015, equations 8 and 9.

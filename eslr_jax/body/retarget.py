@@ -20,24 +20,6 @@ from eslr_jax.io.skeleton import chain_rotations, rotation_matrices
 ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bundled walks clear of the torso
 
 
-def minimal_rotation(start: NDArray, end: NDArray) -> NDArray:
-    """Return the smallest rotation that turns direction `start` onto `end`, shape [3, 3].
-
-    Args:
-        start: A direction of any length, shape [3].
-        end: Another, shape [3].
-    """
-    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-    axis, cosine = np.cross(start, end), float(start @ end)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
-        if cosine > 0:
-            return np.eye(3)
-        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
-    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / sine).as_matrix()
-
-
 def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArray:
     """Return local axis-angle rotations [rad], shape [frames, joints, 3].
 
@@ -63,20 +45,12 @@ def global_rotations(rotations: NDArray, parents: Sequence[int]) -> NDArray:
 
 
 def leg_length(joint_rest_positions: NDArray, parts: Mapping[Part, Sequence[int]]) -> float | None:
-    """Return the length of a thigh and shank in the unit of the positions, or None without such a leg.
-
-    The ratio of two skeletons' legs scales a motion's steps.
-
-    Args:
-        joint_rest_positions: Rest positions of a rig's joints, shape [joints, 3].
-        parts: Joints of each part of the rig; see `find_named_parts`.
-    """
+    """Return the length of a thigh and shank in the unit of the positions, or None without such a leg."""
     for side in ("left", "right"):
         chain = [parts.get((side, name), [None])[0] for name in ("upper_leg", "lower_leg", "foot")]
         if None not in chain:
             bones = np.diff(np.asarray(joint_rest_positions, np.float64)[chain], axis=0)
-            length = float(np.linalg.norm(bones, axis=1).sum())
-            return length if length > 0 else None
+            return float(np.linalg.norm(bones, axis=1).sum()) or None
     return None
 
 

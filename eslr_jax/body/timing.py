@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.motion import Motion, turn_joints
+from eslr_jax.body.motion import Motion, check_length, turn_joints
 from eslr_jax.body.retarget import blend_rotations, count_resampled, local_rotations
 from eslr_jax.errors import MotionError
 from eslr_jax.geometry.topology import face_cross_products
@@ -38,16 +38,10 @@ def num_simulated_frames(motion: Motion, fps: float = 30.0) -> int:
 
 
 def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
-    """Return a motion without a T-pose that stands before it, and a line that says so.
+    """Return a file's motion without a T-pose that stands before it, and a line that says so, or else "".
 
     Many files begin with one or a few frames of the rest pose. Simulated, that is a jump. Frames are skipped
     if the step that follows them is far longer than every other step.
-
-    Args:
-        source: The motion of a file.
-
-    Returns:
-        The motion, and what was skipped; the same motion and "" if nothing was.
     """
     size = float(np.ptp(source.skeleton.rest_positions, axis=0).max()) or 1.0
     steps = np.linalg.norm(np.diff(source.positions, axis=0), axis=-1).max(axis=1) / size
@@ -68,11 +62,7 @@ def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
 
 
 def cut_start(motion: Motion, seconds: float) -> Motion:
-    """Return a motion from a time on.
-
-    Args:
-        motion: A motion.
-        seconds: Time of its new first frame [s].
+    """Return a motion from a time on [s].
 
     Raises:
         MotionError: Fewer than two frames are left.
@@ -90,14 +80,10 @@ def cut_start(motion: Motion, seconds: float) -> Motion:
 
 
 def loop_motion(motion: Motion, seconds: float) -> Motion:
-    """Return a motion that repeats until it is this long.
+    """Return a motion that repeats until it is this long [s].
 
     Each repetition starts where the last one ended, facing the same way, and the end passes smoothly into the
     beginning.
-
-    Args:
-        motion: A motion.
-        seconds: Length wanted [s].
 
     Raises:
         MotionError: The length is not positive, or the motion is too short to repeat.
@@ -128,18 +114,6 @@ def _level_turn(end: NDArray, start: NDArray) -> Rotation:
     """Return the turn about the vertical that brings one axis-angle rotation closest to another, `end`."""
     matrix = (Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()).as_matrix()
     return Rotation.from_euler("y", np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2]))
-
-
-def check_length(poses: BodyMotion) -> None:
-    """Check that a body in motion has frames to simulate.
-
-    Raises:
-        MotionError: It has fewer than two.
-    """
-    if len(poses.joint_transforms) < 2:
-        raise MotionError(
-            f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
-        )
 
 
 def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) -> BodyMotion:
@@ -177,12 +151,9 @@ def begins_at_rest(num_frames: int, body: Body) -> bool:
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
-    """Return frames in which limbs come from the rest pose of a body to a pose; they start and end slowly.
+    """Return frames in which limbs come from the rest pose to `pose`, the map of every joint [joints, 3, 4].
 
-    Args:
-        body: A rigged body.
-        pose: Map of every joint, shape [joints, 3, 4].
-        num_frames: Number of frames.
+    They start and end slowly.
     """
     root = body.parents.index(-1)
     last = local_rotations(pose[None, :, :, :3], body.parents)
@@ -248,10 +219,9 @@ def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = N
     Raises:
         MotionError: A step is too long; the line names the frame, the speed, and what to do.
     """
-    found = find_fast_frame(poses, limit, vertices=vertices)
-    if found is None:
+    frame, step = find_fast_frame(poses, limit, vertices=vertices) or (0, 0.0)
+    if not step:
         return
-    frame, step = found
     timestep = float(poses.timestep)
     raise MotionError(
         f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "

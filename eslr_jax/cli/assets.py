@@ -173,7 +173,7 @@ def info(
         "--self-contact": self_contact,
     })  # fmt: skip
     from eslr_jax.assets import load_model
-    from eslr_jax.assets.names import is_path
+    from eslr_jax.assets.catalog import is_path
     from eslr_jax.config import to_dict
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
 

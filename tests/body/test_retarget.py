@@ -29,22 +29,6 @@ def test_local_and_global_rotations_are_inverse(rng):
     assert angles_between(back, rotations).max() < 1e-7
 
 
-@pytest.mark.parametrize("end", [[1, 0, 0], [-1, 0, 0], [0.2, -0.4, 1.3], [1, 1e-10, 0]])
-def test_minimal_rotation_turns_start_onto_end(end):
-    end = np.array(end, float)
-    matrix = retarget.minimal_rotation(np.array([2.0, 0.0, 0.0]), end)
-    np.testing.assert_allclose(matrix[:, 0], end / np.linalg.norm(end), atol=1e-9)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(matrix) == pytest.approx(1.0)
-
-
-def test_minimal_rotation_is_minimal(rng):
-    start, end = rng.normal(size=(2, 3))
-    angle = Rotation.from_matrix(retarget.minimal_rotation(start, end)).magnitude()
-    cosine = start @ end / np.linalg.norm(start) / np.linalg.norm(end)
-    assert angle == pytest.approx(np.arccos(cosine))
-
-
 def test_abduct_arms_lifts_hanging_arms_outwards():
     rotations = np.zeros((2, len(NAMES), 3))
     lifted = retarget.abduct_arms(rotations, NAMES, 90.0)

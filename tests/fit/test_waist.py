@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cloth import stand_at
+from eslr_jax.fit.waist import WAISTBAND, find_waist
 from garment_files import bundled, source
 from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress
 
@@ -11,7 +12,6 @@ from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.postures import find_arms, shoulder_height
 from eslr_jax.fit.report import describe_cost, describe_fit
-from eslr_jax.fit.waist import WAISTBAND, find_waist
 
 
 def standing(shape, body):
