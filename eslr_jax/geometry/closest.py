@@ -72,14 +72,7 @@ def nearest_places(
     faces: Int[np.ndarray, "faces 3"],
     normals: Float[np.ndarray, "vertices 3"],
 ) -> NearestPlaces:
-    """Return the place of a mesh that is nearest to every point, and the mesh's normal there.
-
-    Args:
-        points: Query points [m], shape [points, 3].
-        positions: Mesh vertices [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        normals: Of the mesh's vertices, shape [vertices, 3].
-    """
+    """Return the place of a mesh that is nearest to every point [m], and the mesh's normal there."""
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]
     offsets = points - np.einsum("pk,pkx->px", weights, positions[corners])
@@ -115,14 +108,12 @@ def barycentric_of_closest(
         ((vb <= 0) & (d2 >= 0) & (d6 <= 0), (1 - along_ac, zero, along_ac)),
         ((va <= 0) & (d4 >= d3) & (d5 >= d6), (zero, 1 - along_bc, along_bc)),
     ]
-    result = inside
-    for is_here, coordinates in reversed(regions):
-        result = np.where(is_here[..., None], np.stack(coordinates, axis=-1), result)
-    return result
+    is_here, coordinates = zip(*regions, strict=True)
+    places = [np.stack(place, axis=-1) for place in coordinates]
+    return np.select([here[..., None] for here in is_here], places, inside)
 
 
 def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the inner product along the last axis."""
     return np.sum(first * second, axis=-1)
 
 

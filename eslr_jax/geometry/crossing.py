@@ -83,10 +83,8 @@ def _piercing_edges(
         for owner, target in ((one, other), (other, one)):
             for k in range(3):
                 ends = faces[owner][:, [k, (k + 1) % 3]]
-                start, end = positions[ends[:, 0]].T, positions[ends[:, 1]].T
-                hits = pierces(
-                    tuple(start), tuple(end), [tuple(corner) for corner in corners[target].T.swapaxes(0, 1)]
-                )
+                start, end = (tuple(positions[side].T) for side in ends.T)
+                hits = pierces(start, end, [tuple(corner.T) for corner in corners[target].swapaxes(0, 1)])
                 found.append((owner[hits], ends[hits], target[hits]))
     owners, ends, pierced = zip(*found, strict=True)
     return np.concatenate(owners), np.concatenate(ends), np.concatenate(pierced)

@@ -144,9 +144,7 @@ def _curvature_of_angles(
 ) -> Float[np.ndarray, "faces 3 3"]:
     """Return the smallest curvature of a face that has the angles of its hinges, as rows by angle [1/m].
 
-    Args:
-        sides: Of the faces.
-        angle: The angle of each hinge for every curvature [m]; zero at free edges.
+    `angle` has that of each hinge for every curvature [m]; zero at free edges.
     """
     gram = np.einsum("fie,fje->fij", angle, angle)
     soft = _SOFTNESS * np.trace(gram, axis1=1, axis2=2) / np.maximum(np.sum(sides.hinge >= 0, axis=1), 1)
@@ -180,7 +178,12 @@ def _shares(
     height = np.where(is_hinge, sides.height[across, place], 0.0)
     part = sides.height / (sides.height + height)
     # Across a hinge directions keep their angle to its edge: there the neighbour's rows have other entries.
-    basis = np.stack([sides.normal, *_edge_frame(sides)], axis=2)
+    # From the row (n0^2, n1^2, sqrt(2) n0 n1) of the normal n: t is n turned by a right angle.
+    normal = sides.normal
+    n0n1 = normal[..., 2] / np.sqrt(2.0)
+    mixed = np.stack([n0n1, -n0n1, (normal[..., 1] - normal[..., 0]) / np.sqrt(2.0)], axis=-1)
+    along = np.stack([normal[..., 1], normal[..., 0], -normal[..., 2]], axis=-1)
+    basis = np.stack([normal, mixed, along], axis=2)
     beyond = basis[across, place]  # the same three curvatures, in the neighbour's threads
     back = np.linalg.solve(basis, beyond)  # from the neighbour's entries to the face's own
     own_turn = sides.turn
@@ -200,16 +203,6 @@ def _shares(
     for step in (1, 2):
         shares[rows, edges, 2 + 2 * edges + step] += far[rows, edges, turned[step]]
     return hinges, np.where(hinges[:, None] >= 0, shares, 0.0)
-
-
-def _edge_frame(sides: _Sides) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mixed curvature at every edge, and that along it, as rows."""
-    nn = sides.normal
-    # From the row (n0^2, n1^2, sqrt(2) n0 n1) of the normal n: t is n turned by a right angle.
-    n0n1 = nn[..., 2] / np.sqrt(2.0)
-    mixed = np.stack([n0n1, -n0n1, (nn[..., 1] - nn[..., 0]) / np.sqrt(2.0)], axis=-1)
-    along = np.stack([nn[..., 1], nn[..., 0], -nn[..., 2]], axis=-1)
-    return mixed, along
 
 
 def _incidence(

@@ -132,6 +132,6 @@ def _select_faces(
 
 
 def _boundary_vertices(faces: np.ndarray) -> np.ndarray:
-    """Return the vertices on edges of a single face, in ascending order."""
+    """Return the vertices on edges of a single face, in ascending order; the mesh may be broken."""
     edges, _, counts = undirected_edges(faces)
     return np.unique(edges[counts == 1])

@@ -60,9 +60,11 @@ def validate_mesh(
     num_components, component = vertex_components(faces, len(positions))
     if num_components > 1 and not allow_components:
         sizes = np.bincount(component)
+        largest = np.sort(sizes)[::-1]
         other = int(np.argmax(component != np.argmax(sizes)))
         raise MeshError(
-            f"{name}: {num_components} separate components (sizes {_shorten(np.sort(sizes)[::-1])}; "
+            f"{name}: {num_components} separate components (sizes {', '.join(map(str, largest[:5]))}"
+            f"{', ...' * (len(sizes) > 5)}; "
             f"vertex {other} is not connected to the largest); join them, delete the loose parts, "
             "or allow several components"
         )
@@ -71,14 +73,9 @@ def validate_mesh(
 def validate_lengths(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str
 ) -> None:
-    """Check other positions of a valid mesh, on which lengths and areas alone are measured.
+    """Check other positions of a mesh that `validate_mesh` has accepted, on which lengths alone are measured.
 
     Vertices of several garments may coincide there: an outfit's garments are sewn one by one.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles of a mesh that `validate_mesh` has accepted, shape [faces, 3].
-        name: Name of the mesh in messages.
 
     Raises:
         MeshError: NaN, an implausible scale, or degenerate faces.
@@ -201,8 +198,7 @@ def _check_edges(faces: np.ndarray, name: str) -> None:
 def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     """Raise on vertices whose faces form more than one fan (bow-ties).
 
-    The face corners are the nodes of a graph. Corners of neighbouring faces at the same vertex are joined, so
-    that each fan is a component. A manifold mesh has as many fans as vertices.
+    Corners of neighbouring faces at the same vertex are joined, so that each fan is a component of a graph.
     """
     starts, _, _ = half_edges(faces.astype(np.int64))
     twins = twin_half_edges(faces)
@@ -293,12 +289,7 @@ def validate_orientation(
     Raises:
         MeshError: The faces point inside.
     """
-    if _enclosed_volume_ratio(np.asarray(positions, np.float64), np.asarray(faces)) < MIN_VOLUME_RATIO:
-        raise MeshError(f"{name}: its faces point inside; flip the normals")
-
-
-def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
-    """Return the volume of the closed mesh relative to a sphere of equal area; 0 if it is mostly hole."""
+    positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
     centered = positions - positions.mean(axis=0)
     triangles = [centered[faces]]
     for loop in boundary_loops(faces):
@@ -308,10 +299,10 @@ def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
     areas = [
         0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in triangles
     ]
-    if sum(areas[1:]) > MAX_HOLE_SHARE * areas[0]:
-        return 0.0
     volume = sum(np.sum(np.linalg.det(t)) for t in triangles) / 6.0
-    return float(6.0 * np.sqrt(np.pi) * volume / sum(areas) ** 1.5)
+    of_sphere = 6.0 * np.sqrt(np.pi) * volume / sum(areas) ** 1.5
+    if sum(areas[1:]) <= MAX_HOLE_SHARE * areas[0] and of_sphere < MIN_VOLUME_RATIO:
+        raise MeshError(f"{name}: its faces point inside; flip the normals")
 
 
 def _diagonal(positions: np.ndarray) -> float:
@@ -327,9 +318,3 @@ def _ids(values: np.ndarray) -> str:
 def _point(values: np.ndarray) -> str:
     """Format a position."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
-
-
-def _shorten(values: np.ndarray, limit: int = 5) -> str:
-    """Format the first few of many counts."""
-    text = ", ".join(str(int(value)) for value in values[:limit])
-    return text + (", ..." if len(values) > limit else "")
