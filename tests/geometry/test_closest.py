@@ -56,7 +56,7 @@ def test_smoothing_keeps_constants_and_softens_a_jump(builders):
     soft = smooth(jump, faces, 20)
     assert soft.min() >= 0
     assert soft.max() <= 1
-    assert np.abs(np.diff(soft[:, 0].reshape(16, 12), axis=0)).max() < 0.4
+    assert np.abs(np.diff(soft[:, 0].reshape(12, 16), axis=1)).max() < 0.4
 
 
 def test_bundled_garment_weights_are_recovered(garment_folder):
