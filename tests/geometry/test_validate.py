@@ -15,10 +15,7 @@ def more(faces, positions=()):
     return np.concatenate([SHEET, np.reshape(positions, (-1, 3))]), np.concatenate([SHEET_FACES, faces])
 
 
-TWO_SHEETS = (np.concatenate([SHEET, SHEET + [0, 0, 0.3]]), np.concatenate([SHEET_FACES, SHEET_FACES + 6]))
-    np.concatenate([SHEET, SHEET + np.array([0, 0, 0.3])]),
-    np.concatenate([SHEET_FACES, SHEET_FACES + 6]),
-)
+TWO_SHEETS = np.concatenate([SHEET, SHEET + np.eye(3)[2]]), np.concatenate([SHEET_FACES, SHEET_FACES + 6])
 BROKEN = [  # a mesh, and what its message names
     (np.zeros((0, 3)), SHEET_FACES[:0], "0 vertices, 0 faces"),
     (SHEET, SHEET_FACES[:0], "6 vertices, 0 faces"),
