@@ -60,12 +60,7 @@ def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float 
 def align_rests(target: Skeleton, source: Skeleton, ours: Parts, theirs: Parts, name: str) -> NDArray:
     """Return the rotation from the body's rest pose to the source's for each joint, shape [joints, 3, 3].
 
-    Args:
-        target: Joints of the body at rest.
-        source: Joints of the motion's file at rest.
-        ours: Joints of the body by part; see `match_parts`.
-        theirs: Joints of the source by part.
-        name: What messages call the motion.
+    `ours` and `theirs` are the joints by part; see `match_parts`. `name` is what messages call the motion.
 
     Raises:
         MotionError: The source's rest pose does not stand.

@@ -44,12 +44,7 @@ class Piece(NamedTuple):
 
 
 def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) -> list[Piece]:
-    """Return the garments of an outfit.
-
-    Args:
-        faces: Triangles of all of them.
-        outfit: Their numbers of vertices, by name and in order.
-    """
+    """Return the garments of an outfit, given its names and numbers of vertices in order."""
     faces = np.asarray(faces)
     return [
         Piece(name, faces[is_own] - rows.start, rows, garment_color(number))
@@ -62,12 +57,9 @@ def body_pieces(
     faces: Int[np.ndarray, "body_faces 3"],
     rig: Body | Skin | None,
 ) -> list[Piece]:
-    """Return skin, top and shorts of a body; all of it is skin if its joints have no common names.
+    """Return skin, top and shorts of a body at rest, upright [m].
 
-    Args:
-        rest_positions: The body at rest, upright [m].
-        faces: Its triangles.
-        rig: What moves it; None shows skin only.
+    All of it is skin without what moves it, and if its joints have no common names.
     """
     positions, faces = np.asarray(rest_positions, np.float64), np.asarray(faces)
     weights = sparse.eye_array(len(positions), format="csr")

@@ -223,11 +223,8 @@ def change_map(
 ) -> dict[str, str]:
     """Return the joint map between two rigs, with a user's changes, however few joints are in it.
 
-    Args:
-        target: Joints of the body.
-        source: Joints of the motion's file.
-        changes: Joints of the body to joints of the source; "" keeps one still.
-        same_names: Leave out joints that would follow one of another name, but for the changes.
+    Changes map joints of the body to joints of the source, or to "" to keep one still. With `same_names`,
+    joints that would follow one of another name are left out, but for the changes.
 
     Raises:
         MotionError: A changed joint is not there.

@@ -131,13 +131,8 @@ def pose_body(
 def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Return the vertices of a body whose joints are turned [m], and the map of every joint.
 
-    Args:
-        body: A rigged body; it may have pose blend shapes.
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-
-    Returns:
-        Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4].
+    Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4]. Rotations are local axis-angle vectors [rad],
+    and translations the root's positions [m].
     """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
     skin = body.rest_positions, body.skin_weights, body.skin_indices, transforms
@@ -154,14 +149,7 @@ def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
 
 
 def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *, fps: float) -> BodyMotion:
-    """Return a body in motion; every `BodyMotion` is made here.
-
-    Args:
-        body: The body at rest.
-        positions: Its vertices [m], shape [frames, body_vertices, 3].
-        joint_transforms: Map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
-        fps: Frames per second.
-    """
+    """Return a body in motion, given its vertices [m] and the map of every joint; every one is made here."""
     return BodyMotion(
         positions=positions,
         joint_transforms=joint_transforms,
@@ -227,11 +215,7 @@ def joint_transforms(
 ) -> jax.Array:
     """Return the map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
 
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-        joints: Joint rest positions [m], shape [joints, 3].
-        parents: Parent of every joint; -1 for the root.
+    Arguments are those of `lbs.joint_transforms`, rotations and translations for every frame.
     """
     turns, places = (jnp.asarray(values, jnp.float32) for values in (rotations, translations))
     return _joint_transforms(turns, places, joints, parents)
@@ -278,10 +262,7 @@ def _frame_at(step: int, num_frames: int, first: int = 0) -> int:
 def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int]:
     """Return the two frames of a step, for a motion that is played forth and back without end.
 
-    Args:
-        step: Number of the step, from zero.
-        num_frames: Of the motion.
-        first: Frame from which on it is played forth and back; those before it are played once.
+    Frames before `first` are played once.
     """
     return _frame_at(step, num_frames, first), _frame_at(step + 1, num_frames, first)
 

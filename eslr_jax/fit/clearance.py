@@ -48,14 +48,9 @@ def body_heights(
 def push_out(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], posture: Posture
 ) -> tuple[Float[np.ndarray, "vertices 3"], dict[str, dict[str, float]]]:
-    """Move vertices that lie inside the body or closer than 3 mm out along the skin's normal.
+    """Move vertices that lie inside a posed body or closer than 3 mm out along the skin's normal.
 
     Their neighbours follow, so that no dents stay. Vertices deeper than 6 cm stay, and are counted apart.
-
-    Args:
-        positions: Garment vertex positions in the posture's pose [m], shape [vertices, 3].
-        faces: Triangles of the garment, shape [faces, 3].
-        posture: The body in that pose.
 
     Returns:
         New positions [m], and a report of the penetration before and after and of the distances moved.
@@ -106,17 +101,11 @@ def lay_to_rest(
     Int[np.ndarray, "vertices 4"],
     dict[str, Any],
 ]:
-    """Return a garment in the body's rest pose, given it in another pose.
-
-    Args:
-        placed: Garment vertices in the posture's pose [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        posture: The body in that pose.
-        body: The body at rest.
-        is_pushed: Move vertices that lie inside the body out of it.
+    """Return a garment in the body's rest pose, given it on the body in another pose [m].
 
     Returns:
-        Rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`.
+        Rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,
+        which is done in both poses unless `is_pushed` is false.
     """
     clear, penetration = push_out(placed, faces, posture) if is_pushed else (placed, {})
     is_loose = np.quantile(posture.heights(clear), 0.9) > _LOOSE

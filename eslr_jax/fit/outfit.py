@@ -25,12 +25,7 @@ _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
 def wear_together(garments: Sequence[GarmentFile], files: Sequence[str]) -> GarmentFile:
     """Return one garment as it is, or several as an outfit whose parts have the names of assets or files.
 
-    Args:
-        garments: Garments of one body, the innermost first.
-        files: The asset or the file of each; `FILE#NAME` is called NAME.
-
-    Raises:
-        MeshError: See `combine_garments`.
+    The innermost comes first; `FILE#NAME` is called NAME. See `combine_garments` for what is refused.
     """
     return garments[0] if len(garments) == 1 else combine_garments(garments, garment_names(files))
 

@@ -56,13 +56,8 @@ def choose_pins(
 ) -> tuple[Bool[np.ndarray, " vertices"], str, list[str]]:
     """Return the pinned vertices, where the pins come from, and a warning if nothing holds the garment.
 
-    Args:
-        texts: Pins as `PIN_FORMS` has them; none takes those of the file, or else what holds the garment up.
-        file_pins: Those of the file.
-        body: The body in its rest pose.
-        positions: Vertex positions in that pose [m].
-        faces: Triangles.
-        names: What pins may name; see `select_vertices`.
+    Pins are written as `PIN_FORMS` has them; without any, those of the file hold, or else what holds the
+    garment up in the body's rest pose. `names` is what pins may name; see `select_vertices`.
 
     Raises:
         ConfigError: A pin is unknown, or it contradicts another.
@@ -99,17 +94,11 @@ def select_vertices(
     face_parts: Int[np.ndarray, " faces"] | None,
     part_names: tuple[str, ...],
 ) -> Bool[np.ndarray, " vertices"]:
-    """Return a mask of the vertices that a pin names.
+    """Return a mask of the vertices that a pin names, one of `PIN_FORMS` but none and waist.
 
-    Args:
-        text: One of `PIN_FORMS` but none and waist. Vertices are counted from zero, as in the file. Regions are
-            in the body's frame [m]: left is +x, up is +y, front is +z. Open edges are numbered by their number
-            of vertices, most first, or named by the side on which their middle lies.
-        positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        vertex_map: Vertex of every vertex of the file, shape [source_vertices]; -1 where it was dropped.
-        face_parts: Part of every face, shape [faces], or None.
-        part_names: Names of the parts.
+    Vertices are counted from zero, as in the file; `vertex_map` has what became of each, -1 where it was
+    dropped. Regions are in the body's frame [m]: left is +x, up is +y, front is +z. Open edges are numbered by
+    their number of vertices, most first, or named by the side on which their middle lies.
 
     Raises:
         ConfigError: The form is unknown, or nothing has that name or number.
@@ -166,16 +155,11 @@ def _loop(text: str, rest: str, positions: np.ndarray, loops: list[np.ndarray]) 
 def find_waist(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], body: Body
 ) -> Waist:
-    """Find what holds up the parts of a garment.
+    """Find what holds up the parts of a garment in the body's rest pose.
 
     A part that reaches above the shoulder joints hangs from them, unless it leaves more than 150 degrees around
-    the neck open, as a cape does: its upper 3 cm are then held, as by a clasp. The others have a waistband: their
-    highest boundary loop around the trunk, and the cloth up to 3 cm from it.
-
-    Args:
-        positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        body: The body in its rest pose.
+    the neck open, as a cape does: its upper 3 cm are then held, as by a clasp. The others have a waistband:
+    their highest boundary loop around the trunk, and the cloth up to 3 cm from it.
     """
     shoulders = shoulder_height(body)
     count, component = vertex_components(faces, len(positions))

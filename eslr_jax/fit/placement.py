@@ -88,16 +88,16 @@ def find_placement(
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
-    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
-    compares the best placement with the next best one that differs from it.
+    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The
+    confidence compares the best placement with the next best one that differs from it.
 
     Args:
-        positions: Vertex positions as the file has them, shape [vertices, 3].
-        faces: Triangles of a welded mesh, shape [faces, 3].
+        positions: Vertex positions as the file has them.
+        faces: Triangles of a welded mesh.
         postures: The body in the poses that the garment may have been modelled on; the rest pose first.
         options: Unit, axes and whether the place is kept, where they are known.
         is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
-        facing: Direction that the body faces, shape [3]; +Z if not given. The nearest axis is taken.
+        facing: Direction that the body faces; +Z if not given. The nearest axis is taken.
         name: Name of the garment in messages.
 
     Raises:

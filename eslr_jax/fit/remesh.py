@@ -22,15 +22,10 @@ _ATTEMPTS = 6  # clusterings with a few vertices more; one in ten leaves a verte
 def remesh(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], edge_length: float
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"], Int[np.ndarray, " faces"]]:
-    """Return an even triangulation with a given mean edge length, and the source face of every face.
+    """Return an even triangulation with a given mean edge length [m], and the source face of every face.
 
     Vertices are the centres of equal clusters (Valette and Chassery 2004, the package pyacvd). The centres
     shrink away from open edges, so boundary vertices are moved back onto the open edges of the source.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        edge_length: Mean edge length to reach [m].
 
     Raises:
         ConfigError: The edge length gives an impossible number of vertices.

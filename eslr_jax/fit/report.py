@@ -82,11 +82,6 @@ def wearer_entry(body: Body) -> dict[str, Any]:
 def check_wearer(garment: GarmentFile, body: Body, name: str) -> None:
     """Check that a garment was fitted to this body; a file that tells no body passes.
 
-    Args:
-        garment: A fitted garment.
-        body: The body that is to wear it.
-        name: Name of the garment in messages.
-
     Raises:
         MeshError: It was fitted to another body: one with other joints, or of another shape.
         AssetError: What the file tells of its body is damaged.

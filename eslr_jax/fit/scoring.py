@@ -81,11 +81,7 @@ def wearing_cost(
 ) -> float:
     """Return the cost of a garment that is not worn: pierced by limbs, around no bone, or slipping down.
 
-    Args:
-        sample: Sample of the garment in the file's coordinates.
-        points: Its points as placed [m], shape [points, 3].
-        bones: Ends of the posture's bones in the file's coordinates, shape [bones, 2, 3].
-        posture: Posture that the garment is placed on.
+    Its points are given as placed on the posture [m], and the posture's bones in the file's coordinates.
     """
     pierced = count_pierced(sample, bones, posture.is_limb)
     is_empty = len(sample.openings) > 0 and not _crosses(bones, sample.openings).any()

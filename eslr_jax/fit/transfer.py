@@ -87,19 +87,11 @@ def carry_shape(
     *,
     scale: Scale,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"], Posture, dict[str, Any]]:
-    """Carry a garment's shape from a posed body to another body in the same pose.
+    """Carry a garment's shape [m] from a posed body, `source`, to another body in the same pose.
 
     A spline through the joints and the crotch maps space from one body to the other. Then the cloth moves along
-    the skin's normals until its distance from the skin is the old one, scaled by the ratio of the bodies' sizes.
-    Loose cloth follows the cloth around it.
-
-    Args:
-        positions: Garment vertices on the source [m].
-        faces: Its triangles.
-        source: The body that the garment was made for, in the pose in which it was made.
-        made_for: That body.
-        target: The body that is to wear it, at rest.
-        scale: Which lengths the cloth gets; see `transfer_garment`.
+    the skin's normals until its distance from the skin is the old one, scaled by the ratio of the bodies'
+    sizes. Loose cloth follows the cloth around it.
 
     Returns:
         Vertices outside the target [m], those with the lengths that the cloth is to have [m], the target in the

@@ -21,12 +21,6 @@ def closest_points(
     Candidates are the faces with the nearest centroids. A face reaches no farther from its centroid than the
     largest centroid-corner distance. A point is done when no face beyond its candidates can be closer; the
     others are tried again with four times as many.
-
-    Args:
-        points: Query points [m], shape [points, 3].
-        positions: Mesh vertices [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        num_candidates: Number of candidates per point in the first round.
     """
     corners = np.asarray(positions, np.float64)[faces]
     centroids = corners.mean(axis=1)

@@ -57,12 +57,7 @@ def add_coarse_edges(garment: Garment) -> Garment:
 
 
 def coarsen(pairs: Int[np.ndarray, "edges 2"], num_vertices: int) -> list[Int[np.ndarray, "coarse_edges 2"]]:
-    """Return the undirected edges of every coarse level, finest first.
-
-    Args:
-        pairs: Mesh edges, in one direction or both, shape [edges, 2].
-        num_vertices: Number of vertices.
-    """
+    """Return the undirected edges of every coarse level, finest first, given the mesh edges."""
     centers, levels = _centers(_matrix(pairs, num_vertices)), []
     for _ in CAPACITIES:
         hops = dijkstra(_matrix(pairs, num_vertices), indices=centers, unweighted=True, min_only=True)

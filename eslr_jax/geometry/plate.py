@@ -49,18 +49,10 @@ def rest_corners(garment: Garment) -> Float[np.ndarray, "faces 3 2"]:
 def prepare_plate(
     garment: Garment, warp: Float[np.ndarray, "faces 2"], rigidity: Float[np.ndarray, "faces 2"]
 ) -> Plate:
-    """Return what bending needs of a fabric with its own rigidity along warp and weft.
+    """Return what bending needs of a fabric with its own rigidity along warp and weft [N m]; NumPy leaves.
 
     The rigidity of twist is the geometric mean of the two (Huber): equal ones bend alike in all directions.
-    Poisson's ratio of bending is zero.
-
-    Args:
-        garment: Prepared garment; its lengths and areas as sewn.
-        warp: Direction of the warp in the plane of every face, unit vectors in the frame of `rest_corners`.
-        rigidity: Flexural rigidity along warp and weft [N m].
-
-    Returns:
-        The plate, with NumPy leaves.
+    Poisson's ratio of bending is zero. The warp is a unit vector in the frame of `rest_corners` on every face.
     """
     is_real = _is_real(garment)
     faces = np.asarray(garment.faces)[is_real]

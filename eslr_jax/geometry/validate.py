@@ -37,18 +37,12 @@ def validate_mesh(
     name: str = "mesh",
     allow_components: bool = False,
 ) -> None:
-    """Check that a mesh can be simulated.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        name: Name of the mesh in messages.
-        allow_components: Accept several connected components.
+    """Check that a mesh can be simulated, its positions in metres; messages begin with `name`.
 
     Raises:
         MeshError: The mesh is empty, has wrong shapes, indices out of range, NaN, an implausible scale,
             unreferenced or duplicate vertices, degenerate or duplicate faces, non-manifold edges or vertices,
-            inconsistent orientation, or several components.
+            inconsistent orientation, or several components that are not allowed.
     """
     positions, faces = np.asarray(positions), np.asarray(faces)
     check_arrays(positions, faces, name)
@@ -231,13 +225,7 @@ def validate_body(
     """Check that a body is closed where cloth may touch it, and that its faces point outside.
 
     Contact keeps cloth on the side that normals point to. Cloth that slipped in through a hole would be held
-    inside.
-
-    Args:
-        positions: Body vertex positions [m], shape [body_vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside, shape [body_faces, 3].
-        is_obstacle: Mask of the faces that cloth may touch, shape [body_faces]; others may have open edges.
-        name: Name of the body in messages.
+    inside. Faces that are no obstacle may have open edges.
 
     Raises:
         MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
@@ -276,15 +264,10 @@ def check_outward(
 def validate_orientation(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str = "mesh"
 ) -> None:
-    """Check that the faces of a garment point outside.
+    """Check that the faces of a garment, a valid mesh, point outside.
 
     The garment's holes are closed with fans, and the sign of the enclosed volume decides. Meshes that are
     mostly hole pass.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles of a valid mesh, shape [faces, 3].
-        name: Name of the mesh in messages.
 
     Raises:
         MeshError: The faces point inside.
