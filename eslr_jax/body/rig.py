@@ -237,10 +237,9 @@ def make_motion(
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
-    is_own = scale is not None
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
-    if not is_own:
+    if scale is None:
         alignments = align_rests(target, source.skeleton, ours, theirs, source.name)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
@@ -269,7 +268,7 @@ def make_motion(
         translations,
         source.fps,
         target.joint_names,
-        arm_abduction=ARM_ABDUCTION if has_arms and not is_own else 0.0,
+        arm_abduction=ARM_ABDUCTION if has_arms and scale is None else 0.0,
     )
 
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.motion import Motion, check_length, turn_joints
-from eslr_jax.body.retarget import blend_rotations, count_resampled, local_rotations
+from eslr_jax.body.retarget import blend_rotations, local_rotations
 from eslr_jax.errors import MotionError
-from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.geometry.topology import face_cross_products, normalize
 from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.types import Body, BodyMotion
 
@@ -30,11 +30,6 @@ _FEWEST_MOVING = 15  # frames in which limbs may come from the rest pose; fewer 
 # Vertices [m] and map of every joint, by frames.
 _Track = tuple[Float[Array, "frames vertices 3"], Float[Array, "frames joints 3 4"]]
 _BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
-
-
-def num_simulated_frames(motion: Motion, fps: float = 30.0) -> int:
-    """Return the number of frames of a motion after resampling to the rate of the simulation."""
-    return count_resampled(len(motion.rotations), motion.fps, fps)
 
 
 def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
@@ -184,18 +179,16 @@ def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
     )
 
 
-def find_fast_frame(
-    poses: BodyMotion, limit: float, *, vertices: NDArray | None = None
-) -> tuple[int, float] | None:
-    """Return the first frame in which a body comes towards cloth by more than a limit, and by how much [m].
+def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
+    """Check that contacts can follow a body in every frame.
 
     Args:
         poses: The body in motion.
         limit: Largest step along the outward normal between two frames [m].
         vertices: Body vertices that cloth can reach; None for all that are an obstacle.
 
-    Returns:
-        The frame that the step leads to and the step [m], or None if all frames keep the limit.
+    Raises:
+        MotionError: A step is too long; the line names the first such frame, the speed, and what to do.
     """
     positions, faces = np.asarray(poses.positions), np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
     if vertices is not None:
@@ -205,27 +198,13 @@ def find_fast_frame(
         moved = positions[frame] - positions[frame - 1]
         if not len(corners) or np.linalg.norm(moved[corners], axis=1).max() <= limit:
             continue  # most frames; normals are needed for the others only
-        normals = face_cross_products(positions[frame - 1], faces)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        normals = normalize(face_cross_products(positions[frame - 1], faces))
         step = float(np.einsum("fka,fa->fk", moved[faces], normals).max())
         if step > limit:
-            return frame, step
-    return None
-
-
-def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
-    """Raise unless contacts can follow the body in every frame; see `find_fast_frame`.
-
-    Raises:
-        MotionError: A step is too long; the line names the frame, the speed, and what to do.
-    """
-    frame, step = find_fast_frame(poses, limit, vertices=vertices) or (0, 0.0)
-    if not step:
-        return
-    timestep = float(poses.timestep)
-    raise MotionError(
-        f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "
-        f"{step / timestep:.1f} m/s), and contacts follow {limit:g} m: "
-        + (f"frames 0 to {frame - 1} are fine, --frames {frame} keeps them; " if frame > 1 else "")
-        + "start later, or repair or slow down the motion"
-    )
+            timestep = float(poses.timestep)
+            kept = f"frames 0 to {frame - 1} are fine, --frames {frame} keeps them; " if frame > 1 else ""
+            raise MotionError(
+                f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "
+                f"{step / timestep:.1f} m/s), and contacts follow {limit:g} m: {kept}start later, or repair or "
+                "slow down the motion"
+            )

@@ -115,15 +115,15 @@ def _check_scale(positions: np.ndarray, name: str) -> None:
     diagonal = _diagonal(positions)
     if MIN_DIAGONAL <= diagonal <= MAX_DIAGONAL:
         return
-    cause = f"{name}: bounding-box diagonal {diagonal:.4g} m is outside {MIN_DIAGONAL}-{MAX_DIAGONAL} m"
+    hint = "positions must be in metres"
     if diagonal > MAX_DIAGONAL:
         unit, factor = min(UNITS.items(), key=lambda item: abs(np.log(diagonal * item[1] / GARMENT_DIAGONAL)))
         if MIN_DIAGONAL <= diagonal * factor <= MAX_DIAGONAL:
-            raise MeshError(f"{cause}; it seems to be in {unit}: scale by {factor:g}")
+            hint = f"it seems to be in {unit}: scale by {factor:g}"
     elif diagonal > 0:
-        factor = 10.0 ** round(-np.log10(diagonal))
-        raise MeshError(f"{cause}; positions must be in metres: scale by about {factor:g}")
-    raise MeshError(f"{cause}; positions must be in metres")
+        hint += f": scale by about {10.0 ** round(-np.log10(diagonal)):g}"
+    cause = f"bounding-box diagonal {diagonal:.4g} m is outside {MIN_DIAGONAL}-{MAX_DIAGONAL} m"
+    raise MeshError(f"{name}: {cause}; {hint}")
 
 
 def _check_vertices(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
@@ -196,23 +196,19 @@ def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     """
     starts, _, _ = half_edges(faces.astype(np.int64))
     twins = twin_half_edges(faces)
-    corner = np.arange(len(starts))  # of the half-edge's start
-    following = next_half_edges(corner)  # corner of its end
-    has_twin = twins >= 0
-    rows = np.concatenate([corner[has_twin], following[has_twin]])
-    columns = np.concatenate([following[twins[has_twin]], twins[has_twin]])
+    start = np.flatnonzero(twins >= 0)  # corner of the half-edge's start
+    twin = twins[start]
+    rows = np.concatenate([start, next_half_edges(start)])
+    columns = np.concatenate([next_half_edges(twin), twin])
     graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (len(starts), len(starts)))
-    num_fans, fan = connected_components(graph, directed=False)
-    if num_fans == num_vertices:
-        return
-    fan_vertex = np.empty(num_fans, np.int64)
-    fan_vertex[fan] = starts
-    counts = np.bincount(fan_vertex, minlength=num_vertices)
-    vertex = int(np.argmax(counts > 1))
-    raise MeshError(
-        f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
-        f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
-    )
+    _, first = np.unique(connected_components(graph, directed=False)[1], return_index=True)
+    counts = np.bincount(starts[first], minlength=num_vertices)
+    if counts.max() > 1:
+        vertex = int(np.argmax(counts > 1))
+        raise MeshError(
+            f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
+            f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
+        )
 
 
 def validate_body(
