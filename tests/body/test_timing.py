@@ -8,7 +8,7 @@ import pytest
 from formats import write_bvh
 
 from eslr_jax.assets import load_motion
-from eslr_jax.body.motion import Motion, pose_body, still_motion
+from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.body.retarget import count_resampled
 from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.body.timing import (
@@ -151,8 +151,3 @@ def test_a_body_that_is_too_fast_is_named_with_its_frame(walk):
     with pytest.raises(MotionError, match=told):
         check_speed(fast, 0.3)
     check_speed(fast, 0.3, vertices=np.zeros(0, int))
-
-
-def test_a_motion_of_nothing_is_refused():
-    with pytest.raises(MotionError, match="no frames"):
-        Motion("empty", np.zeros((0, 1, 3)), np.zeros((0, 3)), 30.0, ("root",))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from eslr_jax.assets import asset_names, load_garment_file
 from eslr_jax.errors import MeshError
 from eslr_jax.geometry.validate import validate_mesh, validate_orientation
 
@@ -76,11 +77,9 @@ def test_open_sheet_has_no_inside(builders):
     validate_orientation(positions, faces[:, ::-1])
 
 
-def test_bundled_garments_are_sound(garment_folder):
-    for path in sorted(garment_folder.glob("*_1k.npz")):
-        with np.load(path) as arrays:
-            positions, faces = arrays["rest_positions"], arrays["faces"]
-        validate_mesh(positions, faces, name=path.stem)
-        validate_orientation(positions, faces, name=path.stem)
+def test_bundled_garments_are_not_inside_out():
+    for name in {name.rsplit("_", 1)[0] for name in asset_names("garment")}:
+        garment = load_garment_file(name)
+        validate_orientation(garment.rest_positions, garment.faces, name=name)
         with pytest.raises(MeshError, match="inside"):
-            validate_orientation(positions, faces[:, ::-1], name=path.stem)
+            validate_orientation(garment.rest_positions, garment.faces[:, ::-1], name=name)
