@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
@@ -23,7 +24,7 @@ from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names, read_gltf_motion
 from eslr_jax.io.motion import read_motion_archive
 from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.parsing import split_name
+from eslr_jax.io.parsing import parsing, split_name
 from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.io.smpl import read_amass, read_smpl_pickle
 from eslr_jax.types import Body
@@ -95,15 +96,8 @@ def own_motion(body: str) -> str:
 def moving_skeleton(name: str) -> SkeletonMotion:
     """Return the moving skeleton whose joints a body follows in a motion.
 
-    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body.
-
-    Args:
-        name: See `load_motion`.
-
-    Raises:
-        AssetError: There is no such motion, or the file is damaged.
-        MotionError: The motion is computed for every body, or it is for another skeleton than its archive has.
-        MissingExtraError: The file needs an extra that is not installed.
+    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body. A motion
+    that is computed for every body has none, and is refused; the rest is as of `load_motion`.
     """
     if name in PROCEDURAL:
         raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
@@ -111,6 +105,21 @@ def moving_skeleton(name: str) -> SkeletonMotion:
         return skeleton_motion(_bundled_motion(name), load_body())
     file, clip = split_name(name)
     return read_skeleton_motion(file, clip)
+
+
+def read_joint_map(path: str | Path) -> dict[str, str]:
+    """Read a joint map: a JSON object from joints of the body to joints of the motion, "" for a still one.
+
+    Raises:
+        AssetError: The file is missing or holds something else.
+    """
+    with parsing(path, "joint map", max_bytes=1 << 22) as file:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
+        raise AssetError(
+            f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
+        )
+    return values
 
 
 def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:

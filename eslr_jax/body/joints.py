@@ -8,15 +8,12 @@ LeftCollar/LeftShoulder/LeftElbow family.
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.parsing import parsing
+from eslr_jax.errors import MotionError
 from eslr_jax.io.skeleton import Skeleton
 
 Part = tuple[str, str]  # side ("left", "right", "") and chain
@@ -168,17 +165,28 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
     return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
-def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
+def map_joints(
+    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None, *, same_names: bool = False
+) -> dict[str, str]:
     """Return the joint of the source that each joint of a rig follows.
 
     A joint follows a joint of the same part: the one of the same name where the part has the same names in both
     rigs, in whatever order; else they are matched from the hips outwards, in proportion if two chains differ in
     length. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
     out, and move with their parent.
+
+    Args:
+        target: Joints of the body.
+        source: Joints of the motion's file.
+        changes: Joints of the body to joints of the source; "" keeps one still.
+        same_names: Leave out joints that would follow one of another name, but for the changes.
+
+    Raises:
+        MotionError: A changed joint is not there.
     """
-    if set(target.joint_names) == set(source.joint_names):
-        return {name: name for name in target.joint_names}
-    ours, theirs = find_parts(target), find_parts(source)
+    known = set(source.joint_names)
+    ours = {} if known == set(target.joint_names) else find_parts(target)
+    theirs = find_parts(source)
     result: dict[str, str] = {}
     for (side, chain), joints in ours.items():
         others = theirs.get((side, chain), [])
@@ -191,75 +199,16 @@ def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
         for position, joint in enumerate(joints if others else ()):
             share = -(-(position + 1) * len(others) // len(joints)) - 1
             result[target.joint_names[joint]] = source.joint_names[others[share]]
-    named = {joint for joints in ours.values() for joint in joints}
-    known = set(source.joint_names)
-    for joint, name in enumerate(target.joint_names):
-        if joint not in named and name in known:
-            result[name] = name
-    return {name: result[name] for name in target.joint_names if name in result}
-
-
-def read_joint_map(path: str | Path) -> dict[str, str]:
-    """Read a joint map: a JSON object from joints of the body to joints of the motion, "" for a still one.
-
-    Raises:
-        AssetError: The file is missing or holds something else.
-    """
-    with parsing(path, "joint map", max_bytes=1 << 22) as file:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
-        raise AssetError(
-            f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
-        )
-    return values
-
-
-def change_map(
-    target: Skeleton,
-    source: Skeleton,
-    changes: Mapping[str, str] | None = None,
-    *,
-    same_names: bool = False,
-) -> dict[str, str]:
-    """Return the joint map between two rigs, with a user's changes, however few joints are in it.
-
-    Changes map joints of the body to joints of the source, or to "" to keep one still. With `same_names`,
-    joints that would follow one of another name are left out, but for the changes.
-
-    Raises:
-        MotionError: A changed joint is not there.
-    """
-    result = map_joints(target, source)
+    of_parts = {target.joint_names[joint] for joints in ours.values() for joint in joints}
+    result |= {name: name for name in target.joint_names if name in known and name not in of_parts}
     if same_names:
-        result = {ours: theirs for ours, theirs in result.items() if ours == theirs}
-    for ours, theirs in (changes or {}).items():
-        for name, rig, owner in ((ours, target, "the body"), (theirs, source, "the motion")):
+        result = {name: other for name, other in result.items() if name == other}
+    for changed, other in (changes or {}).items():
+        for name, rig, owner in ((changed, target, "the body"), (other, source, "the motion")):
             if name not in rig.joint_names and (name or rig is target):
                 close = difflib.get_close_matches(name, rig.joint_names, n=1)
-                known = ", ".join(rig.joint_names[:6])
-                hint = f"; did you mean {close[0]}?" if close else f"; it has {known}, ..."
+                first = ", ".join(rig.joint_names[:6])
+                hint = f"; did you mean {close[0]}?" if close else f"; it has {first}, ..."
                 raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")
-        result[ours] = theirs
+        result[changed] = other
     return {name: result[name] for name in target.joint_names if result.get(name)}
-
-
-def complete_map(
-    target: Skeleton,
-    source: Skeleton,
-    changes: Mapping[str, str] | None = None,
-    *,
-    same_names: bool = False,
-) -> dict[str, str]:
-    """Return the joint map by which one rig follows another; see `change_map` for the arguments.
-
-    Raises:
-        MotionError: A changed joint is not there, or nothing maps.
-    """
-    result = change_map(target, source, changes, same_names=same_names)
-    if len(result) < min(2, len(target)):  # the hips are always found
-        raise MotionError(
-            f"no joint of the motion ({', '.join(source.joint_names[:4])}, ...) is known to this body "
-            f"({', '.join(target.joint_names[:4])}, ...); write a map with eslr "
-            "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
-        )
-    return result

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eslr_jax.body.alignment import align_rests, match_parts, rig_scale
-from eslr_jax.body.joints import HAND, complete_map, find_named_parts, find_parts
+from eslr_jax.body.joints import HAND, find_named_parts, find_parts, map_joints
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
 from eslr_jax.errors import AssetError, MotionError
@@ -233,7 +233,13 @@ def make_motion(
         source = dataclasses.replace(source, skeleton=rest, rotations=turned, positions=moved)
     target = body_skeleton(body)
     is_model = is_body_model(target, source)
-    mapping = complete_map(target, source.skeleton, joint_map, same_names=is_model)
+    mapping = map_joints(target, source.skeleton, joint_map, same_names=is_model)
+    if len(mapping) < min(2, len(target)):  # the hips are always found
+        raise MotionError(
+            f"no joint of the motion ({', '.join(source.skeleton.joint_names[:4])}, ...) is known to this body "
+            f"({', '.join(target.joint_names[:4])}, ...); write a map with eslr "
+            "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
+        )
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)

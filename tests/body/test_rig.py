@@ -10,16 +10,10 @@ import pytest
 from cloth import turn_about
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.assets import load_motion
-from eslr_jax.body.joints import (
-    complete_map,
-    find_named_parts,
-    find_parts,
-    map_joints,
-    read_joint_map,
-    torso_axes,
-)
-from eslr_jax.body.motion import obstacle_surface, pose_body, still_motion
+from eslr_jax import load_motion, pose_body
+from eslr_jax.assets.motions import read_joint_map
+from eslr_jax.body.joints import find_named_parts, find_parts, map_joints, torso_axes
+from eslr_jax.body.motion import obstacle_surface, still_motion
 from eslr_jax.body.procedural import PROCEDURAL
 from eslr_jax.body.retarget import global_rotations
 from eslr_jax.body.rig import body_skeleton, hips_first, make_body, make_motion, skeleton_motion
@@ -78,16 +72,14 @@ def test_the_map_can_be_changed(tmp_path, body):
     source = Skeleton(tuple(RIGS["Unreal"].split()), PARENTS, np.zeros((11, 3)))
     path = tmp_path / "map.json"
     path.write_text(json.dumps({"LeftArm": "lowerarm_l", "Head": ""}))
-    found = complete_map(target, source, read_joint_map(path))
+    found = map_joints(target, source, read_joint_map(path))
     assert found["LeftArm"] == "lowerarm_l"
     assert found["LeftForeArm"] == "lowerarm_l"
     assert "Head" not in found
     with pytest.raises(MotionError, match="did you mean LeftArm"):
-        complete_map(target, source, {"LeftArn": "hand_l"})
+        map_joints(target, source, {"LeftArn": "hand_l"})
     with pytest.raises(MotionError, match="the motion has no joint"):
-        complete_map(target, source, {"LeftArm": "tail"})
-    with pytest.raises(MotionError, match="no joint of the motion"):
-        complete_map(target, Skeleton(("a", "b"), (-1, 0), np.zeros((2, 3))))
+        map_joints(target, source, {"LeftArm": "tail"})
     for text in ("", "[1]", '{"a": 1}', "{"):
         path.write_text(text)
         with pytest.raises(AssetError, match=r"map\.json"):
@@ -126,6 +118,13 @@ def walking(body):
 
 def posed_joints(motion, body):
     return skeleton_motion(motion, body).positions
+
+
+def test_a_motion_of_nameless_joints_is_refused(walking, body):
+    names = tuple(f"bone{joint}" for joint in range(len(walking.skeleton)))
+    nameless = dataclasses.replace(walking.skeleton, joint_names=names)
+    with pytest.raises(MotionError, match=r"no joint of the motion \(bone0"):
+        make_motion(dataclasses.replace(walking, skeleton=nameless), body)
 
 
 def test_a_motion_of_this_rig_is_taken_as_it_is(walking, body):

@@ -21,7 +21,7 @@ from garment_bytes import READERS, whole_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eslr_jax.body.joints import read_joint_map
+from eslr_jax.assets.motions import read_joint_map
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.rig import make_body, make_motion
 from eslr_jax.body.sequence import pose_sequence
