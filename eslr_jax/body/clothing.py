@@ -86,21 +86,17 @@ def _fields(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return how far every vertex is inside the clothing, and over the waist [m]; None for unknown joints."""
     parts = find_named_parts(rig.joint_names)
-    joints = np.asarray(rig.joint_rest_positions, np.float64)
-
-    def first(side: str, chain: str) -> int | None:
-        return next(iter(parts.get((side, chain), ())), None)
-
-    sides = [
-        [first(side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg")]
-        for side in ("left", "right")
+    chains = [
+        (side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg") for side in ("left", "right")
     ]
-    neck, spine = first("", "neck"), first("", "spine")
-    if neck is None or spine is None or any(joint is None for side in sides for joint in side):
+    needed = [*chains, ("", "neck"), ("", "spine")]
+    if any(part not in parts for part in needed):
         return None
-    arms, legs, knees = (joints[[side[k] for side in sides]] for k in range(3))
+    left_arm, right_arm, *_, neck, spine = found = [parts[part][0] for part in needed]
+    joints = np.asarray(rig.joint_rest_positions, np.float64)
+    arms, legs, knees = joints[found[:6]].reshape(3, 2, 3)
     middle, half = arms.mean(axis=0), 0.5 * np.linalg.norm(arms[0] - arms[1])
-    is_limb = np.isin(np.arange(len(rig.parents)), (sides[0][0], sides[1][0], neck))
+    is_limb = np.isin(np.arange(len(rig.parents)), (left_arm, right_arm, neck))
     for _ in rig.parents:  # and what hangs on arms and neck
         is_limb |= np.array([parent >= 0 and is_limb[parent] for parent in rig.parents])
     moved = np.asarray(rig.skin_weights, np.float64) * is_limb[np.asarray(rig.skin_indices)]
@@ -135,9 +131,8 @@ def _cut(
     unique, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     start, end = field[unique].T
     share = start / (start - end)
-    new = weights[unique[:, 0]].multiply((1 - share)[:, None]) + weights[unique[:, 1]].multiply(
-        share[:, None]
-    )
+    shares = sparse.diags_array(1 - share), sparse.diags_array(share)
+    new = shares[0] @ weights[unique[:, 0]] + shares[1] @ weights[unique[:, 1]]
     to_left, to_right = len(field) + number.ravel().reshape(2, -1)
     pieces = [(apex, to_left, to_right), (to_left, left, right), (to_left, right, to_right)]
     return (

@@ -85,13 +85,10 @@ def _sides(
     warp: Float[np.ndarray, "faces 2"],
 ) -> _Sides:
     """Return the sides of faces by their corners in the plane [m] and the direction of the warp there."""
-    twins = topology.twin_half_edges(faces)
-    _, hinge_faces = topology.find_hinges(faces)
-    hinge = np.full(faces.size, -1)
-    starts, ends, _ = topology.half_edges(faces)
-    left = np.flatnonzero((twins >= 0) & (starts < ends))
-    left = left[np.lexsort((ends[left], starts[left]))]  # the order of `find_hinges`
-    hinge[left] = hinge[twins[left]] = np.arange(len(hinge_faces))
+    hinge, neighbor = np.full((2, faces.size), -1)
+    left, right = topology.hinge_half_edges(faces)
+    hinge[left] = hinge[right] = np.arange(len(left))
+    neighbor[left], neighbor[right] = right // 3, left // 3
 
     weft = np.stack([-warp[:, 1], warp[:, 0]], axis=1)
     threads = np.stack([warp, weft], axis=1)
@@ -108,8 +105,7 @@ def _sides(
     turn = 0.5 * height[:, :, None] * across + foot[:, :, None] * mixed
     turn += (0.5 * (foot**2 - 0.25 * length**2) / height)[:, :, None] * along
     areas = 0.5 * height * length
-    neighbor = np.where(twins >= 0, twins // 3, -1).reshape(-1, 3)
-    return _Sides(hinge.reshape(-1, 3), neighbor, height, across, turn, length / areas)
+    return _Sides(hinge.reshape(-1, 3), neighbor.reshape(-1, 3), height, across, turn, length / areas)
 
 
 def _row(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "faces 3 3"]:

@@ -105,6 +105,15 @@ def _slots(rows: np.ndarray, num_rows: int) -> tuple[np.ndarray, int]:
     return slots, max(int(degrees.max(initial=0)), 1)
 
 
+def hinge_half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half-edge in the left and in the right face of every hinge; see `find_hinges`."""
+    starts, ends, _ = half_edges(faces)
+    twins = twin_half_edges(faces)
+    left = np.flatnonzero((twins >= 0) & (starts < ends))
+    left = left[np.lexsort((ends[left], starts[left]))]
+    return left, twins[left]
+
+
 def find_hinges(
     faces: Int[np.ndarray, "faces 3"],
 ) -> tuple[Int[np.ndarray, "hinges 4"], Int[np.ndarray, "hinges 2"]]:
@@ -114,10 +123,7 @@ def find_hinges(
     mesh must be manifold and consistently oriented (`validate_mesh`).
     """
     starts, ends, opposites = half_edges(faces)
-    twins = twin_half_edges(faces)
-    left = np.flatnonzero((twins >= 0) & (starts < ends))
-    left = left[np.lexsort((ends[left], starts[left]))]
-    right = twins[left]
+    left, right = hinge_half_edges(faces)
     hinges = np.stack([starts[left], ends[left], opposites[left], opposites[right]], axis=1)
     return hinges, np.stack([left // 3, right // 3], axis=1)
 
