@@ -71,13 +71,6 @@ def test_skin_reproduces_golden_poses(body):
         np.testing.assert_allclose(skin_points(*skin, transforms), vertices, atol=1e-5)  # [m]
 
 
-def test_rest_pose_leaves_points_where_they_are(rng):
-    _, _, joints = random_tree(rng)
-    positions, weights, indices = random_skin(rng)
-    transforms = joint_transforms(jnp.zeros((len(TREE), 3)), joints[0], joints, TREE)
-    np.testing.assert_allclose(skin_points(positions, weights, indices, transforms), positions, atol=1e-6)
-
-
 def test_joint_transforms_equal_a_float64_chain(rng):
     rotations, translation, joints = random_tree(rng)
     matrices = Rotation.from_rotvec(np.asarray(rotations, np.float64)).as_matrix()

@@ -13,6 +13,8 @@ from eslr_jax.fit.pins import WAISTBAND, find_waist
 from eslr_jax.fit.postures import shoulder_height
 from eslr_jax.fit.report import describe_cost, describe_fit
 
+GIVEN = {"units": "m", "up": "y", "front": "z", "arms": "rest"}
+
 
 def standing(shape, body):
     positions, faces = shape()
@@ -47,13 +49,16 @@ def test_a_body_that_stands_elsewhere_has_the_same_pins(body, shape):
     assert moved.reason == waist.reason
 
 
-def test_a_cape_is_held_at_its_neckline(body):
+def test_a_cape_is_held_at_its_neckline_and_what_lies_on_the_shoulders_is_not(body):
     positions, faces = standing(cape, body)
     waist = find_waist(positions, faces, body)
     below = positions[:, 1].max() - positions[:, 1]
     np.testing.assert_array_equal(waist.is_held, below < WAISTBAND)
     assert "open around the neck" in waist.reason
     assert not waist.is_falling
+    waist = find_waist(*standing(poncho, body), body)
+    assert not waist.is_held.any()
+    assert waist.reason == "it hangs from the shoulders"
 
 
 def test_raised_arms_of_a_body_without_a_rig_raise_no_shoulders(body):
@@ -63,12 +68,6 @@ def test_raised_arms_of_a_body_without_a_rig_raise_no_shoulders(body):
     bones = body.replace(parents=(-1,), joint_rest_positions=raised.mean(axis=0, keepdims=True))
     expected = raised[:, 1].min() + 0.8 * (top - raised[:, 1].min())
     assert shoulder_height(bones.replace(rest_positions=raised)) == pytest.approx(expected, abs=1e-3)
-
-
-def test_what_lies_on_the_shoulders_is_not_held(body):
-    waist = find_waist(*standing(poncho, body), body)
-    assert not waist.is_held.any()
-    assert waist.reason == "it hangs from the shoulders"
 
 
 def test_waistband_is_that_of_the_bundled_garments(body):
@@ -94,8 +93,7 @@ def test_leg_warmers_fall_and_the_report_says_so(body):
     legs = [rings([(0.5, 0.09, 0.09, 0.02), (0.2, 0.09, 0.09, 0.0)], around=24, rows=16) for _ in range(2)]
     for (positions, _), side in zip(legs, (0.175, -0.175), strict=True):
         positions[:, 0] += side
-    options = FitOptions(units="m", up="y", front="z", arms="rest")
-    fitted = fit_garment(source(*joined(*legs)), body, options)
+    fitted = fit_garment(source(*joined(*legs)), body, FitOptions(**GIVEN))
     assert not fitted.is_pinned.any()
     texts = fitted.metadata["fit"]["warnings"]
     (warning,) = (text for text in texts if "nothing holds the garment up" in text)
@@ -103,11 +101,8 @@ def test_leg_warmers_fall_and_the_report_says_so(body):
 
 
 def test_pins_replace_the_waistband(body):
-    fast = {"units": "m", "up": "y", "front": "z", "arms": "rest"}
-    shape = source(*shorts())
-
     def fit(*pins):
-        return fit_garment(shape, body, FitOptions(pin=pins, **fast))
+        return fit_garment(source(*shorts()), body, FitOptions(pin=pins, **GIVEN))
 
     default = fit()
     assert default.metadata["fit"]["pinned"] == default.is_pinned.sum() > 50

@@ -129,9 +129,6 @@ def test_small_bucket_is_named(garment):
         pad_garment(garment, bucket._replace(faces=10))
     with pytest.raises(CapacityError, match="at least 154 vertices"):
         pad_garment(garment, bucket._replace(vertices=153))
-
-
-def test_own_bucket_changes_nothing(garment):
     assert pad_garment(garment, garment_bucket(garment)) is garment
 
 
