@@ -187,7 +187,8 @@ def rest_alignments(
     for name, (start, end) in limb_bones(joint_names).items():
         if name in source_directions:
             bone = joint_rest_positions[index[end]] - joint_rest_positions[index[start]]
-            alignments[index[name]] = retarget.minimal_rotation(bone, source_directions[name])
+            turn, _ = Rotation.align_vectors(source_directions[name][None], bone[None])
+            alignments[index[name]] = turn.as_matrix()
     return alignments
 
 

@@ -20,9 +20,8 @@ from harness import keep, kept, parser
 from eslr_jax.assets import load_body, load_garment, load_motion
 from eslr_jax.body.joints import find_parts
 from eslr_jax.body.motion import Motion, obstacle_surface, pose_body, shape_body, still_motion
-from eslr_jax.body.rig import body_skeleton, make_body
+from eslr_jax.body.rig import UnitsWarning, body_skeleton, make_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.body.units import UnitsWarning
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.metrics import measure_frames
 from eslr_jax.evaluation.report import environment, trajectory_report

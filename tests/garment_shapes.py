@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from cloth import grid_faces
 
 Shape = tuple[np.ndarray, np.ndarray]  # positions [vertices, 3] [m], faces [faces, 3]
 
@@ -21,16 +22,7 @@ def rings(levels, around=48, rows=40) -> Shape:
     height, width, depth, center = (np.interp(share, places, column)[:, None] for column in levels.T)
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)[None]
     parts = [width * np.sin(angle), height + 0 * angle, center + depth * np.cos(angle)]
-    return np.stack(parts, axis=-1).reshape(-1, 3), _grid_faces(rows, around, is_closed=True)
-
-
-def _grid_faces(rows, columns, *, is_closed=False) -> np.ndarray:
-    """Return the triangles of a grid of vertices, which face outwards where rows fall and columns turn left."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    if is_closed:
-        index = np.concatenate([index, index[:, :1]], axis=1)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return np.stack(parts, axis=-1).reshape(-1, 3), grid_faces(rows, around, is_closed=True)
 
 
 def skirt(hem=0.60, flare=0.28) -> Shape:
@@ -40,15 +32,8 @@ def skirt(hem=0.60, flare=0.28) -> Shape:
 
 def tube_dress() -> Shape:
     """A dress without straps, from the armpits to the knees."""
-    return rings(
-        [
-            (1.36, 0.185, 0.13, 0.05),
-            (1.16, 0.17, 0.125, 0.05),
-            (0.94, 0.215, 0.14, 0.02),
-            (0.55, 0.24, 0.18, 0.03),
-        ],
-        rows=50,
-    )
+    upper = [(1.36, 0.185, 0.13, 0.05), (1.16, 0.17, 0.125, 0.05)]
+    return rings([*upper, (0.94, 0.215, 0.14, 0.02), (0.55, 0.24, 0.18, 0.03)], rows=50)
 
 
 def poncho() -> Shape:
@@ -64,7 +49,7 @@ def cape(rows=36, columns=40) -> Shape:
     width = np.interp(share, [0, 0.15, 1], [0.11, 0.22, 0.30])
     depth = np.interp(share, [0, 0.15, 1], [0.07, 0.14, 0.20])
     positions = np.stack([width * np.sin(angle), height + 0 * angle, 0.02 - depth * np.cos(angle)], axis=-1)
-    return positions.reshape(-1, 3), _grid_faces(rows, columns)[:, ::-1]
+    return positions.reshape(-1, 3), grid_faces(rows, columns)[:, ::-1]
 
 
 def shorts(hem=0.66, waist=1.10, spacing=0.02) -> Shape:
@@ -75,24 +60,20 @@ def shorts(hem=0.66, waist=1.10, spacing=0.02) -> Shape:
     seam[:outside] = np.stack([0.205 * np.sin(bend), 0 * bend, 0.03 + 0.15 * np.cos(bend)], axis=1)
     seam[outside:, 2] = np.linspace(-0.12, 0.18, inside + 2)[1:-1]
     spread = np.pi / 3
-    bend = np.concatenate(
-        [
-            np.linspace(-spread, np.pi + spread, outside),
-            np.linspace(np.pi + spread, 2 * np.pi - spread, inside + 2)[1:-1],
-        ]
-    )
+    inner = np.linspace(np.pi + spread, 2 * np.pi - spread, inside + 2)[1:-1]
+    bend = np.concatenate([np.linspace(-spread, np.pi + spread, outside), inner])
     center = 0.115 + 0.09 * (0.98 - hem)  # the bundled body stands with its feet apart
     cuff = np.stack([center + 0.11 * np.sin(bend), 0 * bend, 0.03 + 0.13 * np.cos(bend)], axis=1)
     left = _loft(seam, cuff, crotch, hem, spacing)
     left[1:, :, 0] = np.maximum(left[1:, :, 0], 0.006)
-    legs = _grid_faces(*left.shape[:2], is_closed=True)
+    legs = grid_faces(*left.shape[:2], is_closed=True)
     around = np.concatenate([seam[:outside], seam[outside - 2 : 0 : -1] * [-1, 1, 1]])
     bend = np.linspace(0, 2 * np.pi, len(around), endpoint=False)
     band = np.stack([0.178 * np.sin(bend), 0 * bend, 0.045 + 0.122 * np.cos(bend)], axis=1)
     trunk = _loft(band, around, waist, crotch, spacing)
     count = left[..., 0].size
     positions = np.concatenate([part.reshape(-1, 3) for part in (left, left * [-1, 1, 1], trunk)])
-    faces = [legs, legs[:, ::-1] + count, _grid_faces(*trunk.shape[:2], is_closed=True) + 2 * count]
+    faces = [legs, legs[:, ::-1] + count, grid_faces(*trunk.shape[:2], is_closed=True) + 2 * count]
     mesh = trimesh.Trimesh(positions, np.concatenate(faces), process=False)
     mesh.merge_vertices(digits_vertex=7)
     return np.array(mesh.vertices), np.array(mesh.faces)

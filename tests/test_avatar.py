@@ -9,14 +9,32 @@ import pytest
 from formats import write_smpl, write_walker
 from other_bodies import smpl_female
 
-from eslr_jax.assets import load_motion
+from eslr_jax import load_garment, load_motion, pose_body
 from eslr_jax.io.obj import obj_text
 from eslr_jax.io.trajectory import read_trajectory
+from eslr_jax.scene.build import skin_garment
 
 
 def eslr(*arguments):
     command = [sys.executable, "-m", "eslr_jax.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def done(*arguments):
+    """Return what a command that succeeds prints, and what it says beside."""
+    result = eslr(*arguments)
+    assert result.returncode == 0, result.stderr
+    return result.stdout, result.stderr
+
+
+def simulate(out, *arguments, frames=3, iterations=20):
+    """Return the report of a simulation and what is said beside it."""
+    length = () if frames is None else ("--frames", frames)
+    words = ("--simulator", "physics", *length, "--iterations", iterations, "--no-pictures", "--json")
+    printed, said = done("simulate", *arguments, *words, "--out", out)
+    report = json.loads(printed)
+    assert report["finite"]
+    return report, said
 
 
 @pytest.fixture(scope="module")
@@ -30,124 +48,70 @@ def avatar(tmp_path_factory, body):
 @pytest.mark.slow
 def test_a_new_character_with_its_garment_is_one_command(avatar, tmp_path, body):
     out = tmp_path / "out"
-    result = eslr(
-        "simulate", "--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", "--simulator", "physics",
-        "--frames", 4, "--iterations", 20, "--no-pictures", "--json", "--out", out,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert report["finite"]
+    report, _ = simulate(out, "--body", avatar / "avatar.glb", "--garment", avatar / "shirt.obj", frames=4)
     assert report["motion"].endswith("avatar.glb")  # its own animation
     run = read_trajectory(out / "trajectory.npz")
     assert run.positions.shape == (4, 1000, 3)
-    from eslr_jax.body.motion import pose_body
-
     expected = pose_body(body, load_motion(), arm_abduction=0.0, num_frames=4)
     distance = np.linalg.norm(run.body.positions - np.asarray(expected.positions), axis=-1)
     assert np.quantile(distance, 0.99) < 2e-3  # [m]: glTF kept four of up to seven influences
     assert distance.max() < 0.015
-    result = eslr("export", out, "--out", tmp_path / "shirt.pc2")
-    assert result.returncode == 0, result.stderr
+    done("export", out, "--out", tmp_path / "shirt.pc2")
 
 
 @pytest.mark.slow
 def test_a_skipped_start_pose_is_in_the_report_and_said_with_a_point_cache(tmp_path, body):
-    character = tmp_path / "avatar.glb"
+    character, out = tmp_path / "avatar.glb", tmp_path / "out"
     write_walker(character, tmp_path / "shirt.obj", body, start_poses=2)
-    result = eslr(
-        "simulate", "--body", character, "--simulator", "physics", "--frames", 3, "--iterations", 5,
-        "--settle", 0, "--no-pictures", "--json", "--out", tmp_path / "out",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
+    report, _ = simulate(out, "--body", character, "--settle", 0, iterations=5)
     skipped = 2 / load_motion().fps
-    assert json.loads(result.stdout)["motion_start_s"] == pytest.approx(skipped, rel=1e-3)
-    result = eslr("export", tmp_path / "out", "--out", tmp_path / "shirt.pc2")
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip() == str(tmp_path / "shirt.pc2")
-    assert f"is {skipped:.3f} s after the first frame of the animation" in " ".join(result.stderr.split())
+    assert report["motion_start_s"] == pytest.approx(skipped, rel=1e-3)
+    printed, said = done("export", out, "--out", tmp_path / "shirt.pc2")
+    assert printed.strip() == str(tmp_path / "shirt.pc2")
+    assert f"is {skipped:.3f} s after the first frame of the animation" in " ".join(said.split())
 
 
 @pytest.mark.slow
 def test_a_bundled_garment_is_carried_to_a_new_character_with_a_line_that_says_so(avatar, tmp_path):
-    out, words = tmp_path / "out", ("--simulator", "physics", "--frames", 4, "--iterations", 20)
-    result = eslr(
-        "simulate", "--body", avatar / "avatar.glb", *words, "--no-pictures", "--json", "--out", out
-    )
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert report["finite"]
+    report, said = simulate(tmp_path / "out", "--body", avatar / "avatar.glb", frames=4)
     assert report["penetration_max_mm"] < 1.0
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("tshirt carried to ")]
+    (line,) = [line for line in said.splitlines() if line.startswith("tshirt carried to ")]
     assert "cut anew for it; its girth is 1.00 and its length 1.00" in line  # it is the bundled body, renamed
-    fitted = tmp_path / "kept.npz"
-    result = eslr(
-        "fit",
-        "tank",
-        "--body",
-        avatar / "avatar.glb",
-        "--scale",
-        "none",
-        "--out",
-        fitted,
-        "--no-picture",
-        "--json",
-    )
-    assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout)["scale"] == "none"
-    assert fitted.exists()
+    words = ("--scale", "none", "--out", tmp_path / "kept.npz", "--no-picture", "--json")
+    printed, _ = done("fit", "tank", "--body", avatar / "avatar.glb", *words)
+    assert json.loads(printed)["scale"] == "none"
+    assert (tmp_path / "kept.npz").exists()
 
 
 @pytest.mark.slow
-def test_a_mesh_in_motion_is_a_body(avatar, tmp_path, body, walk):
-    np.savez(tmp_path / "body.npz", positions=walk.positions[:5], faces=body.faces, fps=30)
+def test_a_mesh_in_motion_is_a_body(tmp_path, walk):
+    moving, garment, out = tmp_path / "body.npz", tmp_path / "shirt.obj", tmp_path / "out"
+    np.savez(moving, positions=walk.positions[:5], faces=walk.faces, fps=30)
     # The shirt that the walk starts in: a garment has to fit the first frame.
-    from eslr_jax.assets import load_garment
-    from eslr_jax.scene.build import skin_garment
-
     shirt = load_garment("tshirt")
     start = np.asarray(skin_garment(shirt, walk.joint_transforms))[0]
-    garment = tmp_path / "shirt.obj"
     garment.write_text(obj_text("shirt", start, np.asarray(shirt.faces)))
-    out = tmp_path / "out"
-    result = eslr(
-        "simulate", "--body", tmp_path / "body.npz", "--garment", garment, "--simulator", "physics",
-        "--iterations", 20, "--no-pictures", "--json", "--out", out,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
+    simulate(out, "--body", moving, "--garment", garment, frames=None)
     run = read_trajectory(out / "trajectory.npz")
     np.testing.assert_allclose(run.body.positions, walk.positions[:5], atol=1e-6)
-    assert json.loads(result.stdout)["finite"]
 
 
 @pytest.mark.slow
-def test_what_contradicts_is_refused_in_one_line(avatar, tmp_path, body):
-    np.savez(tmp_path / "body.npz", positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
-    cases = ((("--body", tmp_path / "body.npz", "--motion", "turn"), "follows no other"),)
-    for arguments, word in cases:
-        result = eslr(
-            "simulate", *arguments, "--simulator", "physics", "--frames", 2, "--out", tmp_path / "out"
-        )
-        lines = [line for line in result.stderr.splitlines() if line.startswith("eslr: ")]
-        assert result.returncode == 2, result.stderr
-        assert len(lines) == 1
-        assert word in lines[0]
-    assert not (tmp_path / "out").exists(), "what is refused leaves no folder"
+def test_what_contradicts_is_refused_in_one_line(tmp_path):
+    moving, out = tmp_path / "body.npz", tmp_path / "out"
+    np.savez(moving, positions=np.zeros((2, 3, 3)), faces=np.array([[0, 1, 2]]))
+    result = eslr("simulate", "--body", moving, "--motion", "turn", "--frames", 2, "--out", out)
+    assert result.returncode == 2, result.stderr
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("eslr: ")]
+    assert "follows no other" in line
+    assert not out.exists(), "what is refused leaves no folder"
 
 
 def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
-    result = eslr(
-        "joints",
-        "--body",
-        "anny",
-        "--motion",
-        avatar / "avatar.glb",
-        "--out",
-        tmp_path / "map.json",
-        "--json",
-    )
-    assert result.returncode == 0, result.stderr
-    found = json.loads(result.stdout)
-    assert json.loads((tmp_path / "map.json").read_text()) == found
+    path = tmp_path / "map.json"
+    printed, _ = done("joints", "--body", "anny", "--motion", avatar / "avatar.glb", "--out", path, "--json")
+    found = json.loads(printed)
+    assert json.loads(path.read_text()) == found
     assert found["LeftArm"] == "mixamorig:LeftArm"
     assert found["Spine1"] == "mixamorig:Spine2"
 
@@ -155,17 +119,10 @@ def test_the_joint_map_is_printed_and_written(avatar, tmp_path):
 @pytest.mark.slow
 def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(tmp_path, body):
     write_walker(tmp_path / "giant.glb", tmp_path / "shirt.obj", body, size=118.0)
-    out = tmp_path / "out"
-    result = eslr(
-        "simulate", "--body", tmp_path / "giant.glb", "--simulator", "physics", "--frames", 3, "--iterations", 20,
-        "--no-pictures", "--json", "--out", out,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    assert "taken to be in cm" in result.stderr
-    report = json.loads(result.stdout)
-    assert report["finite"]
+    report, said = simulate(tmp_path / "out", "--body", tmp_path / "giant.glb")
+    assert "taken to be in cm" in said
     assert report["motion"].endswith("giant.glb")
-    run = read_trajectory(out / "trajectory.npz")
+    run = read_trajectory(tmp_path / "out" / "trajectory.npz")
     assert 1.5 < np.ptp(run.body.positions[-1][:, 1]) < 2.2
     assert report["max_principal_stretch"] < 2.0
     assert report["penetration_max_mm"] < 1.0
@@ -174,14 +131,8 @@ def test_a_character_of_200_m_is_scaled_with_a_line_and_wears_a_bundled_garment(
 @pytest.mark.slow
 def test_the_default_shirt_is_carried_to_a_smpl_file(tmp_path):
     write_smpl(tmp_path / "smpl.pkl", smpl_female())
-    result = eslr(
-        "simulate", "--body", tmp_path / "smpl.pkl", "--simulator", "physics", "--frames", 3, "--iterations", 20,
-        "--no-pictures", "--json", "--out", tmp_path / "out",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
-    assert report["finite"]
+    report, said = simulate(tmp_path / "out", "--body", tmp_path / "smpl.pkl")
     assert report["garment"] == "tshirt"
     assert report["max_principal_stretch"] < 2.0
     assert report["penetration_max_mm"] < 1.0
-    assert "tshirt carried to " in result.stderr
+    assert "tshirt carried to " in said

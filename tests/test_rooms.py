@@ -21,7 +21,6 @@ KERNELS = {
 }  # fmt: skip
 HOST_FILES = {"physics.validate"}  # inside kernel rooms
 SHARED = {"errors", "types", "config"}  # what kernels and host both read
-MAX_ARGUMENTS = 6
 DOORS = {
     "jraph": {"graph", "models"},
     "orbax": {"training"},
@@ -88,15 +87,6 @@ def test_room_imports_only_rooms_above(module):
 def test_kernel_imports_no_host_room(module):
     for other in own_imports(module):
         assert other in KERNEL_MODULES or other in SHARED, f"{module} imports {other}"
-
-
-@every_kernel
-def test_kernel_function_takes_six_arguments_at_most(module):
-    for node in ast.walk(TREES[module]):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-            counted = [argument.arg for argument in names if argument.arg not in ("self", "cls")]
-            assert len(counted) <= MAX_ARGUMENTS, f"{module}.{node.name} takes {len(counted)} arguments"
 
 
 @every_kernel

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path
+from eslr_jax.assets.catalog import find_asset, is_path
 from eslr_jax.body.motion import shape_body
 from eslr_jax.body.rig import make_body
 from eslr_jax.errors import ConfigError

@@ -1,4 +1,4 @@
-"""The catalogue of bundled files, with licence and checksum."""
+"""The catalogue of bundled files, with licence and checksum; names of assets, and paths in their place."""
 
 from __future__ import annotations
 
@@ -93,3 +93,11 @@ def split_clips(split: str) -> tuple[str, ...]:
 def load_splits() -> dict[str, Any]:
     """Return the split of clips and garments into train, validation, test and unseen."""
     return json.loads((data_folder() / "splits.json").read_text())
+
+
+def is_path(name: str) -> bool:
+    """Tell a path from a name: it has a separator or a suffix, or is a file.
+
+    A folder is none, such as the one of a run that has the name of its garment.
+    """
+    return "/" in name or "\\" in name or Path(name).suffix != "" or Path(name).is_file()

@@ -12,14 +12,13 @@ import numpy as np
 
 from eslr_jax.assets.bodies import load_body
 from eslr_jax.assets.cache import cached_arrays, cached_struct, content_key
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path
+from eslr_jax.assets.catalog import find_asset, is_path
 from eslr_jax.errors import ConfigError
 from eslr_jax.fabric import garment_material
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions, Scale
+from eslr_jax.fit.report import check_wearer, wearer_entry
 from eslr_jax.fit.transfer import transfer_garment
-from eslr_jax.fit.wearer import check_wearer, wearer_entry
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.geometry.prepare import prepare_garment, to_device
 from eslr_jax.geometry.refine import refine

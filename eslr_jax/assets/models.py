@@ -7,8 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path
+from eslr_jax.assets.catalog import find_asset, is_path
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import AssetError
 from eslr_jax.io.weights import read_weights

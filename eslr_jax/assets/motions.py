@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
@@ -12,8 +13,7 @@ from typing import Literal
 import numpy as np
 
 from eslr_jax.assets.bodies import load_body
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.assets.names import is_path
+from eslr_jax.assets.catalog import find_asset, is_path
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.procedural import PROCEDURAL, make_procedural
 from eslr_jax.body.rig import make_motion, skeleton_motion
@@ -22,7 +22,7 @@ from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.io.bundled import read_motion_archive
 from eslr_jax.io.gltf_rig import GLTF_SUFFIXES, gltf_clip_names
 from eslr_jax.io.npz import read_arrays
-from eslr_jax.io.parsing import split_name
+from eslr_jax.io.parsing import parsing, split_name
 from eslr_jax.io.registry import find_reader
 from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.types import Body
@@ -94,15 +94,8 @@ def own_motion(body: str) -> str:
 def moving_skeleton(name: str) -> SkeletonMotion:
     """Return the moving skeleton whose joints a body follows in a motion.
 
-    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body.
-
-    Args:
-        name: See `load_motion`.
-
-    Raises:
-        AssetError: There is no such motion, or the file is damaged.
-        MotionError: The motion is computed for every body, or it is for another skeleton than its archive has.
-        MissingExtraError: The file needs an extra that is not installed.
+    A bundled clip, and an archive in its format, holds no skeleton: it is for that of the bundled body. A motion
+    that is computed for every body has none, and is refused; the rest is as of `load_motion`.
     """
     if name in PROCEDURAL:
         raise MotionError(f"motion {name} is computed on the joints of any body; it needs no joint map")
@@ -110,6 +103,21 @@ def moving_skeleton(name: str) -> SkeletonMotion:
         return skeleton_motion(_bundled_motion(name), load_body())
     file, clip = split_name(name)
     return read_skeleton_motion(file, clip)
+
+
+def read_joint_map(path: str | Path) -> dict[str, str]:
+    """Read a joint map: a JSON object from joints of the body to joints of the motion, "" for a still one.
+
+    Raises:
+        AssetError: The file is missing or holds something else.
+    """
+    with parsing(path, "joint map", max_bytes=1 << 22) as file:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
+        raise AssetError(
+            f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
+        )
+    return values
 
 
 def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
@@ -129,13 +137,12 @@ def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
 
 def _is_archived(text: str) -> bool:
     """Tell a clip of the bundled format, by its name or in a user's archive, from a motion with its skeleton."""
+    if not is_path(text):
+        return True
     file, _ = split_name(text)
-    return not is_path(text) or (Path(file).suffix.lower() == ".npz" and not _is_amass(file))
-
-
-def _is_amass(file: str) -> bool:
-    """Tell an archive of AMASS from one in the bundled format."""
-    return "poses" in read_arrays(file, content="motion", names=("poses",))
+    if Path(file).suffix.lower() != ".npz":
+        return False
+    return "poses" not in read_arrays(file, content="motion", names=("poses",))  # those of AMASS
 
 
 def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:

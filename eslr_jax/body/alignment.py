@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.joints import HAND, Part, find_parts, torso_axes
-from eslr_jax.body.retarget import minimal_rotation
 from eslr_jax.errors import MotionError
 from eslr_jax.io.skeleton import Skeleton
 
@@ -26,10 +25,7 @@ def match_parts(
 ) -> tuple[dict[Part, list[int]], dict[Part, list[int]]]:
     """Return the joints of each part that both rigs have: those of the body, and those of the source.
 
-    Args:
-        target: Joints of the body.
-        source: Joints of the motion's file.
-        followed: Joint of the source that each joint of the body follows; -1 for none.
+    `followed` has the joint of the source that each joint of the body follows, or -1.
     """
     ours: dict[Part, list[int]] = {}
     theirs: dict[Part, list[int]] = {}
@@ -41,22 +37,12 @@ def match_parts(
         if other >= 0 and part is not None:
             ours.setdefault(part, []).append(joint)
             theirs.setdefault(part, []).append(other)
-    if followed[0] < 0:
-        theirs["", "hips"] = others["", "hips"]
-    else:
-        theirs["", "hips"] = [followed[0]]
-    ours["", "hips"] = [0]
+    ours["", "hips"], theirs["", "hips"] = [0], others["", "hips"] if followed[0] < 0 else [followed[0]]
     return ours, theirs
 
 
 def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float | None:
-    """Return the metres per unit of the source if it is the body's rig in other units; None for another rig.
-
-    Args:
-        target: Joints of the body at rest [m].
-        source: Joints of the motion's file at rest, in its unit.
-        followed: Joint of the source that each joint of the body follows; -1 for none.
-    """
+    """Return the metres per unit of the source if it is the body's rig in other units; None for another rig."""
     names = source.joint_names
     if any(
         other < 0 or names[other] != name for name, other in zip(target.joint_names, followed, strict=True)
@@ -71,21 +57,10 @@ def rig_scale(target: Skeleton, source: Skeleton, followed: list[int]) -> float 
     return None
 
 
-def align_rests(
-    target: Skeleton,
-    source: Skeleton,
-    ours: Parts,
-    theirs: Parts,
-    name: str,
-) -> NDArray:
+def align_rests(target: Skeleton, source: Skeleton, ours: Parts, theirs: Parts, name: str) -> NDArray:
     """Return the rotation from the body's rest pose to the source's for each joint, shape [joints, 3, 3].
 
-    Args:
-        target: Joints of the body at rest.
-        source: Joints of the motion's file at rest.
-        ours: Joints of the body by part; see `match_parts`.
-        theirs: Joints of the source by part.
-        name: What messages call the motion.
+    `ours` and `theirs` are the joints by part; see `match_parts`. `name` is what messages call the motion.
 
     Raises:
         MotionError: The source's rest pose does not stand.
@@ -97,11 +72,14 @@ def align_rests(
             parts = (side, chain), (side, beyond)
             if not all(part in ours and part in theirs for part in parts):
                 continue
-            bone = _bone(target, ours, *parts)
-            other = _bone(source, theirs, *parts)
+            bone, other = (
+                np.subtract(*(rig.rest_positions[joints[part][0]] for part in reversed(parts)))
+                for rig, joints in ((target, ours), (source, theirs))
+            )
             if min(np.linalg.norm(bone), np.linalg.norm(other)) < 1e-9:
                 continue
-            turn = minimal_rotation(upright @ bone, other)
+            # Of all rotations that do it, the smallest.
+            turn = Rotation.align_vectors(other[None], (upright @ bone)[None])[0].as_matrix()
             if beyond in ("lower_leg", "foot") and _angle(np.trace(turn)) > MAX_LEG_TURN:
                 raise MotionError(
                     f"motion {name}: its rest pose does not stand ({side} {chain} points elsewhere); "
@@ -118,11 +96,6 @@ def _angle(trace: NDArray) -> NDArray:
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
-def _bone(skeleton: Skeleton, parts: Parts, start: Part, end: Part) -> NDArray:
-    """Return the vector from one part's first joint to another's, at rest."""
-    return skeleton.rest_positions[parts[end][0]] - skeleton.rest_positions[parts[start][0]]
-
-
 def _torso_turn(target: Skeleton, ours: Parts, source: Skeleton, theirs: Parts) -> NDArray:
     """Return the rotation from the body's rest torso to the source's, shape [3, 3].
 
@@ -135,5 +108,4 @@ def _torso_turn(target: Skeleton, ours: Parts, source: Skeleton, theirs: Parts) 
     turn = other @ one.T
     quarters = Rotation.create_group("O").as_matrix()
     angles = _angle(np.einsum("nab,ab->n", quarters, turn))
-    is_near = angles.min() < ORDINARY_TILT
-    return np.round(quarters[angles.argmin()]) if is_near else turn
+    return np.round(quarters[angles.argmin()]) if angles.min() < ORDINARY_TILT else turn

@@ -6,8 +6,7 @@ any scene.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -17,6 +16,8 @@ from eslr_jax.body.joints import find_named_parts
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.io.garment import split_outfit
 from eslr_jax.io.palette import BODY_COLORS, Color, garment_color
+from eslr_jax.io.skin import Skin
+from eslr_jax.types import Body
 
 _SKIN, _TOP, _SHORTS = 0, 1, 2
 _NAMES = ("skin", "top", "shorts")
@@ -26,35 +27,6 @@ _ARMHOLE = 0.75  # depth of the armholes below the shoulder joints, over the sam
 _NECKLINE = 0.45  # radius of the neckline, over the same length
 _LIMB = 0.1  # [m] over which the weight of a limb goes from none to one
 _SMOOTHINGS = 6  # of the border of a limb, over the mesh
-
-
-class Skinned(Protocol):
-    """What joints move: a `Body`, or the skin of a run."""
-
-    @property
-    def skin_weights(self) -> Any:
-        """Weights, [vertices, influences]."""
-        ...
-
-    @property
-    def skin_indices(self) -> Any:
-        """Their joints, [vertices, influences]."""
-        ...
-
-    @property
-    def joint_rest_positions(self) -> Any:
-        """Where joints are at rest [m], [joints, 3]."""
-        ...
-
-    @property
-    def parents(self) -> Sequence[int]:
-        """The joint above each, or -1."""
-        ...
-
-    @property
-    def joint_names(self) -> Sequence[str]:
-        """Names of the joints."""
-        ...
 
 
 class Piece(NamedTuple):
@@ -72,12 +44,7 @@ class Piece(NamedTuple):
 
 
 def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) -> list[Piece]:
-    """Return the garments of an outfit.
-
-    Args:
-        faces: Triangles of all of them.
-        outfit: Their numbers of vertices, by name and in order.
-    """
+    """Return the garments of an outfit, given its names and numbers of vertices in order."""
     faces = np.asarray(faces)
     return [
         Piece(name, faces[is_own] - rows.start, rows, garment_color(number))
@@ -88,14 +55,11 @@ def garment_pieces(faces: Int[np.ndarray, "faces 3"], outfit: dict[str, int]) ->
 def body_pieces(
     rest_positions: Float[np.ndarray, "body_vertices 3"],
     faces: Int[np.ndarray, "body_faces 3"],
-    rig: Skinned | None,
+    rig: Body | Skin | None,
 ) -> list[Piece]:
-    """Return skin, top and shorts of a body; all of it is skin if its joints have no common names.
+    """Return skin, top and shorts of a body at rest, upright [m].
 
-    Args:
-        rest_positions: The body at rest, upright [m].
-        faces: Its triangles.
-        rig: What moves it; None shows skin only.
+    All of it is skin without what moves it, and if its joints have no common names.
     """
     positions, faces = np.asarray(rest_positions, np.float64), np.asarray(faces)
     weights = sparse.eye_array(len(positions), format="csr")
@@ -117,25 +81,26 @@ def _piece(kind: int, faces: np.ndarray, weights: sparse.csr_array) -> Piece:
     return Piece(_NAMES[kind], own.reshape(-1, 3), weights[vertices].astype(np.float32), BODY_COLORS[kind])
 
 
-def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.ndarray, np.ndarray] | None:
+def _fields(
+    positions: np.ndarray, faces: np.ndarray, rig: Body | Skin
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Return how far every vertex is inside the clothing, and over the waist [m]; None for unknown joints."""
     parts = find_named_parts(rig.joint_names)
-    joints = np.asarray(rig.joint_rest_positions, np.float64)
-
-    def first(side: str, chain: str) -> int | None:
-        return next(iter(parts.get((side, chain), ())), None)
-
-    sides = [
-        [first(side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg")]
-        for side in ("left", "right")
+    chains = [
+        (side, chain) for chain in ("upper_arm", "upper_leg", "lower_leg") for side in ("left", "right")
     ]
-    neck, spine = first("", "neck"), first("", "spine")
-    if neck is None or spine is None or any(joint is None for side in sides for joint in side):
+    needed = [*chains, ("", "neck"), ("", "spine")]
+    if any(part not in parts for part in needed):
         return None
-    arms, legs, knees = (joints[[side[k] for side in sides]] for k in range(3))
+    left_arm, right_arm, *_, neck, spine = found = [parts[part][0] for part in needed]
+    joints = np.asarray(rig.joint_rest_positions, np.float64)
+    arms, legs, knees = joints[found[:6]].reshape(3, 2, 3)
     middle, half = arms.mean(axis=0), 0.5 * np.linalg.norm(arms[0] - arms[1])
-    is_limb = [_below(rig.parents, joint) for joint in (sides[0][0], sides[1][0], neck)]
-    limbs = smooth(_share(rig, np.any(is_limb, axis=0))[:, None], faces, _SMOOTHINGS)[:, 0]
+    is_limb = np.isin(np.arange(len(rig.parents)), (left_arm, right_arm, neck))
+    for _ in rig.parents:  # and what hangs on arms and neck
+        is_limb |= np.array([parent >= 0 and is_limb[parent] for parent in rig.parents])
+    moved = np.asarray(rig.skin_weights, np.float64) * is_limb[np.asarray(rig.skin_indices)]
+    limbs = smooth(moved.sum(axis=1, keepdims=True), faces, _SMOOTHINGS)[:, 0]
     inside = [
         _LIMB * (0.5 - limbs),
         np.maximum(
@@ -149,20 +114,6 @@ def _fields(positions: np.ndarray, faces: np.ndarray, rig: Skinned) -> tuple[np.
         is_its_side = (positions - legs.mean(axis=0)) @ (hip - legs.mean(axis=0)) > 0
         inside.append(np.where(is_its_side, _LEG * length - along, _LIMB))
     return np.min(inside, axis=0), positions[:, 1] - joints[spine][1]
-
-
-def _below(parents: Sequence[int], joint: int) -> np.ndarray:
-    """Return which joints are a joint or hang on it."""
-    result = np.zeros(len(parents), bool)
-    result[joint] = True
-    for _ in parents:
-        result |= np.array([parent >= 0 and result[parent] for parent in parents])
-    return result
-
-
-def _share(rig: Skinned, is_chosen: np.ndarray) -> np.ndarray:
-    """Return the share of every vertex that chosen joints move."""
-    return np.sum(np.asarray(rig.skin_weights, np.float64) * is_chosen[np.asarray(rig.skin_indices)], axis=1)
 
 
 def _cut(
@@ -180,9 +131,8 @@ def _cut(
     unique, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     start, end = field[unique].T
     share = start / (start - end)
-    new = weights[unique[:, 0]].multiply((1 - share)[:, None]) + weights[unique[:, 1]].multiply(
-        share[:, None]
-    )
+    shares = sparse.diags_array(1 - share), sparse.diags_array(share)
+    new = shares[0] @ weights[unique[:, 0]] + shares[1] @ weights[unique[:, 1]]
     to_left, to_right = len(field) + number.ravel().reshape(2, -1)
     pieces = [(apex, to_left, to_right), (to_left, left, right), (to_left, right, to_right)]
     return (

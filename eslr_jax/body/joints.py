@@ -8,15 +8,12 @@ LeftCollar/LeftShoulder/LeftElbow family.
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.io.parsing import parsing
+from eslr_jax.errors import MotionError
 from eslr_jax.io.skeleton import Skeleton
 
 Part = tuple[str, str]  # side ("left", "right", "") and chain
@@ -140,16 +137,11 @@ def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
     has_legs = ("left", "upper_leg") in parts and ("right", "upper_leg") in parts
     if not has_legs or len(below) < 3:
         return parts.get(("", "hips"), parts.get(("", "root"), [0]))[0]
-    chains = [_ancestors(skeleton, joint) for joint in below]
-    return max(set.intersection(*map(set, chains)), default=0)
-
-
-def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    """Return a joint and all joints above it, up to the root."""
-    chain = [joint]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(skeleton.parents[chain[-1]])
-    return chain
+    chains = [{joint} for joint in below]
+    for chain, joint in zip(chains, below, strict=True):
+        while (joint := skeleton.parents[joint]) >= 0:
+            chain.add(joint)
+    return max(set.intersection(*chains), default=0)
 
 
 def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarray | None:
@@ -173,17 +165,28 @@ def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarra
     return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
-def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
+def map_joints(
+    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None, *, same_names: bool = False
+) -> dict[str, str]:
     """Return the joint of the source that each joint of a rig follows.
 
     A joint follows a joint of the same part: the one of the same name where the part has the same names in both
     rigs, in whatever order; else they are matched from the hips outwards, in proportion if two chains differ in
     length. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
     out, and move with their parent.
+
+    Args:
+        target: Joints of the body.
+        source: Joints of the motion's file.
+        changes: Joints of the body to joints of the source; "" keeps one still.
+        same_names: Leave out joints that would follow one of another name, but for the changes.
+
+    Raises:
+        MotionError: A changed joint is not there.
     """
-    if set(target.joint_names) == set(source.joint_names):
-        return {name: name for name in target.joint_names}
-    ours, theirs = find_parts(target), find_parts(source)
+    known = set(source.joint_names)
+    ours = {} if known == set(target.joint_names) else find_parts(target)
+    theirs = find_parts(source)
     result: dict[str, str] = {}
     for (side, chain), joints in ours.items():
         others = theirs.get((side, chain), [])
@@ -196,83 +199,16 @@ def map_joints(target: Skeleton, source: Skeleton) -> dict[str, str]:
         for position, joint in enumerate(joints if others else ()):
             share = -(-(position + 1) * len(others) // len(joints)) - 1
             result[target.joint_names[joint]] = source.joint_names[others[share]]
-    named = {joint for joints in ours.values() for joint in joints}
-    known = set(source.joint_names)
-    for joint, name in enumerate(target.joint_names):
-        if joint not in named and name in known:
-            result[name] = name
-    return {name: result[name] for name in target.joint_names if name in result}
-
-
-def read_joint_map(path: str | Path) -> dict[str, str]:
-    """Read a joint map: a JSON object from joints of the body to joints of the motion, "" for a still one.
-
-    Raises:
-        AssetError: The file is missing or holds something else.
-    """
-    with parsing(path, "joint map", max_bytes=1 << 22) as file:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
-        raise AssetError(
-            f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
-        )
-    return values
-
-
-def change_map(
-    target: Skeleton,
-    source: Skeleton,
-    changes: Mapping[str, str] | None = None,
-    *,
-    same_names: bool = False,
-) -> dict[str, str]:
-    """Return the joint map between two rigs, with a user's changes, however few joints are in it.
-
-    Args:
-        target: Joints of the body.
-        source: Joints of the motion's file.
-        changes: Joints of the body to joints of the source; "" keeps one still.
-        same_names: Leave out joints that would follow one of another name, but for the changes.
-
-    Raises:
-        MotionError: A changed joint is not there.
-    """
-    result = map_joints(target, source)
+    of_parts = {target.joint_names[joint] for joints in ours.values() for joint in joints}
+    result |= {name: name for name in target.joint_names if name in known and name not in of_parts}
     if same_names:
-        result = {ours: theirs for ours, theirs in result.items() if ours == theirs}
-    for ours, theirs in (changes or {}).items():
-        _check_name(ours, target.joint_names, "the body")
-        if theirs:
-            _check_name(theirs, source.joint_names, "the motion")
-        result[ours] = theirs
+        result = {name: other for name, other in result.items() if name == other}
+    for changed, other in (changes or {}).items():
+        for name, rig, owner in ((changed, target, "the body"), (other, source, "the motion")):
+            if name not in rig.joint_names and (name or rig is target):
+                close = difflib.get_close_matches(name, rig.joint_names, n=1)
+                first = ", ".join(rig.joint_names[:6])
+                hint = f"; did you mean {close[0]}?" if close else f"; it has {first}, ..."
+                raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")
+        result[changed] = other
     return {name: result[name] for name in target.joint_names if result.get(name)}
-
-
-def complete_map(
-    target: Skeleton,
-    source: Skeleton,
-    changes: Mapping[str, str] | None = None,
-    *,
-    same_names: bool = False,
-) -> dict[str, str]:
-    """Return the joint map by which one rig follows another; see `change_map`.
-
-    Raises:
-        MotionError: A changed joint is not there, or nothing maps.
-    """
-    result = change_map(target, source, changes, same_names=same_names)
-    if len(result) < min(2, len(target)):  # the hips are always found
-        raise MotionError(
-            f"no joint of the motion ({', '.join(source.joint_names[:4])}, ...) is known to this body "
-            f"({', '.join(target.joint_names[:4])}, ...); write a map with eslr "
-            "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
-        )
-    return result
-
-
-def _check_name(name: str, known: Sequence[str], owner: str) -> None:
-    """Raise MotionError unless a name of a joint map exists; `owner` is what messages call the rig."""
-    if name not in known:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(known[:6])}, ..."
-        raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")

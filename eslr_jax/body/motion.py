@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from eslr_jax.io.skeleton import Skeleton
 from eslr_jax.numerics import product
 from eslr_jax.types import Body, BodyMotion, BodySurface
 
+SHOULDERS = 0.8  # of the body's height, for a body without arms
 _MAX_ABDUCTION = 90.0  # [degrees]; arms lifted further are above the shoulders
 _ORDINARY_YAW = np.deg2rad(35.0)  # a resting chest that faces +Z up to this is taken to face it
 
@@ -135,16 +136,14 @@ def pose_body(
 def turn_joints(body: Body, rotations: np.ndarray, translations: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Return the vertices of a body whose joints are turned [m], and the map of every joint.
 
-    Args:
-        body: A rigged body.
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-
-    Returns:
-        Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4].
+    Shapes [frames, body_vertices, 3] and [frames, joints, 3, 4]. Rotations are local axis-angle vectors [rad],
+    and translations the root's positions [m].
     """
     transforms = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    return _skin_body(body, rotations, transforms), transforms
+    skin = body.rest_positions, body.skin_weights, body.skin_indices, transforms
+    if body.pose_directions is None:
+        return _skin_frames(*skin), transforms
+    return _skin_bent(*skin, body.pose_directions, jnp.asarray(rotations[:, 1:], jnp.float32)), transforms
 
 
 def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
@@ -155,14 +154,7 @@ def first_poses(poses: BodyMotion, num_frames: int) -> BodyMotion:
 
 
 def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *, fps: float) -> BodyMotion:
-    """Return a body in motion; every `BodyMotion` is made here.
-
-    Args:
-        body: The body at rest.
-        positions: Its vertices [m], shape [frames, body_vertices, 3].
-        joint_transforms: Map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
-        fps: Frames per second.
-    """
+    """Return a body in motion, given its vertices [m] and the map of every joint; every one is made here."""
     return BodyMotion(
         positions=positions,
         joint_transforms=joint_transforms,
@@ -174,6 +166,18 @@ def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *
     )
 
 
+def check_length(poses: BodyMotion) -> None:
+    """Check that a body in motion has frames to simulate.
+
+    Raises:
+        MotionError: It has fewer than two.
+    """
+    if len(poses.joint_transforms) < 2:
+        raise MotionError(
+            f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
+        )
+
+
 def obstacle_surface(body: Body) -> BodySurface:
     """Return the search tables of all faces of a body that cloth may touch."""
     faces = np.asarray(body.faces)[np.asarray(body.is_obstacle)]
@@ -181,9 +185,8 @@ def obstacle_surface(body: Body) -> BodySurface:
     return _search_tables(rest.tobytes(), np.asarray(faces, np.int32).tobytes())
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # once per body
 def _search_tables(rest_positions: bytes, faces: bytes) -> BodySurface:
-    """Build search tables once per body."""
     return prepare_surface(
         np.frombuffer(rest_positions, np.float32).reshape(-1, 3),
         np.frombuffer(faces, np.int32).reshape(-1, 3),
@@ -212,27 +215,18 @@ def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
     )
 
 
-@partial(jax.jit, static_argnames="parents")
-def _joint_transforms(rotations, translations, joints, parents):
-    return jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None))(
-        rotations, translations, joints, parents
-    )
-
-
 def joint_transforms(
     rotations: np.ndarray, translations: np.ndarray, joints: jax.Array, parents: tuple[int, ...]
 ) -> jax.Array:
     """Return the map of every joint from rest points to posed points, shape [frames, joints, 3, 4].
 
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-        joints: Joint rest positions [m], shape [joints, 3].
-        parents: Parent of every joint; -1 for the root.
+    Arguments are those of `lbs.joint_transforms`, rotations and translations for every frame.
     """
-    return _joint_transforms(
-        jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), joints, parents
-    )
+    turns, places = (jnp.asarray(values, jnp.float32) for values in (rotations, translations))
+    return _joint_transforms(turns, places, joints, parents)
+
+
+_joint_transforms = jax.jit(jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None)), static_argnums=3)
 
 
 def chest_direction(body: Body) -> np.ndarray:
@@ -244,20 +238,11 @@ def chest_direction(body: Body) -> np.ndarray:
     return axes[:, 2]
 
 
-def _skin_body(body: Body, rotations: np.ndarray, transforms: jax.Array) -> jax.Array:
-    """Return the posed vertices of every frame [m], with pose blend shapes where the body has them."""
-    rest = body.rest_positions
-    if body.pose_directions is None:
-        return _skin_frames(rest, body.skin_weights, body.skin_indices, transforms)
-    bends = jnp.asarray(rotations[:, 1:], jnp.float32)
-    return _skin_bent(rest, body.pose_directions, body.skin_weights, body.skin_indices, bends, transforms)
-
-
 _skin_frames = jax.jit(lbs.skin_frames)
 
 
 @jax.jit
-def _skin_bent(rest, directions, weights, indices, rotations, transforms):
+def _skin_bent(rest, weights, indices, transforms, directions, rotations):
     """Return posed vertices of every frame, with pose blend shapes added at rest.
 
     Source: Loper et al. 2015, equations 8 and 9.
@@ -282,10 +267,7 @@ def _frame_at(step: int, num_frames: int, first: int = 0) -> int:
 def there_and_back(step: int, num_frames: int, first: int = 0) -> tuple[int, int]:
     """Return the two frames of a step, for a motion that is played forth and back without end.
 
-    Args:
-        step: Number of the step, from zero.
-        num_frames: Of the motion.
-        first: Frame from which on it is played forth and back; those before it are played once.
+    Frames before `first` are played once.
     """
     return _frame_at(step, num_frames, first), _frame_at(step + 1, num_frames, first)
 

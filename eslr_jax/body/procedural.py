@@ -27,26 +27,19 @@ _GRAVITY = 9.81  # [m/s^2]
 _Rotations = dict[Part, NDArray]  # [frames, 3], local axis-angle in left, up, front [rad]
 
 
-def turn(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Return rotations and root offsets [m] of a turn on the spot, first faster, then slower.
+# A movement takes the time since it began [s], shape [frames], and the height of the hips above the floor [m]; it
+# returns rotations and root offsets [m].
 
-    Args:
-        time: Time since the movement began [s], shape [frames].
-        leg: Height of the hips above the floor [m]; unused.
-    """
-    del leg
+
+def turn(time: NDArray, _leg: float) -> tuple[_Rotations, NDArray]:
+    """Turn on the spot, first faster, then slower."""
     share = np.clip(time / (SECONDS - STILL_SECONDS), 0.0, 1.0)
     angle = _TURN_RATE * (SECONDS - STILL_SECONDS) * 0.5 * (share - np.sin(2 * np.pi * share) / (2 * np.pi))
     return {("", "hips"): angle[:, None] * [0.0, 1.0, 0.0]}, np.zeros((len(time), 3))
 
 
 def jump(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Return rotations and root offsets [m] of repeated jumps; the knees bend as the hips sink.
-
-    Args:
-        time: Time since the movement began [s], shape [frames].
-        leg: Height of the hips above the floor [m].
-    """
+    """Jump again and again; the knees bend as the hips sink."""
     phase = np.where(time > 0, np.mod(time, _JUMP_SECONDS), 0.0)
     flight = 2.0 * np.sqrt(2.0 * _JUMP_HEIGHT / _GRAVITY)
     crouch = 0.5 * (_JUMP_SECONDS - flight)
@@ -69,14 +62,8 @@ def jump(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
     return rotations, height[:, None] * [0.0, 1.0, 0.0]
 
 
-def swing(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
-    """Return rotations and root offsets [m] of a trunk that twists and arms that swing against each other.
-
-    Args:
-        time: Time since the movement began [s], shape [frames].
-        leg: Height of the hips above the floor [m]; unused.
-    """
-    del leg
+def swing(time: NDArray, _leg: float) -> tuple[_Rotations, NDArray]:
+    """Twist the trunk, and swing the arms against each other."""
     ramp = np.clip(time / _SWING_SECONDS, 0.0, 1.0)
     angle = _SWING * ramp * np.sin(2 * np.pi * time / _SWING_SECONDS)
     rotations: _Rotations = {("", "spine"): 0.5 * angle[:, None] * [0.0, 1.0, 0.0]}
@@ -86,9 +73,7 @@ def swing(time: NDArray, leg: float) -> tuple[_Rotations, NDArray]:
 
 
 PROCEDURAL: dict[str, Callable[[NDArray, float], tuple[_Rotations, NDArray]]] = {
-    "turn": turn,
-    "jump": jump,
-    "swing": swing,
+    movement.__name__: movement for movement in (turn, jump, swing)
 }
 
 
@@ -106,12 +91,10 @@ def make_procedural(name: str, body: Body) -> Motion:
     parts = find_parts(skeleton)
     axes = torso_axes(skeleton, parts)
     axes = np.eye(3) if axes is None else np.round(axes)
-    if abs(np.linalg.det(axes)) < 0.5:  # the torso lies between our axes
-        axes = np.eye(3)
+    axes = np.eye(3) if abs(np.linalg.det(axes)) < 0.5 else axes  # the torso lies between our axes
     time = np.arange(int(SECONDS * FPS) + 1) / FPS - STILL_SECONDS
-    rest = np.asarray(body.rest_positions)
-    leg = skeleton.rest_positions[0, 1] - float(rest[:, 1].min())
-    moved, offsets = PROCEDURAL[name](np.maximum(time, 0.0), max(leg, 1e-3))
+    root = skeleton.rest_positions[0] - [0.0, float(np.asarray(body.rest_positions)[:, 1].min()), 0.0]
+    moved, offsets = PROCEDURAL[name](np.maximum(time, 0.0), max(root[1], 1e-3))
     rotations = np.zeros((len(time), len(skeleton), 3))
     joints = {part: parts[part][0] for part in moved if part in parts}
     for part, joint in joints.items():
@@ -121,5 +104,4 @@ def make_procedural(name: str, body: Body) -> Motion:
         raise MotionError(
             f"motion {name} moves joints that this body lacks ({known}, ...); give another motion"
         )
-    root = skeleton.rest_positions[0] - [0.0, float(rest[:, 1].min()), 0.0]
     return Motion(name, rotations, root + offsets, FPS, skeleton.joint_names, arm_abduction=0.0)

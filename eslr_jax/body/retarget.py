@@ -20,30 +20,10 @@ from eslr_jax.io.skeleton import chain_rotations, rotation_matrices
 ARM_ABDUCTION = 12.0  # [degrees]; least that keeps the hanging arms of the bundled walks clear of the torso
 
 
-def minimal_rotation(start: NDArray, end: NDArray) -> NDArray:
-    """Return the smallest rotation that turns direction `start` onto `end`, shape [3, 3].
-
-    Args:
-        start: A direction of any length, shape [3].
-        end: Another, shape [3].
-    """
-    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-    axis, cosine = np.cross(start, end), float(start @ end)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
-        if cosine > 0:
-            return np.eye(3)
-        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
-    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / sine).as_matrix()
-
-
 def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArray:
     """Return local axis-angle rotations [rad], shape [frames, joints, 3].
 
-    Args:
-        global_rotations: Rotation matrices since the rest pose, shape [frames, joints, 3, 3].
-        parents: Parent of each joint, -1 for the root.
+    `global_rotations` are matrices since the rest pose, shape [frames, joints, 3, 3].
     """
     local = np.array(global_rotations, dtype=np.float64)
     for joint, parent in enumerate(parents):
@@ -53,30 +33,17 @@ def local_rotations(global_rotations: NDArray, parents: Sequence[int]) -> NDArra
 
 
 def global_rotations(rotations: NDArray, parents: Sequence[int]) -> NDArray:
-    """Return rotation matrices since the rest pose, shape [frames, joints, 3, 3].
-
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        parents: Parent of each joint, -1 for the root.
-    """
+    """Return rotation matrices since the rest pose, shape [frames, joints, 3, 3]."""
     return chain_rotations(rotation_matrices(rotations), tuple(parents))
 
 
 def leg_length(joint_rest_positions: NDArray, parts: Mapping[Part, Sequence[int]]) -> float | None:
-    """Return the length of a thigh and shank in the unit of the positions, or None without such a leg.
-
-    The ratio of two skeletons' legs scales a motion's steps.
-
-    Args:
-        joint_rest_positions: Rest positions of a rig's joints, shape [joints, 3].
-        parts: Joints of each part of the rig; see `find_named_parts`.
-    """
+    """Return the length of a thigh and shank in the unit of the positions, or None without such a leg."""
     for side in ("left", "right"):
         chain = [parts.get((side, name), [None])[0] for name in ("upper_leg", "lower_leg", "foot")]
         if None not in chain:
             bones = np.diff(np.asarray(joint_rest_positions, np.float64)[chain], axis=0)
-            length = float(np.linalg.norm(bones, axis=1).sum())
-            return length if length > 0 else None
+            return float(np.linalg.norm(bones, axis=1).sum()) or None
     return None
 
 
@@ -90,13 +57,7 @@ def abduct_arms(
     """Return rotations with both arms lifted sideways, shape [frames, joints, 3] [rad].
 
     Bodies skinned to captured motion press their hanging arms into the torso; a few degrees keep the armpits
-    open for a garment.
-
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        joint_names: Joints of the rig; both upper arms must be among them.
-        degrees: Angle added to each arm [degrees].
-        front: Direction that the resting chest faces, shape [3].
+    open for a garment. `front` is the direction that the resting chest faces.
 
     Raises:
         MotionError: If the rig has no such arms.
@@ -126,15 +87,6 @@ def resample(
 
     The first frame is kept; the last output frame is the last that falls inside the input.
 
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-        fps_in: Frames per second of the input.
-        fps_out: Frames per second wanted.
-
-    Returns:
-        Rotations [rad] and translations [m] at `fps_out`.
-
     Raises:
         MotionError: If the motion is empty or a frame rate is not positive.
     """
@@ -150,17 +102,7 @@ def resample(
 def interpolate(
     rotations: NDArray, translations: NDArray, times: NDArray, new_times: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return a motion at other times, which must lie within the old ones.
-
-    Args:
-        rotations: Local axis-angle rotations [rad], shape [frames, joints, 3].
-        translations: Root positions [m], shape [frames, 3].
-        times: Time of each frame [s], ascending, shape [frames].
-        new_times: Times wanted [s], shape [new_frames].
-
-    Returns:
-        Rotations [rad], shape [new_frames, joints, 3], and translations [m], shape [new_frames, 3].
-    """
+    """Return rotations [rad] and translations [m] at other times [s], which must lie within the old ones."""
     if len(times) == 1:
         repeat = np.zeros(len(new_times), dtype=int)
         return np.asarray(rotations, np.float64)[repeat], np.asarray(translations, np.float64)[repeat]
@@ -173,10 +115,7 @@ def interpolate(
 def blend_rotations(start: NDArray, end: NDArray, fraction: NDArray) -> NDArray:
     """Return rotations between two, along the shorter way, shape [frames, joints, 3] [rad].
 
-    Args:
-        start: Axis-angle rotations [rad], shape [frames, joints, 3].
-        end: Others, shape [frames, joints, 3].
-        fraction: Share of the way from `start` to `end`, shape [frames].
+    `fraction` is the share of the way from `start` to `end`, shape [frames].
     """
     first, last = (Rotation.from_rotvec(np.reshape(values, (-1, 3))) for values in (start, end))
     step = (first.inv() * last).as_rotvec() * np.repeat(fraction, start.shape[1])[:, None]

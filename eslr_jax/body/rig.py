@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import warnings
 from collections.abc import Mapping
 
@@ -10,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eslr_jax.body.alignment import align_rests, match_parts, rig_scale
-from eslr_jax.body.joints import HAND, complete_map, find_named_parts, find_parts
+from eslr_jax.body.joints import HAND, find_named_parts, find_parts, map_joints
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
-from eslr_jax.body.units import metres_per_unit
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.geometry.validate import check_outward
+from eslr_jax.geometry.validate import UNITS, check_outward
 from eslr_jax.io.mesh import shared_vertices
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton, SkeletonMotion, chain_positions
 from eslr_jax.types import Body
@@ -23,7 +24,58 @@ from eslr_jax.types import Body
 MODEL_JOINTS = 18  # joints that a body shares with the SMPL family's 22 to be one of it
 GROUND_QUANTILE = 0.05  # of the lowest sole of each frame: robust to a toe that dips for a moment
 LOST_MOVE = 0.01  # [m] by which a character's joint may miss its place in the file without a word
+_HUMAN = 1.7  # [m]
+_IN_METRES = (0.3, 3.0)  # [m] extents of bodies that are taken to be in metres
+_IN_UNITS = (0.5, 2.6)  # [m] extents that make another unit believable
+_EXTENTS = (1e-4, 1e6)  # of a body in any unit; beyond, the file is damaged
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from Z up
+
+
+class UnitsWarning(UserWarning):
+    """The unit of a file was guessed."""
+
+
+def metres_per_unit(name: str, extent: float, units: str | None = None) -> float:
+    """Return the metres per unit of a body's file; warn with one line if that is a guess.
+
+    A body of a person's size in metres is in metres. Otherwise the unit that comes closest to an adult's height
+    is taken, and a body that fits no unit is scaled to that height.
+
+    Args:
+        name: What messages call the body.
+        extent: Largest side of its bounding box, in its unit.
+        units: One of `UNITS`, or a number of metres per unit; None guesses.
+
+    Raises:
+        AssetError: The unit is unknown, or the body's extent is none.
+    """
+    if units in UNITS:
+        return UNITS[units]
+    if units is not None:
+        try:
+            scale = float(units)
+        except ValueError:
+            scale = math.nan
+        if not (math.isfinite(scale) and scale > 0):
+            raise AssetError(f"{name}: unknown unit {units!r}; give {', '.join(UNITS)}, or metres per unit")
+        return scale
+    if _IN_METRES[0] <= extent <= _IN_METRES[1]:
+        return 1.0
+    if not _EXTENTS[0] <= extent <= _EXTENTS[1]:
+        raise AssetError(f"{name} is {extent:.4g} units large; export it again in metres")
+    heights = {unit: extent * metres for unit, metres in UNITS.items() if unit != "m"}
+    fitting = {unit: height for unit, height in heights.items() if _IN_UNITS[0] <= height <= _IN_UNITS[1]}
+    if fitting:
+        unit = min(fitting, key=lambda unit: abs(math.log(fitting[unit] / _HUMAN)))
+        text = f"taken to be in {unit}, which makes it {fitting[unit]:.2f} m"
+        scale = UNITS[unit]
+    else:
+        scale = _HUMAN / extent
+        text = f"scaled to {_HUMAN} m, since no unit makes it a person"
+    warnings.warn(
+        f"{name} is {extent:.4g} units large: {text}; name its unit if not", UnitsWarning, stacklevel=3
+    )
+    return scale
 
 
 def body_skeleton(body: Body) -> Skeleton:
@@ -57,11 +109,8 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     indices = joint_place[mesh.skin_indices[vertices]]
     weights = mesh.skin_weights[vertices]
 
-    def floats(values: NDArray):
-        return jnp.asarray(values, jnp.float32)
-
     def lengths(values: NDArray):
-        return floats(scale * values)
+        return jnp.asarray(scale * values, jnp.float32)
 
     shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
     if shapes is None or joint_shapes is None:
@@ -71,7 +120,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
         shape_directions=lengths(shapes[vertices]),
         joint_rest_positions=lengths(skeleton.rest_positions),
         joint_shape_directions=lengths(joint_shapes[order]),
-        skin_weights=floats(weights / weights.sum(1, keepdims=True)),
+        skin_weights=jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
         is_obstacle=jnp.asarray(_is_obstacle(faces, weights, indices, skeleton)),
@@ -179,17 +228,24 @@ def make_motion(
             stacklevel=2,
         )
     if up == "z" or is_judged:
-        source = turn_motion(source, _Y_UP)
+        rest = dataclasses.replace(source.skeleton, rest_positions=source.skeleton.rest_positions @ _Y_UP.T)
+        turned, moved = _Y_UP @ source.rotations @ _Y_UP.T, source.positions @ _Y_UP.T
+        source = dataclasses.replace(source, skeleton=rest, rotations=turned, positions=moved)
     target = body_skeleton(body)
     is_model = is_body_model(target, source)
-    mapping = complete_map(target, source.skeleton, joint_map, same_names=is_model)
+    mapping = map_joints(target, source.skeleton, joint_map, same_names=is_model)
+    if len(mapping) < min(2, len(target)):  # the hips are always found
+        raise MotionError(
+            f"no joint of the motion ({', '.join(source.skeleton.joint_names[:4])}, ...) is known to this body "
+            f"({', '.join(target.joint_names[:4])}, ...); write a map with eslr "
+            "joints --out map.json, fill in its empty names, and give it as --joint-map map.json"
+        )
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
-    is_own = scale is not None
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
-    if not is_own:
+    if scale is None:
         alignments = align_rests(target, source.skeleton, ours, theirs, source.name)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
@@ -199,12 +255,10 @@ def make_motion(
             turned[:, joint] = turned[:, parent] if parent >= 0 else np.eye(3)
     translations = source.positions[:, theirs["", "hips"][0]]
     if scale is None:
-        legs = [
-            leg_length(rig.rest_positions, parts)
-            for rig, parts in ((target, ours), (source.skeleton, theirs))
-        ]
-        if legs[0] and legs[1]:
-            translations = legs[0] / legs[1] * translations
+        leg = leg_length(target.rest_positions, ours)
+        other = leg_length(source.skeleton.rest_positions, theirs)
+        if leg and other:
+            translations = leg / other * translations
         translations = _put_on_floor(turned, translations, target, body)
     elif source.root_axes is not None:
         translations = translations + source.root_axes @ target.rest_positions[0]
@@ -220,18 +274,12 @@ def make_motion(
         translations,
         source.fps,
         target.joint_names,
-        arm_abduction=ARM_ABDUCTION if has_arms and not is_own else 0.0,
+        arm_abduction=ARM_ABDUCTION if has_arms and scale is None else 0.0,
     )
 
 
 def _warn_of_lost_moves(name: str, away: NDArray, body: Body) -> None:
-    """Warn if a joint with skin misses its place in the file.
-
-    Args:
-        name: Name of the motion.
-        away: Distance of each joint from its place in the file [m], shape [frames, joints].
-        body: The body.
-    """
+    """Warn if a joint with skin is `away` from its place in the file [m], [frames, joints]."""
     has_skin = np.zeros(away.shape[1], bool)
     has_skin[np.asarray(body.skin_indices)[np.asarray(body.skin_weights) > 0]] = True
     away = np.where(has_skin, away, 0.0)
@@ -262,19 +310,6 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
     return SkeletonMotion(motion.name, skeleton, turned, positions, motion.fps)
 
 
-def turn_motion(motion: SkeletonMotion, axes: NDArray) -> SkeletonMotion:
-    """Return a motion in other axes, to which `axes`, shape [3, 3], turns every vector."""
-    skeleton = motion.skeleton
-    return SkeletonMotion(
-        motion.name,
-        Skeleton(skeleton.joint_names, skeleton.parents, skeleton.rest_positions @ axes.T),
-        axes @ motion.rotations @ axes.T,
-        motion.positions @ axes.T,
-        motion.fps,
-        motion.root_axes,
-    )
-
-
 def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
     """Tell whether the head is mostly above the feet along z rather than y; positions: [frames, joints, 3]."""
     parts = find_parts(skeleton)
@@ -301,22 +336,10 @@ def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
 
 
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:
-    """Return root positions [m] that start above the origin, with the soles on the floor, shape [frames, 3].
-
-    Args:
-        turned: Rotation matrices of the body's joints since the rest pose, shape [frames, joints, 3, 3].
-        translations: Root positions [m], shape [frames, 3].
-        target: Joints of the body at rest.
-        body: The body.
-    """
+    """Return root positions [m] that start above the origin, with the soles on the floor, shape [frames, 3]."""
     translations = translations - translations[0] * [1.0, 0.0, 1.0]
     parts = find_parts(target)
-    feet = [
-        joint
-        for side in ("left", "right")
-        for chain in ("foot", "toe")
-        for joint in parts.get((side, chain), [])
-    ]
+    feet = [joint for (_, chain), joints in parts.items() if chain in ("foot", "toe") for joint in joints]
     if not feet:
         return translations
     soles = float(np.asarray(body.rest_positions)[:, 1].min())

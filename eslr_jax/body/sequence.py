@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from eslr_jax.body.motion import body_motion
 from eslr_jax.body.retarget import count_resampled
-from eslr_jax.body.units import metres_per_unit
+from eslr_jax.body.rig import metres_per_unit
 from eslr_jax.errors import MotionError
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import unique_edges
@@ -97,13 +97,9 @@ def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
 def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Divide a surface into patches with soft borders.
 
-    Args:
-        rest: Vertices at rest [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-
     Returns:
-        The largest weights of every vertex, which sum to one, shape [vertices, influences]; their patches, of
-        the same shape; and all weights, shape [vertices, patches].
+        The largest weights of every vertex, which sum to one, and their patches, shape [vertices, influences];
+        and all weights, shape [vertices, patches].
     """
     edges = unique_edges(faces)
     lengths = np.maximum(np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1), 1e-9)
@@ -128,11 +124,6 @@ def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
 
 def _fit_patches(positions: NDArray, rest: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
     """Return each patch's best rigid motion, shape [frames, patches, 3, 4], and rest centre, [patches, 3].
-
-    Args:
-        positions: Vertices in motion [m], shape [frames, vertices, 3].
-        rest: Vertices at rest [m], shape [vertices, 3].
-        weights: Weight of every patch at every vertex, shape [vertices, patches].
 
     Source: Kabsch 1976 (doi:10.1107/S0567739476001873).
     """

@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body.motion import Motion, turn_joints
-from eslr_jax.body.retarget import blend_rotations, count_resampled, local_rotations
+from eslr_jax.body.motion import Motion, check_length, turn_joints
+from eslr_jax.body.retarget import blend_rotations, local_rotations
 from eslr_jax.errors import MotionError
-from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.geometry.topology import face_cross_products, normalize
 from eslr_jax.io.skeleton import SkeletonMotion
 from eslr_jax.types import Body, BodyMotion
 
@@ -32,22 +32,11 @@ _Track = tuple[Float[Array, "frames vertices 3"], Float[Array, "frames joints 3 
 _BLEND_SECONDS = 0.3  # in which the end of a loop passes into its beginning
 
 
-def num_simulated_frames(motion: Motion, fps: float = 30.0) -> int:
-    """Return the number of frames of a motion after resampling to the rate of the simulation."""
-    return count_resampled(len(motion.rotations), motion.fps, fps)
-
-
 def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
-    """Return a motion without a T-pose that stands before it, and a line that says so.
+    """Return a file's motion without a T-pose that stands before it, and a line that says so, or else "".
 
     Many files begin with one or a few frames of the rest pose. Simulated, that is a jump. Frames are skipped
     if the step that follows them is far longer than every other step.
-
-    Args:
-        source: The motion of a file.
-
-    Returns:
-        The motion, and what was skipped; the same motion and "" if nothing was.
     """
     size = float(np.ptp(source.skeleton.rest_positions, axis=0).max()) or 1.0
     steps = np.linalg.norm(np.diff(source.positions, axis=0), axis=-1).max(axis=1) / size
@@ -68,11 +57,7 @@ def skip_start_pose(source: SkeletonMotion) -> tuple[SkeletonMotion, str]:
 
 
 def cut_start(motion: Motion, seconds: float) -> Motion:
-    """Return a motion from a time on.
-
-    Args:
-        motion: A motion.
-        seconds: Time of its new first frame [s].
+    """Return a motion from a time on [s].
 
     Raises:
         MotionError: Fewer than two frames are left.
@@ -90,14 +75,10 @@ def cut_start(motion: Motion, seconds: float) -> Motion:
 
 
 def loop_motion(motion: Motion, seconds: float) -> Motion:
-    """Return a motion that repeats until it is this long.
+    """Return a motion that repeats until it is this long [s].
 
     Each repetition starts where the last one ended, facing the same way, and the end passes smoothly into the
     beginning.
-
-    Args:
-        motion: A motion.
-        seconds: Length wanted [s].
 
     Raises:
         MotionError: The length is not positive, or the motion is too short to repeat.
@@ -128,18 +109,6 @@ def _level_turn(end: NDArray, start: NDArray) -> Rotation:
     """Return the turn about the vertical that brings one axis-angle rotation closest to another, `end`."""
     matrix = (Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()).as_matrix()
     return Rotation.from_euler("y", np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2]))
-
-
-def check_length(poses: BodyMotion) -> None:
-    """Check that a body in motion has frames to simulate.
-
-    Raises:
-        MotionError: It has fewer than two.
-    """
-    if len(poses.joint_transforms) < 2:
-        raise MotionError(
-            f"a simulation needs two frames or more; this motion has {len(poses.joint_transforms)}"
-        )
 
 
 def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) -> BodyMotion:
@@ -177,12 +146,9 @@ def begins_at_rest(num_frames: int, body: Body) -> bool:
 
 
 def _limbs_from_rest(body: Body, pose: NDArray, num_frames: int) -> _Track:
-    """Return frames in which limbs come from the rest pose of a body to a pose; they start and end slowly.
+    """Return frames in which limbs come from the rest pose to `pose`, the map of every joint [joints, 3, 4].
 
-    Args:
-        body: A rigged body.
-        pose: Map of every joint, shape [joints, 3, 4].
-        num_frames: Number of frames.
+    They start and end slowly.
     """
     root = body.parents.index(-1)
     last = local_rotations(pose[None, :, :, :3], body.parents)
@@ -213,18 +179,16 @@ def _glide(motion: _Track, limbs: _Track | None, num_frames: int) -> _Track:
     )
 
 
-def find_fast_frame(
-    poses: BodyMotion, limit: float, *, vertices: NDArray | None = None
-) -> tuple[int, float] | None:
-    """Return the first frame in which a body comes towards cloth by more than a limit, and by how much [m].
+def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
+    """Check that contacts can follow a body in every frame.
 
     Args:
         poses: The body in motion.
         limit: Largest step along the outward normal between two frames [m].
         vertices: Body vertices that cloth can reach; None for all that are an obstacle.
 
-    Returns:
-        The frame that the step leads to and the step [m], or None if all frames keep the limit.
+    Raises:
+        MotionError: A step is too long; the line names the first such frame, the speed, and what to do.
     """
     positions, faces = np.asarray(poses.positions), np.asarray(poses.faces)[np.asarray(poses.is_obstacle)]
     if vertices is not None:
@@ -234,28 +198,13 @@ def find_fast_frame(
         moved = positions[frame] - positions[frame - 1]
         if not len(corners) or np.linalg.norm(moved[corners], axis=1).max() <= limit:
             continue  # most frames; normals are needed for the others only
-        normals = face_cross_products(positions[frame - 1], faces)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        normals = normalize(face_cross_products(positions[frame - 1], faces))
         step = float(np.einsum("fka,fa->fk", moved[faces], normals).max())
         if step > limit:
-            return frame, step
-    return None
-
-
-def check_speed(poses: BodyMotion, limit: float, *, vertices: NDArray | None = None) -> None:
-    """Raise unless contacts can follow the body in every frame; see `find_fast_frame`.
-
-    Raises:
-        MotionError: A step is too long; the line names the frame, the speed, and what to do.
-    """
-    found = find_fast_frame(poses, limit, vertices=vertices)
-    if found is None:
-        return
-    frame, step = found
-    timestep = float(poses.timestep)
-    raise MotionError(
-        f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "
-        f"{step / timestep:.1f} m/s), and contacts follow {limit:g} m: "
-        + (f"frames 0 to {frame - 1} are fine, --frames {frame} keeps them; " if frame > 1 else "")
-        + "start later, or repair or slow down the motion"
-    )
+            timestep = float(poses.timestep)
+            kept = f"frames 0 to {frame - 1} are fine, --frames {frame} keeps them; " if frame > 1 else ""
+            raise MotionError(
+                f"the body moves {step:.2f} m in one frame, to frame {frame} ({frame * timestep:.2f} s; "
+                f"{step / timestep:.1f} m/s), and contacts follow {limit:g} m: {kept}start later, or repair or "
+                "slow down the motion"
+            )

@@ -47,8 +47,7 @@ def load_wearer(body: str, *, units: str | None = None, betas: tuple[float, ...]
 def load_actor(options: Options) -> Actor:
     """Load a body and set it in motion."""
     from eslr_jax.assets import load_body, load_motion
-    from eslr_jax.assets.motions import own_motion
-    from eslr_jax.body.joints import read_joint_map
+    from eslr_jax.assets.motions import own_motion, read_joint_map
     from eslr_jax.body.motion import pose_body
     from eslr_jax.body.sequence import pose_sequence
     from eslr_jax.body.timing import cut_start, loop_motion

@@ -86,9 +86,10 @@ def _fabrics() -> dict[str, dict[str, Any]]:
 def _simulated_frames(names: list[str]) -> dict[str, int]:
     """Return how many frames bundled motions have as they are simulated."""
     from eslr_jax.assets import load_motion
-    from eslr_jax.body.timing import num_simulated_frames
+    from eslr_jax.body.retarget import count_resampled
 
-    return {name: num_simulated_frames(load_motion(name), FPS) for name in names}
+    motions = map(load_motion, names)
+    return {motion.name: count_resampled(len(motion.rotations), motion.fps, FPS) for motion in motions}
 
 
 def _export_body(path: Path, name: str) -> None:
@@ -173,7 +174,7 @@ def info(
         "--self-contact": self_contact,
     })  # fmt: skip
     from eslr_jax.assets import load_model
-    from eslr_jax.assets.names import is_path
+    from eslr_jax.assets.catalog import is_path
     from eslr_jax.config import to_dict
     from eslr_jax.models.registry import MODELS, count_parameters, init_model
 

@@ -31,15 +31,15 @@ def joints(
         json_: Print as JSON.
     """
     from eslr_jax.assets import load_body
-    from eslr_jax.assets.motions import moving_skeleton
-    from eslr_jax.body.joints import change_map, read_joint_map
+    from eslr_jax.assets.motions import moving_skeleton, read_joint_map
+    from eslr_jax.body.joints import map_joints
     from eslr_jax.body.rig import body_skeleton, is_body_model
     from eslr_jax.io.atomic import atomic_write
 
     target = body_skeleton(load_body(body))
     source = moving_skeleton(motion)
     changes = None if joint_map is None else read_joint_map(joint_map)
-    found = change_map(target, source.skeleton, changes, same_names=is_body_model(target, source))
+    found = map_joints(target, source.skeleton, changes, same_names=is_body_model(target, source))
     values = {name: found.get(name, "") for name in target.joint_names}
     if out is not None:
         with atomic_write(out) as temporary:

@@ -1,19 +1,25 @@
-"""Find where a garment lies inside the body, and move it out."""
+"""Where a garment lies inside the body, its way out, and from a posed body to the resting one."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.fit.postures import Posture
+from eslr_jax.fit.postures import Posture, rest_posture, unpose
 from eslr_jax.geometry.closest import nearest_places
-from eslr_jax.geometry.skinning import smooth
+from eslr_jax.geometry.skinning import smooth, transfer_skin_weights
+from eslr_jax.types import Body
 
 CLEARANCE = 3e-3  # [m] left between cloth and skin: a millimetre over the thickness of collisions
 MAX_DEPTH = 0.06  # [m] from which a vertex is moved out; deeper ones are in another limb
 _MARGIN = 0.15  # [m] within which distances are exact
 _ROUNDS = 12
 _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
+_SMOOTHING = 3  # Laplacian steps over transferred skin weights, as for the bundled shirts
+_LOOSE_SMOOTHING = 20  # for skirts, or the two legs tear them, as for the bundled dresses
+_LOOSE = 0.05  # [m] from the body; a garment is loose if a tenth of its vertices are farther away
 
 
 def body_heights(
@@ -24,60 +30,34 @@ def body_heights(
     The sign comes from the interpolated vertex normal at the closest point. Beyond 15 cm, distances are to the
     nearest vertex and normals are zero.
     """
-    heights = posture.heights(points)
-    normals = np.zeros_like(points)
-    close = np.abs(heights) < _MARGIN
-    if close.any():
-        heights[close], normals[close] = _exact_heights(points[close], posture)
+    heights, normals = posture.heights(points), np.zeros_like(points)
+    is_close = np.abs(heights) < _MARGIN
+    if is_close.any():
+        close, faces = points[is_close], posture.faces[posture.is_obstacle]
+        centers = posture.positions[faces].mean(axis=1)
+        is_near = (centers > close.min(axis=0) - _MARGIN) & (centers < close.max(axis=0) + _MARGIN)
+        near = is_near.all(axis=1)
+        faces = faces[near] if near.any() else faces
+        place = nearest_places(close, posture.positions, faces, posture.normals)
+        distance = np.linalg.norm(place.offsets, axis=1)
+        is_inside = np.einsum("px,px->p", place.offsets, place.normals) < 0
+        heights[is_close], normals[is_close] = np.where(is_inside, -distance, distance), place.normals
     return heights, normals
 
 
-def _exact_heights(points: np.ndarray, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
-    """Return signed distances and normals of points within `_MARGIN` of the skin; see `body_heights`."""
-    faces = posture.faces[posture.is_obstacle]
-    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
-    centers = posture.positions[faces].mean(axis=1)
-    near = ((centers > low) & (centers < high)).all(axis=1)
-    faces = faces[near] if near.any() else faces
-    _, _, offset, normals = nearest_places(points, posture.positions, faces, posture.normals)
-    distance = np.linalg.norm(offset, axis=1)
-    return np.where(np.einsum("px,px->p", offset, normals) < 0, -distance, distance), normals
-
-
-def penetration(heights: Float[np.ndarray, " points"]) -> dict[str, float]:
-    """Return the number of points inside the body and their largest depth, given signed distances [m].
-
-    Points deeper than 6 cm are counted apart.
-    """
-    is_deeper = heights <= -MAX_DEPTH
-    depth = np.maximum(-heights[~is_deeper], 0.0)
-    return {
-        "inside": int(np.sum(depth > 0)),
-        "depth_max_mm": round(float(depth.max(initial=0.0)) * 1e3, 3),
-        "deeper": int(np.sum(is_deeper)),
-    }
-
-
 def push_out(
-    positions: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    posture: Posture,
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], posture: Posture
 ) -> tuple[Float[np.ndarray, "vertices 3"], dict[str, dict[str, float]]]:
-    """Move vertices that lie inside the body or closer than 3 mm out along the skin's normal.
+    """Move vertices that lie inside a posed body or closer than 3 mm out along the skin's normal.
 
-    Their neighbours follow, so that no dents stay.
-
-    Args:
-        positions: Garment vertex positions in the posture's pose [m], shape [vertices, 3].
-        faces: Triangles of the garment, shape [faces, 3].
-        posture: The body in that pose.
+    Their neighbours follow, so that no dents stay. Vertices deeper than 6 cm stay, and are counted apart.
 
     Returns:
         New positions [m], and a report of the penetration before and after and of the distances moved.
     """
     result = positions.copy()
     heights, normals = body_heights(result, posture)
-    before = penetration(heights)
+    before = _penetration(heights)
     active = np.flatnonzero(np.abs(heights) < MAX_DEPTH)
     for _ in range(_ROUNDS):
         lift = np.zeros(len(result))
@@ -86,14 +66,60 @@ def push_out(
         if lift.max(initial=0.0) < 1e-5:
             break
         move = lift[:, None] * normals
-        follow = smooth(move, faces, _SPREAD)
-        result += np.where(lift[:, None] > 0, move, follow)
-        heights = heights.copy()
+        result += np.where(lift[:, None] > 0, move, smooth(move, faces, _SPREAD))
         heights[active], normals[active] = body_heights(result[active], posture)
-    after = penetration(heights)
     moved = np.linalg.norm(result - positions, axis=1)
-    report = {
-        "moved": int(np.sum(moved > 1e-4)),
-        "moved_max_mm": round(float(moved.max(initial=0.0)) * 1e3, 3),
+    report = {"moved": int(np.sum(moved > 1e-4)), "moved_max_mm": _millimetres(moved)}
+    return result, {"before": before, "after": _penetration(heights), "push_out": report}
+
+
+def _penetration(heights: np.ndarray) -> dict[str, float]:
+    """Return how many vertices are inside, how deep, and how many deeper than any that is moved."""
+    is_deeper = heights <= -MAX_DEPTH
+    depth = np.maximum(-heights[~is_deeper], 0.0)
+    return {
+        "inside": int(np.sum(depth > 0)),
+        "depth_max_mm": _millimetres(depth),
+        "deeper": int(np.sum(is_deeper)),
     }
-    return result, {"before": before, "after": after, "push_out": report}
+
+
+def _millimetres(lengths: np.ndarray) -> float:
+    return round(float(lengths.max(initial=0.0)) * 1e3, 3)
+
+
+def lay_to_rest(
+    placed: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    posture: Posture,
+    body: Body,
+    *,
+    is_pushed: bool = True,
+) -> tuple[
+    Float[np.ndarray, "vertices 3"],
+    Float[np.ndarray, "vertices 4"],
+    Int[np.ndarray, "vertices 4"],
+    dict[str, Any],
+]:
+    """Return a garment in the body's rest pose, given it on the body in another pose [m].
+
+    Returns:
+        Rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,
+        which is done in both poses unless `is_pushed` is false.
+    """
+    clear, penetration = push_out(placed, faces, posture) if is_pushed else (placed, {})
+    is_loose = np.quantile(posture.heights(clear), 0.9) > _LOOSE
+    weights, indices = transfer_skin_weights(
+        clear,
+        posture.positions,
+        posture.faces,
+        np.asarray(body.skin_weights, np.float64),
+        np.asarray(body.skin_indices),
+        smoothing_steps=_LOOSE_SMOOTHING if is_loose else _SMOOTHING,
+        faces=faces,
+    )
+    rest = clear
+    if not np.array_equal(posture.transforms, np.broadcast_to(np.eye(3, 4), posture.transforms.shape)):
+        rest = unpose(clear, weights, indices, posture.transforms)
+        rest = push_out(rest, faces, rest_posture(body))[0] if is_pushed else rest
+    return rest, weights, indices, penetration

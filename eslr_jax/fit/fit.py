@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from eslr_jax.body.motion import chest_direction
 from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax.fit.clearance import lay_to_rest
 from eslr_jax.fit.options import FitOptions
-from eslr_jax.fit.pins import select_vertices
-from eslr_jax.fit.placement import Placement, find_placement
+from eslr_jax.fit.pins import choose_pins
+from eslr_jax.fit.placement import find_placement
 from eslr_jax.fit.postures import Posture, arm_postures, rest_posture
 from eslr_jax.fit.remesh import remesh
-from eslr_jax.fit.rest import lay_to_rest
+from eslr_jax.fit.report import wearer_entry
 from eslr_jax.fit.transfer import carry_shape
-from eslr_jax.fit.waist import Waist, find_waist
-from eslr_jax.fit.wearer import wearer_entry
 from eslr_jax.geometry.repair import (
     Cleaned,
     consistent_orientation,
@@ -76,59 +73,54 @@ def fit_garment(
     worn_by = body if made_for is None else made_for
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
+    facing = chest_direction(worn_by)
     placement = find_placement(
-        clean.positions,
-        clean.faces,
-        postures,
-        units=options.units,
-        up=options.up,
-        front=options.front,
-        keep_place=options.keep_place,
-        is_metric=source.is_metric,
-        facing=chest_direction(worn_by),
-        name=name,
+        clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
     clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
     is_turned = _turned_faces(clean, posture)
-    sewn, face_source, lost = clean.positions, clean.face_source, []
-    vertex_map, joined_rows = clean.vertex_map, None
-    if mesh.rows is not None and options.edge_length is None:
-        vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
-    if options.edge_length is not None:
+
+    sewn, parts, uvs, lost = clean.positions, mesh.face_parts, mesh.corner_uvs, []
+    file_pins = np.zeros(len(sewn), bool)
+    if options.edge_length is None:
+        vertex_map, joined_rows, face_source = clean.vertex_map, None, clean.face_source
+        if source.is_pinned is not None:
+            held = vertex_map[source.is_pinned]
+            file_pins[held[held >= 0]] = True
+        if mesh.rows is not None:
+            vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
+        uvs = None if uvs is None else _turn(uvs[face_source], is_turned)
+    else:
         lost = _lost_pins(source, options)
         sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
-        vertex_map, face_source = np.arange(len(sewn)), face_source[nearest]
+        vertex_map, joined_rows, face_source = np.arange(len(sewn)), None, clean.face_source[nearest]
+        file_pins, uvs = np.zeros(len(sewn), bool), None
+    parts = None if parts is None else parts[face_source]
     validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
     report |= {"vertices": len(sewn), "faces": len(faces)}
 
     placed, worn_in, transfer = sewn, posture, {}
     if made_for is not None:
-        carried = carry_shape((sewn, faces), posture, made_for, body, scale=options.scale)
-        placed, sewn, worn_in = carried.placed, carried.sewn, carried.posture
-        transfer = {"transfer": carried.report}
+        placed, sewn, worn_in, carried = carry_shape(
+            sewn, faces, posture, made_for, body, scale=options.scale
+        )
+        transfer = {"transfer": carried}
     rest, weights, indices, penetration = lay_to_rest(
         placed, faces, worn_in, body, is_pushed=options.push_out
     )
-    parts = None if mesh.face_parts is None else mesh.face_parts[face_source]
-    file_pins = np.zeros(len(rest), bool)
-    if source.is_pinned is not None and options.edge_length is None:
-        held = clean.vertex_map[source.is_pinned]
-        file_pins[held[held >= 0]] = True
-    select = functools.partial(
-        select_vertices,
+    is_pinned, pinned_by, falling = choose_pins(
+        options.pin,
+        file_pins,
+        body,
         positions=rest,
         faces=faces,
         vertex_map=vertex_map,
         face_parts=parts,
         part_names=mesh.part_names,
     )
-    is_pinned, pinned_by, falling = _pin(options.pin, file_pins, select, find_waist(rest, faces, body))
-    uvs = None
-    if mesh.corner_uvs is not None and options.edge_length is None:
-        uvs = _turn(mesh.corner_uvs[face_source], is_turned)
     return GarmentFile(
         rest_positions=rest,
         faces=faces,
@@ -145,7 +137,17 @@ def fit_garment(
             "name": name,
             **wearer_entry(body),
             "fit": {
-                "placement": _describe(placement, posture),
+                "placement": {
+                    "what": placement.describe(),
+                    "metres_per_unit": placement.factor,
+                    "up": placement.up,
+                    "front": placement.front,
+                    "origin": placement.origin,
+                    "moved_m": [round(float(value), 4) for value in placement.translation],
+                    "arms_below_horizontal_deg": posture.arm_angle,
+                    "cost": round(placement.cost, 3),
+                    "confidence": round(placement.confidence, 3),
+                },
                 "mesh": report,
                 "penetration": penetration,
                 "pinned": int(is_pinned.sum()),
@@ -157,54 +159,6 @@ def fit_garment(
     )
 
 
-def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
-    """Return a warning of pins by vertices of the file, which remeshing replaces.
-
-    Raises:
-        ConfigError: They are asked for by number.
-    """
-    counted = [text for text in options.pin if text.startswith("vertices:")]
-    if counted:
-        raise ConfigError(
-            f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
-            "a region or a loop"
-        )
-    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
-        return []
-    return [
-        "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "
-        "loop"
-    ]
-
-
-def _pin(
-    texts: tuple[str, ...], file_pins: np.ndarray, select: Callable[[str], np.ndarray], waist: Waist
-) -> tuple[np.ndarray, str, list[str]]:
-    """Return the pinned vertices, where the pins come from, and a warning if nothing holds the garment.
-
-    Raises:
-        ConfigError: A pin is unknown, or it contradicts another.
-    """
-    is_pinned, nothing = file_pins.copy(), np.zeros_like(file_pins)
-    if "none" in texts:
-        if len(texts) > 1:
-            raise ConfigError("pin 'none' holds nothing; leave out the other pins")
-        is_pinned, pinned_by = nothing, "--pin none"
-    elif texts:
-        if "waist" in texts and not waist.is_held.any():
-            raise ConfigError(f"pin 'waist' holds no vertex: {waist.reason}")
-        for text in texts:
-            is_pinned |= waist.is_held if text == "waist" else select(text)
-        pinned_by = f"--pin {' '.join(texts)}{' and the file' if file_pins.any() else ''}"
-    elif file_pins.any():
-        pinned_by = "the file"
-    else:
-        is_pinned, pinned_by = waist.is_held, waist.reason
-    falls = (waist.is_held.any() or waist.is_falling) and not is_pinned.any()
-    remedy = "give eslr fit --pin, such as --pin loop:top, or --components join to sew its parts together"
-    return is_pinned, pinned_by, [f"nothing holds the garment up: {waist.reason}; {remedy}"] if falls else []
-
-
 def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
     """Weld open edges; return the mesh and a report."""
     clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
@@ -214,7 +168,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
             "smaller --weld"
         )
     num_used = len(np.unique(faces))
-    report = {
+    return clean, {
         "source_vertices": len(positions),
         "source_faces": len(faces),
         "loose_vertices": len(positions) - num_used,
@@ -222,7 +176,6 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
         "dropped_faces": len(faces) - len(clean.faces),
         "components": vertex_components(clean.faces, len(clean.positions))[0],
     }
-    return clean, report
 
 
 def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
@@ -235,10 +188,8 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]
         step = largest_component(clean.positions, clean.faces)
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1
     left = vertex_components(step.faces, len(step.positions))[0]
-    return (
-        Cleaned(step.positions, step.faces, onward, clean.face_source[step.face_source]),
-        {"components_left": left},
-    )
+    joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])
+    return joined, {"components_left": left}
 
 
 def _turned_faces(clean: Cleaned, posture: Posture) -> np.ndarray:
@@ -259,16 +210,17 @@ def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     return result
 
 
-def _describe(placement: Placement, posture: Posture) -> dict[str, Any]:
-    """Return a placement as plain values."""
-    return {
-        "what": placement.describe(),
-        "metres_per_unit": placement.factor,
-        "up": placement.up,
-        "front": placement.front,
-        "origin": placement.origin,
-        "moved_m": [round(float(value), 4) for value in placement.translation],
-        "arms_below_horizontal_deg": posture.arm_angle,
-        "cost": round(placement.cost, 3),
-        "confidence": round(placement.confidence, 3),
-    }
+def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
+    """Return a warning of pins of the file, whose vertices remeshing replaces; raise if a number names them."""
+    counted = [text for text in options.pin if text.startswith("vertices:")]
+    if counted:
+        raise ConfigError(
+            f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
+            "a region or a loop"
+        )
+    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
+        return []
+    return [
+        "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "
+        "loop"
+    ]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import MeshError
-from eslr_jax.fit.wearer import common_wearer
+from eslr_jax.fit.report import common_wearer
 from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.skinning import smooth
 from eslr_jax.geometry.topology import is_on_boundary, vertex_normals
@@ -25,12 +25,7 @@ _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow
 def wear_together(garments: Sequence[GarmentFile], files: Sequence[str]) -> GarmentFile:
     """Return one garment as it is, or several as an outfit whose parts have the names of assets or files.
 
-    Args:
-        garments: Garments of one body, the innermost first.
-        files: The asset or the file of each; `FILE#NAME` is called NAME.
-
-    Raises:
-        MeshError: See `combine_garments`.
+    The innermost comes first; `FILE#NAME` is called NAME. See `combine_garments` for what is refused.
     """
     return garments[0] if len(garments) == 1 else combine_garments(garments, garment_names(files))
 
@@ -74,8 +69,21 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
     counts = [len(positions) for positions in placed]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     influences = max(garment.skin_weights.shape[1] for garment in garments)
-    part_names, face_parts = _parts(garments, names)
     sewn = [g.rest_positions if g.sewn_positions is None else g.sewn_positions for g in garments]
+    uvs = [np.zeros((len(g.faces), 3, 2)) if g.corner_uvs is None else g.corner_uvs for g in garments]
+    has_uvs = any(garment.corner_uvs is not None for garment in garments)
+    part_names, face_parts, fabrics = [], [], []
+    for garment, name in zip(garments, names, strict=True):
+        own, numbers = [name], np.zeros(len(garment.faces), np.int64)
+        if garment.face_parts is not None:
+            own, numbers = [f"{name}/{part}" for part in garment.part_names], garment.face_parts
+        face_parts.append(len(part_names) + numbers)
+        part_names += own
+        given = dict.fromkeys(own, "cotton")
+        for text in garment.metadata.get("fabrics", ()):
+            part, separator, fabric = str(text).rpartition(":")
+            given |= {f"{name}/{part}": fabric} if separator else dict.fromkeys(given, fabric)
+        fabrics += [f"{part}:{fabric}" for part, fabric in given.items()]
     return GarmentFile(
         rest_positions=np.concatenate(placed),
         faces=np.concatenate([g.faces + start for g, start in zip(garments, starts, strict=True)]),
@@ -83,12 +91,12 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         skin_indices=_stack([garment.skin_indices for garment in garments], influences),
         is_pinned=np.concatenate([garment.is_pinned for garment in garments]),
         sewn_positions=np.concatenate(sewn),
-        corner_uvs=_stack_uvs(garments),
-        face_parts=face_parts,
-        part_names=part_names,
+        corner_uvs=np.concatenate(uvs) if has_uvs else None,
+        face_parts=np.concatenate(face_parts),
+        part_names=tuple(part_names),
         metadata={
             "outfit": dict(zip(names, counts, strict=True)),
-            "fabrics": _fabrics(garments, names),
+            "fabrics": fabrics,
             **wearer,
         },
     )
@@ -140,42 +148,3 @@ def _heights(
 def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:
     """Return tables below each other, with columns of zeros up to a width."""
     return np.concatenate([np.pad(table, ((0, 0), (0, width - table.shape[1]))) for table in tables])
-
-
-def _stack_uvs(garments: Sequence[GarmentFile]) -> Float[np.ndarray, "faces 3 2"] | None:
-    """Return the texture coordinates of garments below each other, zeros for one without; None without any."""
-    if all(garment.corner_uvs is None for garment in garments):
-        return None
-    return np.concatenate(
-        [np.zeros((len(g.faces), 3, 2)) if g.corner_uvs is None else g.corner_uvs for g in garments]
-    )
-
-
-def _own_parts(garment: GarmentFile, name: str) -> list[str]:
-    """Return what the parts of a garment are called in an outfit."""
-    return [name] if garment.face_parts is None else [f"{name}/{part}" for part in garment.part_names]
-
-
-def _parts(
-    garments: Sequence[GarmentFile], names: Sequence[str]
-) -> tuple[tuple[str, ...], Int[np.ndarray, " faces"]]:
-    """Return the names of an outfit's parts, and the part of every face."""
-    part_names: list[str] = []
-    face_parts = []
-    for garment, name in zip(garments, names, strict=True):
-        own = np.zeros(len(garment.faces), np.int64) if garment.face_parts is None else garment.face_parts
-        face_parts.append(own + len(part_names))
-        part_names += _own_parts(garment, name)
-    return tuple(part_names), np.concatenate(face_parts)
-
-
-def _fabrics(garments: Sequence[GarmentFile], names: Sequence[str]) -> list[str]:
-    """Return the fabrics that the garments' files give, each for its part."""
-    fabrics: list[str] = []
-    for garment, name in zip(garments, names, strict=True):
-        given = dict.fromkeys(_own_parts(garment, name), "cotton")
-        for text in garment.metadata.get("fabrics", ()):
-            part, separator, fabric = str(text).rpartition(":")
-            given |= {f"{name}/{part}": fabric} if separator else dict.fromkeys(given, fabric)
-        fabrics += [f"{part}:{fabric}" for part, fabric in given.items()]
-    return fabrics

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import MeshError
-from eslr_jax.fit.options import Axis, Unit
+from eslr_jax.fit.options import Axis, FitOptions, Unit
 from eslr_jax.fit.postures import Posture
 from eslr_jax.fit.scoring import DEEP, Sample, count_pierced, fit_cost, sample_garment, wearing_cost
 from eslr_jax.geometry.validate import UNITS
 
-_TRIED_UNITS = (
-    "m",
-    "cm",
-    "mm",
-    "in",
-)  # feet and decimetres have to be given: no garment's file was seen in them
+# Feet and decimetres have to be given: no garment's file was seen in them.
+_TRIED_UNITS = ("m", "cm", "mm", "in")
 _MIN_DIAGONAL, _MAX_DIAGONAL = 0.2, 3.0  # [m] of a garment's bounding box, from a scarf to a long coat
 _SLIDE_STEP = 0.04  # [m] between tried heights
 _SOLES = 0.02  # [m] by which soles may miss height 0 without taking along a garment that keeps its place
@@ -84,11 +79,8 @@ def find_placement(
     positions: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     postures: list[Posture],
+    options: FitOptions | None = None,
     *,
-    units: Unit | float = "auto",
-    up: Axis = "auto",
-    front: Axis = "auto",
-    keep_place: bool = False,
     is_metric: bool = False,
     facing: Float[np.ndarray, " 3"] | None = None,
     name: str = "garment",
@@ -96,26 +88,24 @@ def find_placement(
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
-    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
-    compares the best placement with the next best one that differs from it.
+    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The
+    confidence compares the best placement with the next best one that differs from it.
 
     Args:
-        positions: Vertex positions as the file has them, shape [vertices, 3].
-        faces: Triangles of a welded mesh, shape [faces, 3].
+        positions: Vertex positions as the file has them.
+        faces: Triangles of a welded mesh.
         postures: The body in the poses that the garment may have been modelled on; the rest pose first.
-        units: Unit of the file, or metres per unit.
-        up: Axis of the file that points up.
-        front: Axis of the file that the wearer faces.
-        keep_place: Do not move the garment along the body: its origin is between the feet, or the body's own. If
-            these are within 2 cm of each other, it is the body's own, and the garment stays exactly.
+        options: Unit, axes and whether the place is kept, where they are known.
         is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
-        facing: Direction that the body faces, shape [3]; +Z if not given. The nearest axis is taken.
+        facing: Direction that the body faces; +Z if not given. The nearest axis is taken.
         name: Name of the garment in messages.
 
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where
             everything is given, nothing is refused.
     """
+    options = options or FitOptions()
+    units, up, front, keep_place = options.units, options.up, options.front, options.keep_place
     given = {"--units": units, "--up": up, "--front": front, "--keep-place": keep_place or "auto"}
     missing = [option for option, value in given.items() if value == "auto"]
     if is_metric:
@@ -124,11 +114,11 @@ def find_placement(
     orientations = [
         Placement(factor, rotation, np.zeros(3), 0, *axes, "floor", weight * (1.0 if is_usual else _TURNED))
         for (factor, weight), (rotation, axes, is_usual) in itertools.product(
-            factors.items(), _rotations(up, front, _heading(facing))
+            factors.items(), _rotations(up, front, facing)
         )
     ]
     sample = sample_garment(positions, faces)
-    known = list(_known_candidates(sample, orientations, postures, stays=keep_place))
+    known = _known_candidates(sample, orientations, postures, stays=keep_place)
     best, rival = _choose(known, sample, postures)
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
@@ -158,16 +148,17 @@ def find_placement(
 
 def _known_candidates(
     sample: Sample, orientations: list[Placement], postures: list[Posture], *, stays: bool
-) -> Iterable[Placement]:
-    """Yield every orientation at the known origins, in every posture.
+) -> list[Placement]:
+    """Return every orientation at the known origins, in every posture.
 
     A garment that stays is not moved by the little that the soles of a body miss height 0.
     """
+    found = []
     for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
-        for offset in posture.stands:
-            if not stays or np.linalg.norm(offset) > _SOLES:
-                yield _scored(start, sample, postures, posture=k, translation=offset, origin="floor")
-        yield _scored(start, sample, postures, posture=k, translation=np.zeros(3), origin="body")
+        floors = [at for at in posture.stands if not stays or np.linalg.norm(at) > _SOLES]
+        for at, origin in [*((at, "floor") for at in floors), (np.zeros(3), "body")]:
+            found.append(_scored(start, sample, postures, posture=k, translation=at, origin=origin))
+    return found
 
 
 def _scored(start: Placement, sample: Sample, postures: list[Posture], **changes) -> Placement:
@@ -233,10 +224,12 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
         tried = []
         for k in {0, int(np.argmin(angles))}:
             posture = postures[k]
+            x, y, z = posture.positions[posture.touchable].T
             top = posture.positions[:, 1].max()
             for height in np.arange(posture.floor - low[1], top - high[1] + _SLIDE_STEP, _SLIDE_STEP):
-                middle = [posture.root[0], height, _middle_depth(posture, low[1] + height, high[1] + height)]
-                offset = middle - 0.5 * (low + high) * [1, 0, 1]
+                trunk = (y > low[1] + height) & (y < high[1] + height) & (abs(x - posture.root[0]) < 0.2)
+                depth = 0.5 * (z[trunk].min() + z[trunk].max()) if trunk.any() else posture.root[2]
+                offset = [posture.root[0], height, depth] - 0.5 * (low + high) * [1, 0, 1]
                 tried.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
         found += [(start, best) for best in sorted(tried, key=lambda placement: placement.cost)[:2]]
     refined = []
@@ -246,15 +239,6 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
             offset = _settle(turned, best.translation, posture)
             refined.append(_scored(start, sample, postures, posture=k, translation=offset, origin="found"))
     return refined
-
-
-def _middle_depth(posture: Posture, low: float, high: float) -> float:
-    """Return the middle of the trunk from back to front between two heights [m]."""
-    points = posture.positions[posture.touchable]
-    here = points[
-        (points[:, 1] > low) & (points[:, 1] < high) & (np.abs(points[:, 0] - posture.root[0]) < 0.2)
-    ]
-    return 0.5 * float(here[:, 2].min() + here[:, 2].max()) if len(here) else posture.root[2]
 
 
 def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndarray:
@@ -276,9 +260,7 @@ def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> 
     """Warn if, a few percent larger or smaller, the garment fits clearly better, or fits without moving."""
     posture = postures[best.posture]
     here = fit_cost(best.apply(sample.points), posture)
-    origins = [best.translation]
-    if best.origin == "found":
-        origins = [*posture.stands, np.zeros(3)]
+    origins = [*posture.stands, np.zeros(3)] if best.origin == "found" else [best.translation]
     turned = best.factor * sample.points @ best.rotation.T
     for origin in origins:
         costs = np.array([fit_cost(scale * turned + origin, posture) for scale in _SCALES])
@@ -295,12 +277,12 @@ def _scale_warning(best: Placement, sample: Sample, postures: list[Posture]) -> 
 
 def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: str) -> dict[float, float]:
     """Return the metres per unit to try, each with the factor on its costs."""
-    diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
     if units != "auto":
         factor = UNITS[units] if isinstance(units, str) else float(units)
         if not factor > 0 or not np.isfinite(factor):
             raise MeshError(f"{name}: {units} metres per unit; give a positive number")
         return {factor: 1.0}
+    diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
     factors = [
         UNITS[unit] for unit in _TRIED_UNITS if _MIN_DIAGONAL <= diagonal * UNITS[unit] <= _MAX_DIAGONAL
     ]
@@ -316,24 +298,22 @@ def _factors(positions: np.ndarray, body: Posture, units: Unit | float, name: st
     }
 
 
-def _heading(facing: np.ndarray | None) -> np.ndarray:
-    """Return the quarter turn about Y from +Z to where a body faces, shape [3, 3]."""
+def _rotations(
+    up: Axis, front: Axis, facing: np.ndarray | None
+) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
+    """Return rotations of file axes onto the body's, with the file's axes and whether they are usual."""
     x, _, z = (0.0, 0.0, 1.0) if facing is None else facing
     x, z = (0.0, np.sign(z)) if abs(z) >= abs(x) else (np.sign(x), 0.0)
-    return np.array([[z, 0.0, x], [0.0, 1.0, 0.0], [-x, 0.0, z]])
-
-
-def _rotations(up: Axis, front: Axis, heading: np.ndarray) -> list[tuple[np.ndarray, tuple[str, str], bool]]:
-    """Return rotations of file axes onto the body's, with the file's axes and whether they are usual."""
+    heading = np.array([[z, 0.0, x], [0.0, 1.0, 0.0], [-x, 0.0, z]])  # the quarter turn from +Z
     result = []
     for vertical in ("y", "z") if up == "auto" else (up,):
-        for facing in _VECTORS if front == "auto" else (front,):
-            if facing[-1] == vertical[-1]:
+        for ahead in _VECTORS if front == "auto" else (front,):
+            if ahead[-1] == vertical[-1]:
                 continue
-            y, z = _VECTORS[vertical], _VECTORS[facing]
+            y, z = _VECTORS[vertical], _VECTORS[ahead]
             rotation = heading @ np.stack([np.cross(y, z), y, z])
-            is_usual = _USUAL_FRONT[vertical] == facing or np.array_equal(rotation, np.eye(3))
-            result.append((rotation, (vertical, facing), is_usual or front != "auto"))
+            is_usual = _USUAL_FRONT[vertical] == ahead or np.array_equal(rotation, np.eye(3))
+            result.append((rotation, (vertical, ahead), is_usual or front != "auto"))
     if not result:
         raise MeshError(f"up {up} and front {front} are the same axis; give two different ones")
     return result

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.motion import joint_transforms
+from eslr_jax.body.motion import SHOULDERS, joint_transforms
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.types import Body
 
@@ -17,7 +17,6 @@ ARM_ANGLES = (0.0, 25.0, 45.0, 65.0)  # degrees below the horizontal that are tr
 _OFF_AXIS = 0.04  # of the body's height: joints farther from the middle belong to a limb
 _ASIDE = 0.08  # of the body's height, half the depth of a trunk: a body whose root is farther stands aside
 _LIMB = 0.11  # of the body's height: length from which a bone is that of an arm or leg
-SHOULDERS = 0.8  # of the body's height, for a body without arms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +39,9 @@ class Posture:
     @cached_property
     def touchable(self) -> Int[np.ndarray, " touchable"]:
         """Vertices of the faces that cloth may touch."""
-        return np.unique(self.faces[self.is_obstacle])
+        is_touchable = np.zeros(len(self.positions), bool)
+        is_touchable[self.faces[self.is_obstacle]] = True  # quicker than to sort them
+        return np.flatnonzero(is_touchable)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -90,7 +91,7 @@ class Posture:
 
 def rest_posture(body: Body) -> Posture:
     """Return the body in its rest pose."""
-    return _posture(body, np.tile(np.eye(3, 4), (len(body.parents), 1, 1)), None)
+    return take_posture(body, body.rest_positions, np.tile(np.eye(3, 4), (len(body.parents), 1, 1)))
 
 
 def arm_postures(body: Body) -> list[Posture]:
@@ -106,10 +107,14 @@ def arm_postures(body: Body) -> list[Posture]:
     for (joint, _), bone, rest_angle in zip(arms, bones, rest_angles, strict=True):
         rotations[:, joint, 2] = np.sign(bone[0]) * np.radians(rest_angle - np.array(angles))
     translations = np.tile(joints[body.parents.index(-1)], (len(angles), 1))
-    transforms = np.asarray(
-        joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
-    )
-    return [rest_posture(body), *(_posture(body, *pair) for pair in zip(transforms, angles, strict=True))]
+    turned = joint_transforms(rotations, translations, body.joint_rest_positions, body.parents)
+    postures = [rest_posture(body)]
+    for transforms, angle in zip(np.asarray(turned, np.float64), angles, strict=True):
+        weights = np.asarray(body.skin_weights, np.float64)
+        blended = _blend(weights, np.asarray(body.skin_indices), transforms)
+        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], postures[0].positions) + blended[:, :, 3]
+        postures.append(take_posture(body, posed, transforms, angle))
+    return postures
 
 
 def find_arms(body: Body) -> list[tuple[int, int]] | None:
@@ -142,12 +147,11 @@ def body_middle(body: Body) -> Float[np.ndarray, " 3"]:
 def shoulder_height(body: Body) -> float:
     """Return the height of the upper arm joints in the rest pose [m]; an estimate if the rig has no arms."""
     arms = find_arms(body)
-    if arms is None:
-        positions = np.asarray(body.rest_positions)
-        heights = positions[:, 1]
-        is_aside = np.abs(positions[:, 0] - body_middle(body)[0]) > 2 * _OFF_AXIS * np.ptp(heights)
-        return float(heights.min() + SHOULDERS * np.ptp(heights[~is_aside]))  # without raised arms
-    return float(np.mean(np.asarray(body.joint_rest_positions)[[joint for joint, _ in arms], 1]))
+    if arms is not None:
+        return float(np.mean(np.asarray(body.joint_rest_positions)[[joint for joint, _ in arms], 1]))
+    aside, heights, _ = np.asarray(body.rest_positions).T
+    is_aside = np.abs(aside - body_middle(body)[0]) > 2 * _OFF_AXIS * np.ptp(heights)
+    return float(heights.min() + SHOULDERS * np.ptp(heights[~is_aside]))  # without raised arms
 
 
 def unpose(
@@ -156,16 +160,13 @@ def unpose(
     skin_indices: Int[np.ndarray, "vertices influences"],
     transforms: Float[np.ndarray, "joints 3 4"],
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Undo linear blend skinning.
+    """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m].
 
     Args:
-        positions: Posed vertex positions [m], shape [vertices, 3].
-        skin_weights: Joint weights, shape [vertices, influences].
-        skin_indices: Joint of every weight, shape [vertices, influences].
-        transforms: Maps of the joints from the rest pose to the pose, shape [joints, 3, 4].
-
-    Returns:
-        The rest positions that the blended maps take to `positions` [m].
+        positions: Posed vertex positions [m].
+        skin_weights: Joint weights.
+        skin_indices: Joint of every weight.
+        transforms: Maps of the joints from the rest pose to the pose.
     """
     blended = _blend(skin_weights, skin_indices, transforms)
     return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
@@ -176,30 +177,13 @@ def _blend(weights: np.ndarray, indices: np.ndarray, transforms: np.ndarray) -> 
     return np.einsum("vi,vixy->vxy", weights, transforms[indices])
 
 
-def _posture(body: Body, transforms: np.ndarray, angle: float | None) -> Posture:
-    """Return the posture of a body under joint maps; without an angle, the rest pose."""
-    transforms = np.asarray(transforms, np.float64)
-    posed = np.asarray(body.rest_positions, np.float64)
-    if angle is not None:
-        blended = _blend(np.asarray(body.skin_weights, np.float64), np.asarray(body.skin_indices), transforms)
-        posed = np.einsum("vxy,vy->vx", blended[:, :, :3], posed) + blended[:, :, 3]
-    return take_posture(body, posed, transforms, angle)
-
-
 def take_posture(
     body: Body,
     positions: Float[np.ndarray, "body_vertices 3"],
     transforms: Float[np.ndarray, "joints 3 4"],
     arm_angle: float | None = None,
 ) -> Posture:
-    """Return a body in a pose.
-
-    Args:
-        body: The body.
-        positions: Its vertices in the pose [m], shape [body_vertices, 3].
-        transforms: Maps of the joints from the rest pose to the pose, shape [joints, 3, 4].
-        arm_angle: Degrees of the arms below the horizontal, if they are at one of `ARM_ANGLES`.
-    """
+    """Return a body in a pose, given its vertices there [m] and the maps of its joints to it; see `Posture`."""
     transforms = np.asarray(transforms, np.float64)
     rest_joints = np.asarray(body.joint_rest_positions, np.float64)
     return Posture(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,15 +22,10 @@ _ATTEMPTS = 6  # clusterings with a few vertices more; one in ten leaves a verte
 def remesh(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], edge_length: float
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"], Int[np.ndarray, " faces"]]:
-    """Return an even triangulation with a given mean edge length, and the source face of every face.
+    """Return an even triangulation with a given mean edge length [m], and the source face of every face.
 
     Vertices are the centres of equal clusters (Valette and Chassery 2004, the package pyacvd). The centres
     shrink away from open edges, so boundary vertices are moved back onto the open edges of the source.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        edge_length: Mean edge length to reach [m].
 
     Raises:
         ConfigError: The edge length gives an impossible number of vertices.
@@ -50,28 +44,21 @@ def remesh(
     source = pyvista.PolyData.from_regular_faces(positions, faces)
     with warnings.catch_warnings():  # pyacvd 0.4 reads an attribute that pyvista 0.49 deprecates
         warnings.simplefilter("ignore")
-        return _clusterings(pyacvd.Clustering(source), positions, faces, count, edge_length)
-
-
-def _clusterings(
-    clustering: Any, positions: np.ndarray, faces: np.ndarray, count: int, edge_length: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first clustering that is a clean mesh; see `remesh`."""
-    clustering.subdivide(max(1, min(4, int(np.ceil(np.log(25 * count / len(positions)) / np.log(4.0))))))
-    cause = ""
-    for attempt in range(_ATTEMPTS):
-        clustering.cluster(count + 7 * attempt)
-        mesh = clustering.create_mesh().triangulate().clean()
-        points, triangles = np.array(mesh.points, np.float64), np.array(mesh.regular_faces, np.int64)
-        try:
-            triangles = _oriented(points, triangles, positions, faces)
-            points = _onto_open_edges(points, triangles, positions, faces)
-            validate_mesh(points, triangles, allow_components=True)
-        except (MeshError, ValueError, KeyError) as error:
-            cause = str(error)
-            continue
-        nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
-        return points, triangles, nearest
+        clustering = pyacvd.Clustering(source)
+        clustering.subdivide(max(1, min(4, int(np.ceil(np.log(25 * count / len(positions)) / np.log(4.0))))))
+        cause = ""
+        for attempt in range(_ATTEMPTS):
+            clustering.cluster(count + 7 * attempt)
+            mesh = clustering.create_mesh().triangulate().clean()
+            points, triangles = np.array(mesh.points, np.float64), np.array(mesh.regular_faces, np.int64)
+            try:
+                triangles = _oriented(points, triangles, positions, faces)
+                points = _onto_open_edges(points, triangles, positions, faces)
+                validate_mesh(points, triangles, allow_components=True)
+            except (MeshError, ValueError, KeyError) as error:
+                cause = str(error)
+                continue
+            return points, triangles, closest_points(points[triangles].mean(axis=1), positions, faces)[0]
     raise MeshError(
         f"no clean mesh with edges of {edge_length:g} m was found ({cause}); choose another length"
     )

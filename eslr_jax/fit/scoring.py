@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from eslr_jax.fit.postures import Posture
 from eslr_jax.geometry.topology import boundary_loops, face_areas, vertex_areas
+from eslr_jax.numerics import pierces
 
 _POINTS = 160  # garment points whose distances are measured
 _TOP_POINTS = 16  # the highest of them, by which a garment hangs
@@ -19,36 +20,10 @@ _BELOW_FLOOR = 4.0  # cost of a garment under the floor
 _PIERCED = 0.4  # cost of a limb that pierces the cloth
 _ARMHOLE = 0.35  # of a limb, that may pierce it
 _EMPTY = 0.6  # cost of a garment through none of whose openings a bone passes
-_SLIPS, _DROP, _HELD = (
-    0.4,
-    0.04,
-    0.07,
-)  # cost of a garment that slips; [m] it is let down; inside cost that holds
+# Cost of a garment that slips; [m] it is let down; inside cost that holds.
+_SLIPS, _DROP, _HELD = 0.4, 0.04, 0.07
 _COARSE_FACES = 4000  # beyond which bones are tested against a coarser mesh
 DEEP = 0.01  # [m] of depth from which a point is called deep inside
-
-
-class Triangles:
-    """Triangles that segments are tested against, shape [triangles, 3, 3]."""
-
-    def __init__(self, corners: np.ndarray) -> None:
-        self.corners, self.low, self.high = corners, corners.min(axis=1), corners.max(axis=1)
-
-    def crosses(self, segment: Float[np.ndarray, "2 3"]) -> bool:
-        """Tell whether a segment crosses a triangle (Moeller and Trumbore 1997)."""
-        start, end = segment
-        near = ((self.low <= segment.max(axis=0)) & (self.high >= segment.min(axis=0))).all(axis=1)
-        a, b, c = np.moveaxis(self.corners[near], 1, 0)
-        along, first, second = end - start, b - a, c - a
-        cross = np.cross(along, second)
-        determinant = np.einsum("fx,fx->f", first, cross)
-        scale = 1.0 / np.where(determinant == 0, np.inf, determinant)
-        offset = start - a
-        turned = np.cross(offset, first)
-        u = scale * np.einsum("fx,fx->f", offset, cross)
-        v = scale * (turned @ along)
-        t = scale * np.einsum("fx,fx->f", second, turned)
-        return bool(np.any((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1) & (determinant != 0)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +31,8 @@ class Sample:
     """Points of a garment in the file's coordinates, spread evenly over its area, and coarse triangles."""
 
     points: Float[np.ndarray, "points 3"]
-    cloth: Triangles
-    openings: Triangles  # that close the boundary loops; none for a sheet, which has only its outline
+    cloth: Float[np.ndarray, "triangles 3 3"]
+    openings: Float[np.ndarray, "fans 3 3"]  # that close the boundary loops; none for a sheet's one outline
 
 
 def sample_garment(positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> Sample:
@@ -71,8 +46,7 @@ def sample_garment(positions: Float[np.ndarray, "vertices 3"], faces: Int[np.nda
     for loop in map(positions.__getitem__, loops if len(loops) > 1 else []):
         center = np.broadcast_to(loop.mean(axis=0), loop.shape)
         fans.append(np.stack([loop, np.roll(loop, -1, axis=0), center], axis=1))
-    cloth = Triangles(_coarse_corners(positions, faces))
-    return Sample(positions[points], cloth, Triangles(np.concatenate(fans)))
+    return Sample(positions[points], _coarse_corners(positions, faces), np.concatenate(fans))
 
 
 def fit_cost(points: Float[np.ndarray, "points 3"], posture: Posture) -> float:
@@ -95,9 +69,8 @@ def count_pierced(
 
     The start of a limb does not count: it lies beside the edge of an armhole.
     """
-    return sum(
-        sample.cloth.crosses(bone + _ARMHOLE * (bone[::-1] - bone) * [[1], [0]]) for bone in bones[is_limb]
-    )
+    limbs = bones[is_limb]
+    return int(np.sum(_crosses(limbs + _ARMHOLE * (limbs[:, ::-1] - limbs) * [[1], [0]], sample.cloth)))
 
 
 def wearing_cost(
@@ -108,18 +81,24 @@ def wearing_cost(
 ) -> float:
     """Return the cost of a garment that is not worn: pierced by limbs, around no bone, or slipping down.
 
-    Args:
-        sample: Sample of the garment in the file's coordinates.
-        points: Its points as placed [m], shape [points, 3].
-        bones: Ends of the posture's bones in the file's coordinates, shape [bones, 2, 3].
-        posture: Posture that the garment is placed on.
+    Its points are given as placed on the posture [m], and the posture's bones in the file's coordinates.
     """
     pierced = count_pierced(sample, bones, posture.is_limb)
-    openings = sample.openings
-    is_empty = len(openings.corners) > 0 and not any(openings.crosses(bone) for bone in bones)
+    is_empty = len(sample.openings) > 0 and not _crosses(bones, sample.openings).any()
     now, lower = (_inside(posture.heights(points - [0.0, drop, 0.0])).mean() for drop in (0.0, _DROP))
     slips = 1.0 - np.clip((lower - now) / _HELD, 0.0, 1.0)
     return float(_PIERCED * pierced + _EMPTY * is_empty + _SLIPS * slips)
+
+
+def _crosses(segments: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return which segments, [segments, 2, 3], pierce a triangle."""
+    is_left = triangles.max(axis=1) < segments.min(axis=1)[:, None]
+    is_right = triangles.min(axis=1) > segments.max(axis=1)[:, None]
+    segment, triangle = np.nonzero(~(is_left | is_right).any(axis=2))
+    start, end = segments[segment].transpose(1, 2, 0)
+    corners = triangles[triangle].transpose(1, 2, 0)
+    hits = pierces(tuple(start), tuple(end), [tuple(corner) for corner in corners])
+    return np.isin(np.arange(len(segments)), segment[hits])
 
 
 def _inside(heights: np.ndarray) -> np.ndarray:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
+from scipy.interpolate import RBFInterpolator
 from scipy.sparse.linalg import splu
 
 from eslr_jax.body.alignment import align_rests
@@ -17,11 +17,10 @@ from eslr_jax.body.motion import Motion, pose_body
 from eslr_jax.body.retarget import local_rotations
 from eslr_jax.body.rig import body_skeleton
 from eslr_jax.errors import ConfigError, MeshError, MotionError
-from eslr_jax.fit.clearance import body_heights, push_out
+from eslr_jax.fit.clearance import body_heights, lay_to_rest, push_out
 from eslr_jax.fit.options import Scale
 from eslr_jax.fit.postures import Posture, rest_posture, take_posture
-from eslr_jax.fit.rest import lay_to_rest
-from eslr_jax.fit.wearer import wearer_entry
+from eslr_jax.fit.report import wearer_entry
 from eslr_jax.geometry.topology import unique_edges
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.skeleton import Skeleton
@@ -35,15 +34,6 @@ _EASE = 0.03  # [m] from the skin, from which on cloth rather follows the cloth 
 _REACHES = (0.6, 0.3, 0.15, 0.1, 0.06)  # [m] over which the cloth moves together, one after the other
 _ROUNDS = 3  # of each
 _UNSEEN = 1e-6  # weight of the offset where no skin is near
-
-
-class Carried(NamedTuple):
-    """A garment on another body, in the pose in which it was made."""
-
-    placed: Float[np.ndarray, "vertices 3"]  # outside the body [m]
-    sewn: Float[np.ndarray, "vertices 3"]  # with the lengths that it is to have [m]
-    posture: Posture  # the body in that pose
-    report: dict[str, Any]
 
 
 def transfer_garment(
@@ -74,39 +64,38 @@ def transfer_garment(
             "a fitted garment can't be carried to another body; give the mesh it was fitted from, and the body "
             "that it was made for (eslr fit --made-for)"
         )
-    mesh = garment.rest_positions, garment.faces
-    carried = carry_shape(mesh, rest_posture(source), source, target, scale=scale)
-    rested = lay_to_rest(carried.placed, garment.faces, carried.posture, target)
+    placed, sewn, posture, report = carry_shape(
+        garment.rest_positions, garment.faces, rest_posture(source), source, target, scale=scale
+    )
+    rest, weights, indices, _ = lay_to_rest(placed, garment.faces, posture, target)
     return dataclasses.replace(
         garment,
-        rest_positions=rested.positions,
-        skin_weights=rested.skin_weights,
-        skin_indices=rested.skin_indices,
-        sewn_positions=carried.sewn,
-        metadata=garment.metadata | wearer_entry(target) | {"transfer": carried.report},
+        rest_positions=rest,
+        skin_weights=weights,
+        skin_indices=indices,
+        sewn_positions=sewn,
+        metadata=garment.metadata | wearer_entry(target) | {"transfer": report},
     )
 
 
 def carry_shape(
-    mesh: tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]],
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
     source: Posture,
     made_for: Body,
     target: Body,
     *,
     scale: Scale,
-) -> Carried:
-    """Carry a garment's shape from a posed body to another body in the same pose.
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"], Posture, dict[str, Any]]:
+    """Carry a garment's shape [m] from a posed body, `source`, to another body in the same pose.
 
     A spline through the joints and the crotch maps space from one body to the other. Then the cloth moves along
-    the skin's normals until its distance from the skin is the old one, scaled by the ratio of the bodies' sizes.
-    Loose cloth follows the cloth around it.
+    the skin's normals until its distance from the skin is the old one, scaled by the ratio of the bodies'
+    sizes. Loose cloth follows the cloth around it.
 
-    Args:
-        mesh: Garment vertices on the source [m], and triangles.
-        source: The body that the garment was made for, in the pose in which it was made.
-        made_for: That body.
-        target: The body that is to wear it, at rest.
-        scale: Which lengths the cloth gets; see `transfer_garment`.
+    Returns:
+        Vertices outside the target [m], those with the lengths that the cloth is to have [m], the target in the
+        pose in which the garment was made, and a report.
 
     Raises:
         MeshError: The target lacks arms or legs of known names, or does not stand at rest.
@@ -114,7 +103,6 @@ def carry_shape(
     Source: Duchon 1977 (doi:10.1007/BFb0086566), the spline; Brouet et al. 2012 (doi:10.1145/2185520.2185532),
     the aim to keep proportion, ease and shape.
     """
-    positions, faces = mesh
     joints = Skeleton(made_for.joint_names, made_for.parents, source.joints)
     posture = pose_alike(target, joints)
     here = _landmarks(source, joints)
@@ -123,19 +111,26 @@ def carry_shape(
     passed = ("upper_leg",) if all(("", "crotch") in marks for marks in (here, there)) else ("crotch",)
     shared = [part for part in here if part in there and part[1] not in passed]
     start, end = (np.array([marks[part] for part in shared]) for marks in (here, there))
-    size = _size(start, end)
+    size = np.linalg.norm(end - end.mean(axis=0)) / np.linalg.norm(start - start.mean(axis=0))
+    spline = RBFInterpolator(start, end - size * start, kernel="linear", degree=0)
     heights, _ = body_heights(positions, source)
-    graded = _keep_ease(_spline(start, end, size)(positions), faces, size * heights, posture)
+    graded = _keep_ease(size * positions + spline(positions), faces, size * heights, posture)
     placed, _ = push_out(graded, faces, posture)
     left, right = (here[side, "upper_arm"] for side in ("left", "right"))
     is_trunk = _aside(positions, left, right) < _aside(left, left, right)
-    girth, length = _proportions(positions, placed, unique_edges(faces), is_trunk)
+    edges = unique_edges(faces)
+    edges = edges[is_trunk[edges].all(axis=1)]
+    spans = [np.abs(points[edges[:, 1]] - points[edges[:, 0]]) for points in (placed, positions)]
+    girth, length = (  # of level lengths around trunk and legs, and of upright ones
+        float(np.divide(*(np.linalg.norm(span[:, axes], axis=1).sum() for span in spans)))
+        for axes in ([0, 2], [1])
+    )
     if scale == "body":
         sewn = np.where(heights[:, None] > 0, placed, graded)  # what was tight stays tight
     else:
         sewn = positions * (girth if scale == "girth" else 1.0)
     report = {"scale": scale, "girth": round(girth, 3), "length": round(length, 3)}
-    return Carried(placed, sewn, posture, report)
+    return placed, sewn, posture, report
 
 
 def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
@@ -172,50 +167,29 @@ def pose_alike(body: Body, skeleton: Skeleton) -> Posture:
 
 
 def _landmarks(posture: Posture, skeleton: Skeleton) -> dict[Part, np.ndarray]:
-    """Return places that correspond between bodies [m]: joints, and the crotch if it is clear where it is."""
+    """Return places that correspond between bodies [m]: joints, and the crotch.
+
+    That is the lowest point of the trunk between the legs, unless they meet farther down.
+    """
     places = {
         part: skeleton.rest_positions[joints[0]]
         for part, joints in find_parts(skeleton).items()
         if part[1] in _JOINTS
     }
-    crotch = _crotch(posture, places["left", "upper_leg"], places["right", "upper_leg"])
-    return places if crotch is None else places | {("", "crotch"): crotch}
-
-
-def _crotch(posture: Posture, left: np.ndarray, right: np.ndarray) -> np.ndarray | None:
-    """Return the lowest point of the trunk between the legs [m]; None if the legs meet farther down."""
+    left, right = places["left", "upper_leg"], places["right", "upper_leg"]
     height = float(np.ptp(posture.positions[:, 1]))
     points = posture.positions[posture.touchable]
     middle = points[_aside(points, left, right) < _MIDLINE * height, 1]
-    hips = 0.5 * (left + right)
-    if not len(middle) or not -_CROTCH[0] * height < middle.min() - hips[1] < _CROTCH[1] * height:
-        return None
-    return np.array([hips[0], middle.min(), hips[2]])
+    x, y, z = 0.5 * (left + right)
+    if len(middle) and -_CROTCH[0] * height < middle.min() - y < _CROTCH[1] * height:
+        places["", "crotch"] = np.array([x, middle.min(), z])
+    return places
 
 
 def _aside(points: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return how far points are from the middle of two joints, along the level line through both [m]."""
     across = (left - right) * [1, 0, 1]  # whatever the body faces
     return np.abs((points - 0.5 * (left + right)) @ across) / np.linalg.norm(across)
-
-
-def _size(start: np.ndarray, end: np.ndarray) -> float:
-    """Return how many times farther apart the second places are than the first."""
-    spread = [np.sum((places - places.mean(axis=0)) ** 2) for places in (start, end)]
-    return float(np.sqrt(spread[1] / spread[0]))
-
-
-def _spline(start: np.ndarray, end: np.ndarray, size: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the smooth map of space that takes the first places to the second and scales by `size`."""
-
-    def kernel(points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points[:, None] - start, axis=2)
-
-    system = np.block(
-        [[kernel(start), np.ones((len(start), 1))], [np.ones((1, len(start))), np.zeros((1, 1))]]
-    )
-    weights = np.linalg.solve(system, np.vstack([end - size * start, np.zeros((1, 3))]))
-    return lambda points: size * points + kernel(points) @ weights[:-1] + weights[-1]
 
 
 def _keep_ease(positions: np.ndarray, faces: np.ndarray, wanted: np.ndarray, posture: Posture) -> np.ndarray:
@@ -233,15 +207,3 @@ def _keep_ease(positions: np.ndarray, faces: np.ndarray, wanted: np.ndarray, pos
         system = scipy.sparse.diags_array(weight) + (reach / edge) ** 2 * laplacian
         result = result + splu(system.tocsc()).solve((weight * (wanted - heights))[:, None] * normals)
     return result
-
-
-def _proportions(
-    before: np.ndarray, after: np.ndarray, edges: np.ndarray, is_trunk: np.ndarray
-) -> tuple[float, float]:
-    """Return how cloth around trunk and legs has changed: level lengths, and upright ones."""
-    edges = edges[is_trunk[edges].all(axis=1)]
-    spans = [np.abs(points[edges[:, 1]] - points[edges[:, 0]]) for points in (before, after)]
-    level, upright = (
-        [float(np.linalg.norm(span[:, axes], axis=1).sum()) for span in spans] for axes in ([0, 2], [1])
-    )
-    return level[1] / level[0], upright[1] / upright[0]

@@ -21,12 +21,6 @@ def closest_points(
     Candidates are the faces with the nearest centroids. A face reaches no farther from its centroid than the
     largest centroid-corner distance. A point is done when no face beyond its candidates can be closer; the
     others are tried again with four times as many.
-
-    Args:
-        points: Query points [m], shape [points, 3].
-        positions: Mesh vertices [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        num_candidates: Number of candidates per point in the first round.
     """
     corners = np.asarray(positions, np.float64)[faces]
     centroids = corners.mean(axis=1)
@@ -72,14 +66,7 @@ def nearest_places(
     faces: Int[np.ndarray, "faces 3"],
     normals: Float[np.ndarray, "vertices 3"],
 ) -> NearestPlaces:
-    """Return the place of a mesh that is nearest to every point, and the mesh's normal there.
-
-    Args:
-        points: Query points [m], shape [points, 3].
-        positions: Mesh vertices [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        normals: Of the mesh's vertices, shape [vertices, 3].
-    """
+    """Return the place of a mesh that is nearest to every point [m], and the mesh's normal there."""
     nearest, weights = closest_points(points, positions, faces)
     corners = faces[nearest]
     offsets = points - np.einsum("pk,pkx->px", weights, positions[corners])
@@ -97,33 +84,27 @@ def barycentric_of_closest(
     """
     a, b, c = (triangles[..., k, :] for k in range(3))
     ab, ac = b - a, c - a
-    d1, d2 = _dot(ab, points - a), _dot(ac, points - a)
-    d3, d4 = _dot(ab, points - b), _dot(ac, points - b)
-    d5, d6 = _dot(ab, points - c), _dot(ac, points - c)
+    d1, d2 = np.vecdot(ab, points - a), np.vecdot(ac, points - a)
+    d3, d4 = np.vecdot(ab, points - b), np.vecdot(ac, points - b)
+    d5, d6 = np.vecdot(ab, points - c), np.vecdot(ac, points - c)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     total = va + vb + vc
-    inside = np.stack([va, vb, vc], axis=-1) / np.where(total == 0, 1.0, total)[..., None]
+    inside = [area / np.where(total == 0, 1.0, total) for area in (va, vb, vc)]
     along_ab = _ratio(d1, d1 - d3)
     along_ac = _ratio(d2, d2 - d6)
     along_bc = _ratio(d4 - d3, (d4 - d3) + (d5 - d6))
-    zero, one = np.zeros_like(d1), np.ones_like(d1)
     regions = [
-        ((d1 <= 0) & (d2 <= 0), (one, zero, zero)),
-        ((d3 >= 0) & (d4 <= d3), (zero, one, zero)),
-        ((d6 >= 0) & (d5 <= d6), (zero, zero, one)),
-        ((vc <= 0) & (d1 >= 0) & (d3 <= 0), (1 - along_ab, along_ab, zero)),
-        ((vb <= 0) & (d2 >= 0) & (d6 <= 0), (1 - along_ac, zero, along_ac)),
-        ((va <= 0) & (d4 >= d3) & (d5 >= d6), (zero, 1 - along_bc, along_bc)),
+        ((d1 <= 0) & (d2 <= 0), (1.0, 0.0, 0.0)),
+        ((d3 >= 0) & (d4 <= d3), (0.0, 1.0, 0.0)),
+        ((d6 >= 0) & (d5 <= d6), (0.0, 0.0, 1.0)),
+        ((vc <= 0) & (d1 >= 0) & (d3 <= 0), (1 - along_ab, along_ab, 0.0)),
+        ((vb <= 0) & (d2 >= 0) & (d6 <= 0), (1 - along_ac, 0.0, along_ac)),
+        ((va <= 0) & (d4 >= d3) & (d5 >= d6), (0.0, 1 - along_bc, along_bc)),
     ]
-    result = inside
-    for is_here, coordinates in reversed(regions):
-        result = np.where(is_here[..., None], np.stack(coordinates, axis=-1), result)
-    return result
-
-
-def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the inner product along the last axis."""
-    return np.sum(first * second, axis=-1)
+    is_here, places = zip(*regions, strict=True)
+    return np.stack(
+        [np.select(is_here, [place[k] for place in places], inside[k]) for k in range(3)], axis=-1
+    )
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:

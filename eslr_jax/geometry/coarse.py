@@ -11,20 +11,18 @@ Source: HOOD's `utils/coarse.py`; the centre is the middle of a longest path fou
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Bool, Int
+import scipy.sparse
+from jaxtyping import Int
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from eslr_jax.geometry.padding import round_up
 from eslr_jax.geometry.topology import directed_edges
 from eslr_jax.types import CoarseEdges, Garment
 
-CAPACITIES = (
-    0.42,
-    0.26,
-    0.14,
-)  # of the mesh edges, for HOOD's three levels; enough for every bundled garment
+# Of the mesh edges, for HOOD's three levels; enough for every bundled garment.
+CAPACITIES = (0.42, 0.26, 0.14)
 
 Graph = list[set[int]]  # neighbours of every vertex
 
@@ -40,36 +38,42 @@ def add_coarse_edges(garment: Garment) -> Garment:
     mask = np.asarray(garment.edge_mask)
     pairs = np.stack([np.asarray(garment.senders)[mask], np.asarray(garment.receivers)[mask]], axis=1)
     vertex_mask = np.asarray(garment.vertex_mask)
-    levels = []
+    last, levels = len(vertex_mask) - 1, []
     for edges, share in zip(coarsen(pairs, len(vertex_mask)), CAPACITIES, strict=True):
-        capacity = max(round_up(int(share * len(mask))), round_up(2 * len(edges)))
-        levels.append(_level(edges, vertex_mask, capacity))
+        senders, receivers, reverse = directed_edges(edges)
+        count = len(senders)
+        capacity = max(round_up(int(share * len(mask))), round_up(count))
+        padding = np.full(0 if vertex_mask[last] else capacity - count, last)  # the last vertex to itself
+        itself = np.arange(count, count + len(padding))
+        level = CoarseEdges(
+            senders=np.concatenate([senders, padding]).astype(np.int32),
+            receivers=np.concatenate([receivers, padding]).astype(np.int32),
+            reverse_edges=np.concatenate([reverse, itself]).astype(np.int32),
+            edge_mask=np.arange(count + len(padding)) < count,
+            is_kept=np.isin(np.arange(len(vertex_mask)), senders),
+        )
+        levels.append(level)
     return dataclasses.replace(garment, coarse=tuple(levels))
 
 
 def coarsen(pairs: Int[np.ndarray, "edges 2"], num_vertices: int) -> list[Int[np.ndarray, "coarse_edges 2"]]:
-    """Return the undirected edges of every coarse level, finest first.
-
-    Args:
-        pairs: Mesh edges, in one direction or both, shape [edges, 2].
-        num_vertices: Number of vertices.
-    """
-    graph: Graph = [set() for _ in range(num_vertices)]
-    for a, b in pairs.tolist():
-        graph[a].add(b)
-        graph[b].add(a)
-    centers = _centers(graph)
-    levels = []
+    """Return the undirected edges of every coarse level, finest first, given the mesh edges."""
+    centers, levels = _centers(_matrix(pairs, num_vertices)), []
     for _ in CAPACITIES:
-        graph = _coarsen_once(graph, centers)
+        hops = dijkstra(_matrix(pairs, num_vertices), indices=centers, unweighted=True, min_only=True)
+        hops = np.where(np.isfinite(hops), hops, 0).astype(int)  # zero where none is reached (HOOD)
+        graph: Graph = [set() for _ in range(num_vertices)]
+        for a, b in pairs.tolist():
+            _link(graph, a, b)
+        graph = _coarsen_once(graph, hops.tolist())
         edges = sorted((a, b) for a, around in enumerate(graph) for b in around if a < b)
-        levels.append(np.array(edges, np.int64).reshape(-1, 2))
+        pairs = np.array(edges, np.int64).reshape(-1, 2)
+        levels.append(pairs)
     return levels
 
 
-def _coarsen_once(graph: Graph, centers: Iterable[int]) -> Graph:
-    """Return the next level of a graph."""
-    distance = _distances(graph, centers)
+def _coarsen_once(graph: Graph, distance: list[int]) -> Graph:
+    """Return the next level of a graph, given the hops of its vertices from the centres."""
     joined: Graph = [set() for _ in graph]
     for i, around in enumerate(graph):
         if distance[i] % 2:
@@ -110,68 +114,29 @@ def _is_near(graph: Graph, a: int, b: int) -> bool:
     return b in graph[a] or not graph[a].isdisjoint(graph[b])
 
 
-def _distances(graph: Graph, sources: Iterable[int]) -> list[int]:
-    """Return hops from the nearest source; zero where none is reached (HOOD)."""
-    distance, front = [-1] * len(graph), list(sources)
-    for source in front:
-        distance[source] = 0
-    while front:
-        reached = []
-        for i in front:
-            for a in graph[i]:
-                if distance[a] < 0:
-                    distance[a] = distance[i] + 1
-                    reached.append(a)
-        front = reached
-    return [max(hops, 0) for hops in distance]
+def _matrix(pairs: np.ndarray, num_vertices: int) -> scipy.sparse.csr_array:
+    both = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return scipy.sparse.coo_array((np.ones(both.shape[1]), both), (num_vertices, num_vertices)).tocsr()
 
 
-def _centers(graph: Graph) -> list[int]:
-    """Return the middle of a longest path of every component."""
-    centers, seen = [], set()
-    for start, around in enumerate(graph):
-        if around and start not in seen:
-            path = _path_to_farthest(graph, _path_to_farthest(graph, start)[-1])
-            centers.append(path[len(path) // 2])
-            front = {start}
-            while front:
-                seen.update(front)
-                front = {a for i in front for a in graph[i]} - seen
+def _centers(matrix: scipy.sparse.csr_array) -> list[int]:
+    """Return the middle of a longest path of every component with edges."""
+    _, component = connected_components(matrix, directed=False)
+    linked = np.flatnonzero(np.diff(matrix.indptr))
+    centers = []
+    for start in linked[np.unique(component[linked], return_index=True)[1]]:
+        path = _path_to_farthest(matrix, _path_to_farthest(matrix, start)[-1])
+        centers.append(path[len(path) // 2])
     return centers
 
 
-def _path_to_farthest(graph: Graph, start: int) -> list[int]:
-    """Return a shortest path to a vertex that is farthest from `start`."""
-    parent, front, last = {start: start}, [start], start
-    while front:
-        last = front[0]
-        reached = []
-        for i in front:
-            for a in sorted(graph[i]):
-                if a not in parent:
-                    parent[a] = i
-                    reached.append(a)
-        front = reached
-    path = [last]
+def _path_to_farthest(matrix: scipy.sparse.csr_array, start: int) -> list[int]:
+    """Return a shortest path to the vertex that is farthest from `start`, the first of them that is found."""
+    order, parents = breadth_first_order(matrix, start)
+    hops = np.zeros(len(parents), int)
+    for vertex in order[1:]:
+        hops[vertex] = hops[parents[vertex]] + 1
+    path = [int(order[hops[order].argmax()])]
     while path[-1] != start:
-        path.append(parent[path[-1]])
+        path.append(int(parents[path[-1]]))
     return path[::-1]
-
-
-def _level(
-    edges: Int[np.ndarray, "coarse_edges 2"], vertex_mask: Bool[np.ndarray, " vertices"], capacity: int
-) -> CoarseEdges:
-    """Return both directions of a level's edges; padded edges join the last vertex to itself."""
-    senders, receivers, reverse = directed_edges(edges)
-    count, last = len(senders), len(vertex_mask) - 1
-    is_kept = np.zeros(len(vertex_mask), bool)
-    is_kept[senders] = True
-    missing = 0 if vertex_mask[last] else capacity - count
-    itself = np.arange(count, count + missing)
-    return CoarseEdges(
-        senders=np.concatenate([senders, np.full(missing, last)]).astype(np.int32),
-        receivers=np.concatenate([receivers, np.full(missing, last)]).astype(np.int32),
-        reverse_edges=np.concatenate([reverse, itself]).astype(np.int32),
-        edge_mask=np.arange(count + missing) < count,
-        is_kept=is_kept,
-    )

@@ -30,15 +30,12 @@ def find_crossings(
     """Return the pairs of faces that intersect, and how deep vertices are behind the layer that they passed.
 
     Two faces intersect where an edge of one pierces the other; faces that share a vertex touch and don't count.
-    The edges that pierce surround the cloth on the wrong side: without them it is a separate region. The depth of
-    its vertices is their distance from all other cloth, which is too small where a third layer lies nearby. An
-    intersection that begins at a crease, as at an armpit, separates no region, so no depth is known.
+    The edges that pierce surround the cloth on the wrong side: without them it is a separate region. The depth
+    of its vertices is their distance from all other cloth, which is too small where a third layer lies nearby.
+    An intersection that begins at a crease, as at an armpit, separates no region, so no depth is known. Where
+    positions are not finite nothing is found.
 
     Source: the regions of Baraff, Witkin and Kass 2003, doi 10.1145/1201775.882357, section 4.
-
-    Args:
-        positions: Vertices [m], shape [vertices, 3]; where they are not finite nothing is found.
-        faces: Triangles, shape [faces, 3].
     """
     positions = np.asarray(positions, np.float64)
     depths = np.zeros(len(positions))
@@ -83,10 +80,8 @@ def _piercing_edges(
         for owner, target in ((one, other), (other, one)):
             for k in range(3):
                 ends = faces[owner][:, [k, (k + 1) % 3]]
-                start, end = positions[ends[:, 0]].T, positions[ends[:, 1]].T
-                hits = pierces(
-                    tuple(start), tuple(end), [tuple(corner) for corner in corners[target].T.swapaxes(0, 1)]
-                )
+                start, end = (tuple(positions[side].T) for side in ends.T)
+                hits = pierces(start, end, [tuple(corner.T) for corner in corners[target].swapaxes(0, 1)])
                 found.append((owner[hits], ends[hits], target[hits]))
     owners, ends, pierced = zip(*found, strict=True)
     return np.concatenate(owners), np.concatenate(ends), np.concatenate(pierced)

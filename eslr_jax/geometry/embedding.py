@@ -80,13 +80,7 @@ def geodesic_embedding(
 
 
 def classical_scaling(landmarks: np.ndarray, distances: np.ndarray, size: int) -> np.ndarray:
-    """Return the landmark classical scaling [m], shape [vertices, size], with zeros beyond the last real axis.
-
-    Args:
-        landmarks: Landmark vertices, shape [landmarks].
-        distances: Geodesic distances from the landmarks [m], shape [landmarks, vertices].
-        size: Number of coordinates.
-    """
+    """Return the landmark classical scaling [m], shape [vertices, size], with zeros beyond the last real axis."""
     squared = distances[:, landmarks] ** 2
     mean = squared.mean(axis=0)
     gram = -0.5 * (squared - mean - mean[:, None] + mean.mean())
@@ -128,12 +122,8 @@ def canonical_start(
 def majorize_stress(embedding: np.ndarray, landmarks: np.ndarray, distances: np.ndarray) -> np.ndarray:
     """Reduce the stress of an embedding by landmark majorisation (SMACOF with all-to-landmark weights).
 
-    A step moves vertex x to the mean over landmarks y_l of y_l + d_l (x - y_l) / |x - y_l|.
-
-    Args:
-        embedding: Initial coordinates [m], shape [vertices, size].
-        landmarks: Landmark vertices, shape [landmarks].
-        distances: Geodesic distances d from the landmarks [m], shape [landmarks, vertices].
+    A step moves vertex x to the mean over landmarks y_l of y_l + d_l (x - y_l) / |x - y_l|, where d_l is the
+    geodesic distance [landmarks, vertices].
     """
     targets = np.ascontiguousarray(distances.T)
     for _ in range(NUM_ITERATIONS):

@@ -11,10 +11,6 @@ def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.n
 
     The set is halved along its longest side again and again, at a multiple of `size`, so the number of groups
     depends on the number of points alone.
-
-    Args:
-        points: Positions [m], shape [points, 3].
-        size: Points in a group.
     """
     pending, groups = [np.arange(len(points))], []
     while pending:

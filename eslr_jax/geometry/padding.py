@@ -103,38 +103,8 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
         needed = have.vertices + 1
         raise CapacityError(f"padding needs a vertex to point at; give the bucket at least {needed} vertices")
     leaves = {name: np.asarray(getattr(garment, name)) for name in garment.__dataclass_fields__}
-    padded = {}
-    for size, values in _padding_values(leaves, bucket).items():
-        for name, value in values.items():
-            leaf = leaves[name]
-            rows = getattr(bucket, size) - getattr(have, size)
-            block = np.broadcast_to(np.asarray(value, leaf.dtype), (rows, *leaf.shape[1:]))
-            padded[name] = np.concatenate([leaf, block])
-    itself = np.arange(have.edges, bucket.edges, dtype=leaves["reverse_edges"].dtype)
-    padded["reverse_edges"] = np.concatenate([leaves["reverse_edges"], itself])
-    neighbors = np.arange(bucket.vertices, dtype=leaves["neighbors"].dtype)[:, None].repeat(bucket.degree, 1)
-    neighbors[: have.vertices, : have.degree] = leaves["neighbors"]
-    extra = ((0, bucket.vertices - have.vertices), (0, bucket.degree - have.degree))
-    padded["neighbors"], padded["neighbor_mask"] = neighbors, np.pad(leaves["neighbor_mask"], extra)
-    padded["face_incidence"] = _pad_incidence(
-        leaves["face_incidence"], 3, (have.faces, bucket.faces), (bucket.vertices, bucket.face_degree)
-    )
-    padded["hinge_incidence"] = _pad_incidence(
-        leaves["hinge_incidence"], 4, (have.hinges, bucket.hinges), (bucket.vertices, bucket.hinge_degree)
-    )
-    for name, size, count in (
-        ("vertex_blocks", BLOCK, bucket.vertices),
-        ("face_blocks", FACE_BLOCK, bucket.faces),
-    ):
-        spare = -(-count // size) - len(leaves[name])
-        padded[name] = np.pad(leaves[name], ((0, spare), (0, 0)), constant_values=count - 1)
-    return dataclasses.replace(garment, **padded)
-
-
-def _padding_values(leaves: dict[str, np.ndarray], bucket: Bucket) -> dict[str, dict[str, object]]:
-    """Return the value of padded rows for each field, by the size that counts its rows."""
     last = bucket.vertices - 1
-    return {
+    values = {
         "vertices": {
             "rest_positions": leaves["rest_positions"].mean(axis=0),
             "sewn_positions": leaves["sewn_positions"].mean(axis=0),
@@ -149,17 +119,33 @@ def _padding_values(leaves: dict[str, np.ndarray], bucket: Bucket) -> dict[str, 
         "hinges": {"hinges": last, "hinge_rest_areas": 0, "hinge_rest_lengths": 0},
         "edges": {"senders": last, "receivers": last, "edge_mask": False},
     }
-
-
-def _pad_incidence(
-    table: np.ndarray, corners: int, items: tuple[int, int], shape: tuple[int, int]
-) -> np.ndarray:
-    """Return an incidence table of a new shape, for items[1] instead of items[0] items.
-
-    Entry corner * items[0] + item becomes corner * items[1] + item; so does the padding, corners * items[0].
-    """
-    corner, item = np.divmod(table, max(items[0], 1))
-    padded = np.full(shape, corners * items[1], table.dtype)
-    moved = np.where(table == corners * items[0], corners * items[1], corner * items[1] + item)
-    padded[: table.shape[0], : table.shape[1]] = moved
-    return padded
+    padded = {}
+    for size, fields in values.items():
+        for name, value in fields.items():
+            leaf = leaves[name]
+            rows = getattr(bucket, size) - getattr(have, size)
+            block = np.broadcast_to(np.asarray(value, leaf.dtype), (rows, *leaf.shape[1:]))
+            padded[name] = np.concatenate([leaf, block])
+    itself = np.arange(have.edges, bucket.edges, dtype=leaves["reverse_edges"].dtype)
+    padded["reverse_edges"] = np.concatenate([leaves["reverse_edges"], itself])
+    neighbors = np.arange(bucket.vertices, dtype=leaves["neighbors"].dtype)[:, None].repeat(bucket.degree, 1)
+    neighbors[: have.vertices, : have.degree] = leaves["neighbors"]
+    extra = ((0, bucket.vertices - have.vertices), (0, bucket.degree - have.degree))
+    padded["neighbors"], padded["neighbor_mask"] = neighbors, np.pad(leaves["neighbor_mask"], extra)
+    for name, corners, old, new, degree in (
+        ("face_incidence", 3, have.faces, bucket.faces, bucket.face_degree),
+        ("hinge_incidence", 4, have.hinges, bucket.hinges, bucket.hinge_degree),
+    ):
+        # Entry corner * old + item becomes corner * new + item; so does what fills rows, corners * old.
+        corner, item = np.divmod(leaves[name], max(old, 1))
+        table = np.full((bucket.vertices, degree), corners * new, leaves[name].dtype)
+        moved = np.where(leaves[name] == corners * old, corners * new, corner * new + item)
+        table[: moved.shape[0], : moved.shape[1]] = moved
+        padded[name] = table
+    for name, size, count in (
+        ("vertex_blocks", BLOCK, bucket.vertices),
+        ("face_blocks", FACE_BLOCK, bucket.faces),
+    ):
+        spare = -(-count // size) - len(leaves[name])
+        padded[name] = np.pad(leaves[name], ((0, spare), (0, 0)), constant_values=count - 1)
+    return dataclasses.replace(garment, **padded)

@@ -49,18 +49,10 @@ def rest_corners(garment: Garment) -> Float[np.ndarray, "faces 3 2"]:
 def prepare_plate(
     garment: Garment, warp: Float[np.ndarray, "faces 2"], rigidity: Float[np.ndarray, "faces 2"]
 ) -> Plate:
-    """Return what bending needs of a fabric with its own rigidity along warp and weft.
+    """Return what bending needs of a fabric with its own rigidity along warp and weft [N m]; NumPy leaves.
 
     The rigidity of twist is the geometric mean of the two (Huber): equal ones bend alike in all directions.
-    Poisson's ratio of bending is zero.
-
-    Args:
-        garment: Prepared garment; its lengths and areas as sewn.
-        warp: Direction of the warp in the plane of every face, unit vectors in the frame of `rest_corners`.
-        rigidity: Flexural rigidity along warp and weft [N m].
-
-    Returns:
-        The plate, with NumPy leaves.
+    Poisson's ratio of bending is zero. The warp is a unit vector in the frame of `rest_corners` on every face.
     """
     is_real = _is_real(garment)
     faces = np.asarray(garment.faces)[is_real]
@@ -93,13 +85,10 @@ def _sides(
     warp: Float[np.ndarray, "faces 2"],
 ) -> _Sides:
     """Return the sides of faces by their corners in the plane [m] and the direction of the warp there."""
-    twins = topology.twin_half_edges(faces)
-    _, hinge_faces = topology.find_hinges(faces)
-    hinge = np.full(faces.size, -1)
-    starts, ends, _ = topology.half_edges(faces)
-    left = np.flatnonzero((twins >= 0) & (starts < ends))
-    left = left[np.lexsort((ends[left], starts[left]))]  # the order of `find_hinges`
-    hinge[left] = hinge[twins[left]] = np.arange(len(hinge_faces))
+    hinge, neighbor = np.full((2, faces.size), -1)
+    left, right = topology.hinge_half_edges(faces)
+    hinge[left] = hinge[right] = np.arange(len(left))
+    neighbor[left], neighbor[right] = right // 3, left // 3
 
     weft = np.stack([-warp[:, 1], warp[:, 0]], axis=1)
     threads = np.stack([warp, weft], axis=1)
@@ -116,8 +105,7 @@ def _sides(
     turn = 0.5 * height[:, :, None] * across + foot[:, :, None] * mixed
     turn += (0.5 * (foot**2 - 0.25 * length**2) / height)[:, :, None] * along
     areas = 0.5 * height * length
-    neighbor = np.where(twins >= 0, twins // 3, -1).reshape(-1, 3)
-    return _Sides(hinge.reshape(-1, 3), neighbor, height, across, turn, length / areas)
+    return _Sides(hinge.reshape(-1, 3), neighbor.reshape(-1, 3), height, across, turn, length / areas)
 
 
 def _row(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "faces 3 3"]:
@@ -144,9 +132,7 @@ def _curvature_of_angles(
 ) -> Float[np.ndarray, "faces 3 3"]:
     """Return the smallest curvature of a face that has the angles of its hinges, as rows by angle [1/m].
 
-    Args:
-        sides: Of the faces.
-        angle: The angle of each hinge for every curvature [m]; zero at free edges.
+    `angle` has that of each hinge for every curvature [m]; zero at free edges.
     """
     gram = np.einsum("fie,fje->fij", angle, angle)
     soft = _SOFTNESS * np.trace(gram, axis1=1, axis2=2) / np.maximum(np.sum(sides.hinge >= 0, axis=1), 1)
@@ -180,7 +166,12 @@ def _shares(
     height = np.where(is_hinge, sides.height[across, place], 0.0)
     part = sides.height / (sides.height + height)
     # Across a hinge directions keep their angle to its edge: there the neighbour's rows have other entries.
-    basis = np.stack([sides.normal, *_edge_frame(sides)], axis=2)
+    # From the row (n0^2, n1^2, sqrt(2) n0 n1) of the normal n: t is n turned by a right angle.
+    normal = sides.normal
+    n0n1 = normal[..., 2] / np.sqrt(2.0)
+    mixed = np.stack([n0n1, -n0n1, (normal[..., 1] - normal[..., 0]) / np.sqrt(2.0)], axis=-1)
+    along = np.stack([normal[..., 1], normal[..., 0], -normal[..., 2]], axis=-1)
+    basis = np.stack([normal, mixed, along], axis=2)
     beyond = basis[across, place]  # the same three curvatures, in the neighbour's threads
     back = np.linalg.solve(basis, beyond)  # from the neighbour's entries to the face's own
     own_turn = sides.turn
@@ -200,16 +191,6 @@ def _shares(
     for step in (1, 2):
         shares[rows, edges, 2 + 2 * edges + step] += far[rows, edges, turned[step]]
     return hinges, np.where(hinges[:, None] >= 0, shares, 0.0)
-
-
-def _edge_frame(sides: _Sides) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mixed curvature at every edge, and that along it, as rows."""
-    nn = sides.normal
-    # From the row (n0^2, n1^2, sqrt(2) n0 n1) of the normal n: t is n turned by a right angle.
-    n0n1 = nn[..., 2] / np.sqrt(2.0)
-    mixed = np.stack([n0n1, -n0n1, (nn[..., 1] - nn[..., 0]) / np.sqrt(2.0)], axis=-1)
-    along = np.stack([nn[..., 1], nn[..., 0], -nn[..., 2]], axis=-1)
-    return mixed, along
 
 
 def _incidence(

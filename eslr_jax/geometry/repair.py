@@ -28,13 +28,8 @@ def weld(
 ) -> Cleaned:
     """Join coincident boundary vertices, then drop collapsed faces, repeated faces and loose vertices.
 
-    Only boundary vertices are joined. This closes seams that were split for texture coordinates, and keeps
-    two layers of cloth apart that touch.
-
-    Args:
-        positions: Vertex positions in any unit, shape [vertices, 3].
-        faces: Triangles with every index in range, shape [faces, 3].
-        tolerance: Distance below which two vertices coincide, relative to the bounding box's diagonal.
+    Only boundary vertices are joined. This closes seams that were split for texture coordinates, and keeps two
+    layers of cloth apart that touch. The tolerance is relative to the bounding box's diagonal.
     """
     diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
     candidates = _boundary_vertices(faces)
@@ -132,6 +127,6 @@ def _select_faces(
 
 
 def _boundary_vertices(faces: np.ndarray) -> np.ndarray:
-    """Return the vertices on edges of a single face, in ascending order."""
+    """Return the vertices on edges of a single face, in ascending order; the mesh may be broken."""
     edges, _, counts = undirected_edges(faces)
     return np.unique(edges[counts == 1])

@@ -34,8 +34,7 @@ def transfer_skin_weights(
         smoothing_steps: Number of Laplacian smoothings. Loose skirts need about 20, or the two legs tear them.
 
     Returns:
-        The four largest weights of every vertex, which sum to one, and their joints, both of shape
-        [vertices, 4].
+        The four largest weights of every vertex, which sum to one, and their joints, shape [vertices, 4].
     """
     nearest, barycentric = closest_points(positions, body_positions, body_faces)
     corners = body_faces[nearest]

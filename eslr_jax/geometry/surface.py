@@ -15,13 +15,10 @@ _PATCH_SIZE = 16  # vertices in a patch; more make the first level cheaper and t
 def prepare_surface(
     rest_positions: np.ndarray, faces: np.ndarray, *, boundary: np.ndarray | None = None
 ) -> BodySurface:
-    """Build the search tables of a body surface.
+    """Build the search tables of a body surface from its vertices in a pose without self-contact [m].
 
-    Args:
-        rest_positions: All body vertices in any pose without self-contact [m], shape [body_vertices, 3].
-        faces: The faces to keep, shape [surface_faces, 3]; other vertices are dropped.
-        boundary: Body vertices where the body goes on with faces that are not kept, shape [boundary_vertices];
-            cloth beyond them is not in contact. None if all that the body has is kept.
+    Only the vertices of the faces to keep are kept. At `boundary` vertices the body goes on with faces that are
+    not kept: cloth beyond them is not in contact.
     """
     vertex_ids, flat = np.unique(faces, return_inverse=True)
     faces = flat.reshape(-1, 3)

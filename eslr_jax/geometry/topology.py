@@ -13,10 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 def half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start, end and opposite vertex of every half-edge, each of shape [3 * faces]."""
-    starts = faces.ravel()
-    ends = faces[:, [1, 2, 0]].ravel()
-    opposites = faces[:, [2, 0, 1]].ravel()
-    return starts, ends, opposites
+    return faces.ravel(), faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
 
 
 def next_half_edges(half_edge: Int[np.ndarray, " items"]) -> Int[np.ndarray, " items"]:
@@ -76,10 +73,7 @@ def neighbor_table(
 ) -> tuple[Int[np.ndarray, "vertices degree"], Bool[np.ndarray, "vertices degree"]]:
     """Return the neighbours of every vertex in ascending order, and a mask of the real entries.
 
-    Args:
-        senders: Start vertex of every directed edge, shape [edges].
-        receivers: End vertex of every directed edge in ascending order, shape [edges].
-        num_vertices: Number of rows of the table. A row is padded with its own vertex.
+    Edges are those of `directed_edges`. A row is padded with its own vertex.
     """
     slots, degree = _slots(receivers, num_vertices)
     table = np.repeat(np.arange(num_vertices)[:, None], degree, axis=1)
@@ -94,11 +88,7 @@ def incidence_table(
 ) -> Int[np.ndarray, "rows degree"]:
     """Return for every row the positions in `indices.T.ravel()` that name it, padded with `indices.size`.
 
-    `numerics.gather_corners` reads this table.
-
-    Args:
-        indices: Vertex of every corner of every item (face or hinge), shape [items, corners].
-        num_rows: Number of vertices.
+    Items are faces or hinges, rows are vertices. `numerics.gather_corners` reads this table.
     """
     flat = indices.T.ravel()
     order = np.argsort(flat, kind="stable")
@@ -111,9 +101,17 @@ def incidence_table(
 def _slots(rows: np.ndarray, num_rows: int) -> tuple[np.ndarray, int]:
     """Return the column of every entry of a table, given ascending rows, and the number of columns."""
     degrees = np.bincount(rows, minlength=num_rows)
-    return np.arange(len(rows)) - np.repeat(np.cumsum(degrees) - degrees, degrees), max(
-        int(degrees.max(initial=0)), 1
-    )
+    slots = np.arange(len(rows)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
+    return slots, max(int(degrees.max(initial=0)), 1)
+
+
+def hinge_half_edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half-edge in the left and in the right face of every hinge; see `find_hinges`."""
+    starts, ends, _ = half_edges(faces)
+    twins = twin_half_edges(faces)
+    left = np.flatnonzero((twins >= 0) & (starts < ends))
+    left = left[np.lexsort((ends[left], starts[left]))]
+    return left, twins[left]
 
 
 def find_hinges(
@@ -125,10 +123,7 @@ def find_hinges(
     mesh must be manifold and consistently oriented (`validate_mesh`).
     """
     starts, ends, opposites = half_edges(faces)
-    twins = twin_half_edges(faces)
-    left = np.flatnonzero((twins >= 0) & (starts < ends))
-    left = left[np.lexsort((ends[left], starts[left]))]
-    right = twins[left]
+    left, right = hinge_half_edges(faces)
     hinges = np.stack([starts[left], ends[left], opposites[left], opposites[right]], axis=1)
     return hinges, np.stack([left // 3, right // 3], axis=1)
 
@@ -205,13 +200,11 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
     following = dict(zip(starts[is_boundary].tolist(), ends[is_boundary].tolist(), strict=True))
     loops = []
     for first in sorted(following):
-        loop = []
-        vertex = first
-        while vertex in following:
+        loop = [first]
+        while (vertex := following.pop(loop[-1], None)) is not None:
             loop.append(vertex)
-            vertex = following.pop(vertex)
-        if loop:
-            loops.append(np.array(loop))
+        if len(loop) > 1:
+            loops.append(np.array(loop[:-1]))
     return sorted(loops, key=lambda loop: (-len(loop), loop[0]))
 
 

@@ -37,18 +37,12 @@ def validate_mesh(
     name: str = "mesh",
     allow_components: bool = False,
 ) -> None:
-    """Check that a mesh can be simulated.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        name: Name of the mesh in messages.
-        allow_components: Accept several connected components.
+    """Check that a mesh can be simulated, its positions in metres; messages begin with `name`.
 
     Raises:
         MeshError: The mesh is empty, has wrong shapes, indices out of range, NaN, an implausible scale,
             unreferenced or duplicate vertices, degenerate or duplicate faces, non-manifold edges or vertices,
-            inconsistent orientation, or several components.
+            inconsistent orientation, or several components that are not allowed.
     """
     positions, faces = np.asarray(positions), np.asarray(faces)
     check_arrays(positions, faces, name)
@@ -60,9 +54,11 @@ def validate_mesh(
     num_components, component = vertex_components(faces, len(positions))
     if num_components > 1 and not allow_components:
         sizes = np.bincount(component)
+        largest = np.sort(sizes)[::-1]
         other = int(np.argmax(component != np.argmax(sizes)))
         raise MeshError(
-            f"{name}: {num_components} separate components (sizes {_shorten(np.sort(sizes)[::-1])}; "
+            f"{name}: {num_components} separate components (sizes {', '.join(map(str, largest[:5]))}"
+            f"{', ...' * (len(sizes) > 5)}; "
             f"vertex {other} is not connected to the largest); join them, delete the loose parts, "
             "or allow several components"
         )
@@ -71,14 +67,9 @@ def validate_mesh(
 def validate_lengths(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str
 ) -> None:
-    """Check other positions of a valid mesh, on which lengths and areas alone are measured.
+    """Check other positions of a mesh that `validate_mesh` has accepted, on which lengths alone are measured.
 
     Vertices of several garments may coincide there: an outfit's garments are sewn one by one.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles of a mesh that `validate_mesh` has accepted, shape [faces, 3].
-        name: Name of the mesh in messages.
 
     Raises:
         MeshError: NaN, an implausible scale, or degenerate faces.
@@ -124,15 +115,15 @@ def _check_scale(positions: np.ndarray, name: str) -> None:
     diagonal = _diagonal(positions)
     if MIN_DIAGONAL <= diagonal <= MAX_DIAGONAL:
         return
-    cause = f"{name}: bounding-box diagonal {diagonal:.4g} m is outside {MIN_DIAGONAL}-{MAX_DIAGONAL} m"
+    hint = "positions must be in metres"
     if diagonal > MAX_DIAGONAL:
         unit, factor = min(UNITS.items(), key=lambda item: abs(np.log(diagonal * item[1] / GARMENT_DIAGONAL)))
         if MIN_DIAGONAL <= diagonal * factor <= MAX_DIAGONAL:
-            raise MeshError(f"{cause}; it seems to be in {unit}: scale by {factor:g}")
+            hint = f"it seems to be in {unit}: scale by {factor:g}"
     elif diagonal > 0:
-        factor = 10.0 ** round(-np.log10(diagonal))
-        raise MeshError(f"{cause}; positions must be in metres: scale by about {factor:g}")
-    raise MeshError(f"{cause}; positions must be in metres")
+        hint += f": scale by about {10.0 ** round(-np.log10(diagonal)):g}"
+    cause = f"bounding-box diagonal {diagonal:.4g} m is outside {MIN_DIAGONAL}-{MAX_DIAGONAL} m"
+    raise MeshError(f"{name}: {cause}; {hint}")
 
 
 def _check_vertices(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
@@ -201,28 +192,23 @@ def _check_edges(faces: np.ndarray, name: str) -> None:
 def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
     """Raise on vertices whose faces form more than one fan (bow-ties).
 
-    The face corners are the nodes of a graph. Corners of neighbouring faces at the same vertex are joined, so
-    that each fan is a component. A manifold mesh has as many fans as vertices.
+    Corners of neighbouring faces at the same vertex are joined, so that each fan is a component of a graph.
     """
     starts, _, _ = half_edges(faces.astype(np.int64))
     twins = twin_half_edges(faces)
-    corner = np.arange(len(starts))  # of the half-edge's start
-    following = next_half_edges(corner)  # corner of its end
-    has_twin = twins >= 0
-    rows = np.concatenate([corner[has_twin], following[has_twin]])
-    columns = np.concatenate([following[twins[has_twin]], twins[has_twin]])
+    start = np.flatnonzero(twins >= 0)  # corner of the half-edge's start
+    twin = twins[start]
+    rows = np.concatenate([start, next_half_edges(start)])
+    columns = np.concatenate([next_half_edges(twin), twin])
     graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (len(starts), len(starts)))
-    num_fans, fan = connected_components(graph, directed=False)
-    if num_fans == num_vertices:
-        return
-    fan_vertex = np.empty(num_fans, np.int64)
-    fan_vertex[fan] = starts
-    counts = np.bincount(fan_vertex, minlength=num_vertices)
-    vertex = int(np.argmax(counts > 1))
-    raise MeshError(
-        f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
-        f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
-    )
+    _, first = np.unique(connected_components(graph, directed=False)[1], return_index=True)
+    counts = np.bincount(starts[first], minlength=num_vertices)
+    if counts.max() > 1:
+        vertex = int(np.argmax(counts > 1))
+        raise MeshError(
+            f"{name}: {counts[vertex]} fans of faces meet only at vertex {vertex} "
+            f"({np.sum(counts > 1)} such vertices); split the vertex, or bridge the faces around it"
+        )
 
 
 def validate_body(
@@ -235,13 +221,7 @@ def validate_body(
     """Check that a body is closed where cloth may touch it, and that its faces point outside.
 
     Contact keeps cloth on the side that normals point to. Cloth that slipped in through a hole would be held
-    inside.
-
-    Args:
-        positions: Body vertex positions [m], shape [body_vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside, shape [body_faces, 3].
-        is_obstacle: Mask of the faces that cloth may touch, shape [body_faces]; others may have open edges.
-        name: Name of the body in messages.
+    inside. Faces that are no obstacle may have open edges.
 
     Raises:
         MeshError: The body is empty, not finite, open where cloth may touch it, or inside out.
@@ -280,25 +260,15 @@ def check_outward(
 def validate_orientation(
     positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, name: str = "mesh"
 ) -> None:
-    """Check that the faces of a garment point outside.
+    """Check that the faces of a garment, a valid mesh, point outside.
 
     The garment's holes are closed with fans, and the sign of the enclosed volume decides. Meshes that are
     mostly hole pass.
 
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles of a valid mesh, shape [faces, 3].
-        name: Name of the mesh in messages.
-
     Raises:
         MeshError: The faces point inside.
     """
-    if _enclosed_volume_ratio(np.asarray(positions, np.float64), np.asarray(faces)) < MIN_VOLUME_RATIO:
-        raise MeshError(f"{name}: its faces point inside; flip the normals")
-
-
-def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
-    """Return the volume of the closed mesh relative to a sphere of equal area; 0 if it is mostly hole."""
+    positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
     centered = positions - positions.mean(axis=0)
     triangles = [centered[faces]]
     for loop in boundary_loops(faces):
@@ -308,10 +278,10 @@ def _enclosed_volume_ratio(positions: np.ndarray, faces: np.ndarray) -> float:
     areas = [
         0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in triangles
     ]
-    if sum(areas[1:]) > MAX_HOLE_SHARE * areas[0]:
-        return 0.0
     volume = sum(np.sum(np.linalg.det(t)) for t in triangles) / 6.0
-    return float(6.0 * np.sqrt(np.pi) * volume / sum(areas) ** 1.5)
+    of_sphere = 6.0 * np.sqrt(np.pi) * volume / sum(areas) ** 1.5
+    if sum(areas[1:]) <= MAX_HOLE_SHARE * areas[0] and of_sphere < MIN_VOLUME_RATIO:
+        raise MeshError(f"{name}: its faces point inside; flip the normals")
 
 
 def _diagonal(positions: np.ndarray) -> float:
@@ -327,9 +297,3 @@ def _ids(values: np.ndarray) -> str:
 def _point(values: np.ndarray) -> str:
     """Format a position."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
-
-
-def _shorten(values: np.ndarray, limit: int = 5) -> str:
-    """Format the first few of many counts."""
-    text = ", ".join(str(int(value)) for value in values[:limit])
-    return text + (", ..." if len(values) > limit else "")

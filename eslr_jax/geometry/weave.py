@@ -59,27 +59,27 @@ def _laid(garment: Garment, corners: np.ndarray, direction: Sequence[float]) -> 
     wanted = np.asarray(direction, np.float64)
     if wanted.shape != (3,) or not np.linalg.norm(wanted) > 0:
         raise MeshError(f"{direction} is no direction; give three numbers")
-    wanted = wanted / np.linalg.norm(wanted)
-    faces = np.asarray(garment.faces)[: len(corners)]
-    points = np.asarray(garment.rest_positions, np.float64)[faces]
+    positions, faces = (
+        np.asarray(garment.rest_positions, np.float64),
+        np.asarray(garment.faces)[: len(corners)],
+    )
+    points = positions[faces]
     first = normalize(points[:, 0] - points[:, 2])
     normal = normalize(np.cross(points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]))
-    second = np.cross(normal, first)
-    seen = wanted - np.sum(normal * wanted, axis=1, keepdims=True) * normal
-    length = np.linalg.norm(seen, axis=1)
-    for _ in range(len(faces)):
-        is_blind = length < _LEAST
-        if not is_blind.any() or is_blind.all():
-            break
-        around = np.zeros_like(np.asarray(garment.rest_positions, np.float64))
-        known = np.where(is_blind[:, None], 0.0, seen / np.maximum(length, _LEAST)[:, None])
+
+    def laid(vectors: np.ndarray) -> np.ndarray:
+        return vectors - np.vecdot(normal, vectors)[:, None] * normal
+
+    seen = laid(wanted / np.linalg.norm(wanted))
+    while (is_blind := np.linalg.norm(seen, axis=1) < _LEAST).any():
+        around = np.zeros_like(positions)
+        known = normalize(np.where(is_blind[:, None], 0.0, seen))
         np.add.at(around, faces.ravel(), np.repeat(known, 3, axis=0))
-        mean = around[faces].sum(axis=1)
-        mean = mean - np.sum(normal * mean, axis=1, keepdims=True) * normal
-        found = is_blind & (np.linalg.norm(mean, axis=1) > _LEAST)
-        if not found.any():
+        mean = laid(around[faces].sum(axis=1))
+        is_found = is_blind & (np.linalg.norm(mean, axis=1) > _LEAST)
+        if not is_found.any():  # no face beside it sees the direction
+            seen = np.where(is_blind[:, None], first, seen)
             break
-        seen = np.where(found[:, None], mean, seen)
-        length = np.linalg.norm(seen, axis=1)
-    seen = np.where((length < _LEAST)[:, None], first, seen)
-    return normalize(np.stack([np.sum(seen * first, axis=1), np.sum(seen * second, axis=1)], axis=1))
+        seen = np.where(is_found[:, None], mean, seen)
+    second = np.cross(normal, first)
+    return normalize(np.stack([np.vecdot(seen, first), np.vecdot(seen, second)], axis=1))

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.body.clothing import Piece, Skinned, body_pieces
+from eslr_jax.body.clothing import Piece, body_pieces
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
 from eslr_jax.extras import require
 from eslr_jax.io.palette import GARMENT_COLORS
+from eslr_jax.io.skin import Skin
 from eslr_jax.render.annotate import side_by_side
 from eslr_jax.render.camera import Camera, facing_angles, follow, parse_angle
 from eslr_jax.render.scene import Surface, trace_picture
+from eslr_jax.types import Body
 
 _PICTURE_SIZE = (480, 640)  # width, height [pixels]
 _SHEET_PICTURE_SIZE = (252, 360)  # width, height [pixels]
@@ -31,7 +33,7 @@ def render_frames(
     *,
     frame_indices: Sequence[int] | None = None,
     rest_positions: np.ndarray | None = None,
-    rig: Skinned | None = None,
+    rig: Body | Skin | None = None,
     follows: bool = True,
     camera: str | float = "front",
     zoom: float = 1.0,

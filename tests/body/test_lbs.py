@@ -8,24 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.body import lbs, retarget
 
-ROOT = Path(__file__).resolve().parents[2]
+GOLDEN = Path(__file__).parents[1] / "fixtures" / "anny_lbs_golden.npz"
 TREE = (-1, 0, 1, 0)  # a chain of three joints and a branch
 joint_transforms = jax.jit(lbs.joint_transforms, static_argnums=3)
 skin_points = jax.jit(lbs.skin)
 rotation_matrix = jax.jit(lbs.rotation_matrix)
 turning = jax.jit(jax.jacobian(lbs.rotation_matrix))
-
-
-@pytest.fixture(scope="module")
-def body():
-    with np.load(ROOT / "data" / "body" / "anny_cmu.npz") as file:
-        return dict(file)
-
-
-@pytest.fixture(scope="module")
-def golden():
-    with np.load(ROOT / "tests" / "fixtures" / "anny_lbs_golden.npz") as file:
-        return dict(file)
 
 
 @pytest.fixture
@@ -68,31 +56,19 @@ def test_rotation_matrix_gradient_is_continuous_where_the_series_ends():
     np.testing.assert_allclose(turning(below), turning(above), atol=2e-5)
 
 
-def test_skin_reproduces_golden_poses(body, golden):
-    parents = tuple(int(p) for p in body["parents"])
-    local = retarget.local_rotations(golden["global_rotations"], parents)
-    joints = jnp.asarray(body["joint_rest_positions"])
+def test_skin_reproduces_golden_poses(body):
+    with np.load(GOLDEN) as file:
+        golden = dict(file)
+    local = retarget.local_rotations(golden["global_rotations"], body.parents)
+    joints, rows = body.joint_rest_positions, golden["vertex_index"]
+    skin = body.rest_positions[rows], body.skin_weights[rows], body.skin_indices[rows]
     for rotations, positions, vertices in zip(
         local, golden["joint_positions"], golden["vertices"], strict=True
     ):
-        transforms = joint_transforms(jnp.float32(rotations), jnp.float32(positions[0]), joints, parents)
+        transforms = joint_transforms(jnp.float32(rotations), jnp.float32(positions[0]), joints, body.parents)
         posed_joints = jnp.sum(transforms[:, :, :3] * joints[:, None, :], axis=2) + transforms[:, :, 3]
-        rows = golden["vertex_index"]
-        posed = skin_points(
-            jnp.asarray(body["rest_positions"][rows]),
-            jnp.asarray(body["skin_weights"][rows]),
-            jnp.asarray(body["skin_indices"][rows]),
-            transforms,
-        )
         np.testing.assert_allclose(posed_joints, positions, atol=1e-5)  # [m]
-        np.testing.assert_allclose(posed, vertices, atol=1e-5)  # [m]
-
-
-def test_rest_pose_leaves_points_where_they_are(rng):
-    _, _, joints = random_tree(rng)
-    positions, weights, indices = random_skin(rng)
-    transforms = joint_transforms(jnp.zeros((len(TREE), 3)), joints[0], joints, TREE)
-    np.testing.assert_allclose(skin_points(positions, weights, indices, transforms), positions, atol=1e-6)
+        np.testing.assert_allclose(skin_points(*skin, transforms), vertices, atol=1e-5)  # [m]
 
 
 def test_joint_transforms_equal_a_float64_chain(rng):
@@ -109,25 +85,15 @@ def test_joint_transforms_equal_a_float64_chain(rng):
     np.testing.assert_allclose(result[:, :, 3] + np.einsum("jab,jb->ja", turned, rest), posed, atol=2e-6)
 
 
-def test_skin_is_equivariant_to_translation(rng):
-    rotations, translation, joints = random_tree(rng)
-    skin = random_skin(rng)
-    offset = jnp.float32([0.5, -0.25, 2.0])
-    here = skin_points(*skin, joint_transforms(rotations, translation, joints, TREE))
-    there = skin_points(*skin, joint_transforms(rotations, translation + offset, joints, TREE))
-    np.testing.assert_allclose(there, here + offset[None, :], atol=2e-6)
-
-
-def test_skin_is_equivariant_to_rotation_of_the_root(rng):
+def test_skin_is_equivariant_to_moving_and_turning_the_root(rng):
     rotations, _, joints = random_tree(rng)
     skin = random_skin(rng)
-    turn = Rotation.from_rotvec([0.3, 1.1, -0.4])
+    turn, offset = Rotation.from_rotvec([0.3, 1.1, -0.4]), np.float32([0.5, -0.25, 2.0])
     root = (turn * Rotation.from_rotvec(np.asarray(rotations[0]))).as_rotvec()
     turned = rotations.at[0].set(jnp.float32(root))
-    zero = jnp.zeros(3)
-    here = skin_points(*skin, joint_transforms(rotations, zero, joints, TREE))
-    there = skin_points(*skin, joint_transforms(turned, zero, joints, TREE))
-    np.testing.assert_allclose(there, turn.apply(np.asarray(here)), atol=3e-6)
+    here = skin_points(*skin, joint_transforms(rotations, jnp.zeros(3), joints, TREE))
+    there = skin_points(*skin, joint_transforms(turned, jnp.asarray(offset), joints, TREE))
+    np.testing.assert_allclose(there, turn.apply(np.asarray(here)) + offset, atol=3e-6)
 
 
 def test_whole_turns_change_nothing(rng):
@@ -154,17 +120,3 @@ def test_gradients_are_finite_at_the_rest_pose(rng):
     for joint in range(len(TREE)):
         above, below = (float(height(zero.at[joint, 0].set(sign * step))) for sign in (1, -1))
         assert gradient[joint, 0] == pytest.approx((above - below) / (2 * step), abs=2e-3)
-
-
-def test_vmap_equals_loop_under_jit(rng):
-    rotations, translation, joints = random_tree(rng)
-    skin = random_skin(rng)
-    frames = jnp.stack([rotations, 0.5 * rotations, 0.0 * rotations])
-    roots = jnp.stack([translation, -translation, 0.0 * translation])
-
-    def pose(rotations, translation):
-        return skin_points(*skin, joint_transforms(rotations, translation, joints, TREE))
-
-    together = jax.jit(jax.vmap(pose))(frames, roots)
-    apart = np.stack([pose(r, t) for r, t in zip(frames, roots, strict=True)])
-    np.testing.assert_allclose(together, apart, atol=1e-6)

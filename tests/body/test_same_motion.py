@@ -16,20 +16,15 @@ from formats import (
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.assets import load_motion
-from eslr_jax.body.retarget import global_rotations
-from eslr_jax.body.rig import body_skeleton
+from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.body.timing import skip_start_pose
 from eslr_jax.io.bvh import read_bvh
 from eslr_jax.io.npz import write_arrays
-from eslr_jax.io.skeleton import chain_positions
 
 CLIP = Path(__file__).parents[1] / "fixtures" / "cmu_01_01.bvh"  # 120 frames at 30 Hz of CMU 01_01, a jump
 TOLERANCE = 0.01  # [m]
-NOT_IN_SMPL = {
-    "Head",
-    "LeftHandFinger1",
-    "RightHandFinger1",
-}  # beyond a second neck joint and a finger's base
+# Beyond a second neck joint and a finger's base.
+NOT_IN_SMPL = {"Head", "LeftHandFinger1", "RightHandFinger1"}
 COLLAR_FAMILY = {  # names of BVH files that call the upper arm a shoulder
     "LeftUpLeg": "LeftHip", "LeftLeg": "LeftKnee", "LeftFoot": "LeftAnkle", "LeftToeBase": "LeftToe",
     "LeftShoulder": "LeftCollar", "LeftArm": "LeftShoulder", "LeftForeArm": "LeftElbow",
@@ -59,12 +54,6 @@ def clip():
     return skip_start_pose(read_bvh(CLIP))[0]
 
 
-def posed_joints(motion, body):
-    return chain_positions(
-        global_rotations(motion.rotations, body.parents), motion.translations, body_skeleton(body)
-    )
-
-
 @pytest.fixture(scope="module")
 def own_motion(body):
     with pytest.warns(UserWarning, match="skipped its first frame"):  # a T-pose
@@ -73,7 +62,7 @@ def own_motion(body):
 
 @pytest.fixture(scope="module")
 def expected(own_motion, body):
-    return posed_joints(own_motion, body)
+    return skeleton_motion(own_motion, body).positions
 
 
 def write_same(kind, folder, clip, own):
@@ -135,7 +124,7 @@ KINDS = (
 def test_the_same_clip_puts_joints_at_the_same_places(kind, tmp_path, clip, body, own_motion, expected):
     motion = load_motion(write_same(kind, tmp_path, clip, own_motion), body=body)
     assert motion.fps == pytest.approx(30.0, rel=1e-4)
-    found = posed_joints(motion, body)
+    found = skeleton_motion(motion, body).positions
     assert found.shape == expected.shape
     distance = np.linalg.norm(found - expected, axis=-1).max(axis=0)
     compared = [

@@ -8,8 +8,14 @@ import pytest
 
 from eslr_jax.assets import load_body, load_motion
 from eslr_jax.body.motion import shape_body
-from eslr_jax.body.rig import body_skeleton, make_body, make_motion, skeleton_motion
-from eslr_jax.body.units import UnitsWarning, metres_per_unit
+from eslr_jax.body.rig import (
+    UnitsWarning,
+    body_skeleton,
+    make_body,
+    make_motion,
+    metres_per_unit,
+    skeleton_motion,
+)
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.io.skeleton import RiggedMesh
 

@@ -55,30 +55,19 @@ def test_garments_far_from_each_other_stay_as_they_are():
     )
 
 
-def test_parts_and_fabrics_are_named_after_their_garments():
-    inner, outer = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
-    half = np.arange(len(outer.faces)) // (len(outer.faces) // 2)
-    outer = dataclasses.replace(
-        outer, face_parts=half, part_names=("low", "high"), metadata={"fabrics": ["denim", "high:silk"]}
-    )
-    outfit = combine_garments([inner, outer], ["skirt", "top"])
+@pytest.mark.parametrize(("inner", "outer", "given", "worn"), [
+    ([], ["denim", "high:silk"], (), ("cotton", "denim", "silk")),
+    (["satin"], [], ("top:denim", "top/high:silk"), ("satin", "denim", "silk")),
+])  # fmt: skip
+def test_parts_and_fabrics_are_named_after_their_garments(inner, outer, given, worn):
+    skirt, top = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
+    half = np.arange(len(top.faces)) // (len(top.faces) // 2)
+    skirt = dataclasses.replace(skirt, metadata={"fabrics": inner})
+    top = dataclasses.replace(top, face_parts=half, part_names=("low", "high"), metadata={"fabrics": outer})
+    outfit = combine_garments([skirt, top], ["skirt", "top"])
     assert outfit.part_names == ("skirt", "top/low", "top/high")
-    garment = prepare_stored(outfit, cache=False)
-    material = garment_material((), garment, outfit)
-    for part, fabric in enumerate(("cotton", "denim", "silk")):
-        expected = fabric_material(fabric).lame_mu
-        assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
-
-
-def test_a_fabric_of_one_garment_leaves_the_others_theirs():
-    inner, outer = tube(0.10, 0.0, 0.4), tube(0.11, 0.2, 0.6)
-    inner = dataclasses.replace(inner, metadata={"fabrics": ["satin"]})
-    half = np.arange(len(outer.faces)) // (len(outer.faces) // 2)
-    outfit = combine_garments(
-        [inner, dataclasses.replace(outer, face_parts=half, part_names=("low", "high"))], ["skirt", "top"]
-    )
-    material = garment_material(("top:denim", "top/high:silk"), prepare_stored(outfit, cache=False), outfit)
-    for part, fabric in enumerate(("satin", "denim", "silk")):
+    material = garment_material(given, prepare_stored(outfit, cache=False), outfit)
+    for part, fabric in enumerate(worn):
         expected = fabric_material(fabric).lame_mu
         assert np.all(np.asarray(material.lame_mu)[outfit.face_parts == part] == expected)
     assert worn_fabrics(("denim",), outfit) == ("denim",)

@@ -8,10 +8,11 @@ from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress
 
 from eslr_jax.body.motion import chest_direction
 from eslr_jax.errors import MeshError
+from eslr_jax.fit.options import FitOptions
 from eslr_jax.fit.placement import DOUBTFUL, find_placement
 from eslr_jax.fit.postures import arm_postures, rest_posture
 
-GIVEN = {"units": "m", "up": "y", "front": "z"}
+KEPT = FitOptions(units="m", up="y", front="z", keep_place=True)
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +36,13 @@ def test_feet_at_the_origin_are_recognised(postures, shape, scale, axes):
     )
 
 
-def test_clear_place_is_confident_and_silent(postures):
-    placement = find_placement(*skirt(), postures)
-    assert placement.confidence > 0.99
-    assert placement.warnings == ()
-
-
-def test_garment_in_the_bodys_frame_stays_there(postures):
+def test_garment_in_the_bodys_frame_stays_there_with_confidence(postures):
     positions, faces = skirt()
     placement = find_placement(positions + standing(postures), faces, postures)
     assert placement.origin == "body"
     np.testing.assert_array_equal(placement.translation, 0.0)
+    assert placement.confidence > 0.99
+    assert placement.warnings == ()
 
 
 def test_a_file_in_the_axes_of_a_body_that_faces_backwards_is_left_as_it_is(body):
@@ -60,9 +57,8 @@ def test_a_file_in_the_axes_of_a_body_that_faces_backwards_is_left_as_it_is(body
         assert (placement.up, placement.front) == ("y", front)
         np.testing.assert_array_equal(placement.rotation, rotation)
         np.testing.assert_allclose(placement.apply(positions), worn @ turn, atol=1e-6)
-    given = find_placement(
-        worn @ turn, garment.faces, [rest_posture(turned)], facing=facing, units="m", up="y", front="-z"
-    )
+    options = FitOptions(units="m", up="y", front="-z")
+    given = find_placement(worn @ turn, garment.faces, [rest_posture(turned)], options, facing=facing)
     np.testing.assert_array_equal(given.rotation, np.eye(3))
 
 
@@ -98,7 +94,7 @@ def test_kept_place_is_obeyed_even_beside_the_body(postures, shape, raised, asid
     positions, faces = shape()
     floor = standing(postures)
     positions = positions + np.array([aside, 0.0, 0.0]) + raised * floor
-    placement = find_placement(positions, faces, postures[:1], keep_place=True, **GIVEN)
+    placement = find_placement(positions, faces, postures[:1], KEPT)
     if aside:
         assert "the garment is not on the body, and stays there as asked" in placement.warnings[-1]
         assert placement.translation[0] == 0.0
@@ -112,14 +108,14 @@ def test_a_kept_place_does_not_follow_soles_that_nearly_stand_on_the_origin(body
     posture = rest_posture(stand_at(body, [0.0, miss - float(body.rest_positions[:, 1].min()), 0.0]))
     assert posture.floor == pytest.approx(miss, abs=1e-6)
     positions, faces = skirt()
-    placement = find_placement(positions, faces, [posture], keep_place=True, **GIVEN)
+    placement = find_placement(positions, faces, [posture], KEPT)
     np.testing.assert_allclose(placement.translation, [0.0, miss if miss > 0.02 else 0.0, 0.0], atol=1e-6)
 
 
 def test_refusal_names_only_the_options_that_are_missing(postures):
     positions, faces = skirt()
     with pytest.raises(MeshError, match=r"give eslr fit --units and --front, or model it on the body"):
-        find_placement(positions + 9.0, faces, postures, keep_place=True, up="y")
+        find_placement(positions + 9.0, faces, postures, FitOptions(keep_place=True, up="y"))
 
 
 @pytest.mark.parametrize("name", ["pants_1k", "longsleeve_1k"])

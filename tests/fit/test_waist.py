@@ -9,9 +9,11 @@ from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dr
 from eslr_jax.errors import ConfigError
 from eslr_jax.fit.fit import fit_garment
 from eslr_jax.fit.options import FitOptions
-from eslr_jax.fit.postures import find_arms, shoulder_height
+from eslr_jax.fit.pins import WAISTBAND, find_waist
+from eslr_jax.fit.postures import shoulder_height
 from eslr_jax.fit.report import describe_cost, describe_fit
-from eslr_jax.fit.waist import WAISTBAND, find_waist
+
+GIVEN = {"units": "m", "up": "y", "front": "z", "arms": "rest"}
 
 
 def standing(shape, body):
@@ -45,16 +47,18 @@ def test_a_body_that_stands_elsewhere_has_the_same_pins(body, shape):
     moved = find_waist(positions + np.array([3.0, 0.0, 0.0]), faces, aside)
     np.testing.assert_array_equal(moved.is_held, waist.is_held)
     assert moved.reason == waist.reason
-    assert find_arms(aside) == find_arms(body)
 
 
-def test_a_cape_is_held_at_its_neckline(body):
+def test_a_cape_is_held_at_its_neckline_and_what_lies_on_the_shoulders_is_not(body):
     positions, faces = standing(cape, body)
     waist = find_waist(positions, faces, body)
     below = positions[:, 1].max() - positions[:, 1]
     np.testing.assert_array_equal(waist.is_held, below < WAISTBAND)
     assert "open around the neck" in waist.reason
     assert not waist.is_falling
+    waist = find_waist(*standing(poncho, body), body)
+    assert not waist.is_held.any()
+    assert waist.reason == "it hangs from the shoulders"
 
 
 def test_raised_arms_of_a_body_without_a_rig_raise_no_shoulders(body):
@@ -66,24 +70,15 @@ def test_raised_arms_of_a_body_without_a_rig_raise_no_shoulders(body):
     assert shoulder_height(bones.replace(rest_positions=raised)) == pytest.approx(expected, abs=1e-3)
 
 
-def test_what_lies_on_the_shoulders_is_not_held(body):
-    waist = find_waist(*standing(poncho, body), body)
-    assert not waist.is_held.any()
-    assert waist.reason == "it hangs from the shoulders"
-
-
-@pytest.mark.parametrize("name", ["shorts", "pants", "kneepants"])
-def test_waistband_is_that_of_the_bundled_garments(body, name):
-    garment = bundled(f"{name}_1k")
-    held = find_waist(garment.rest_positions, garment.faces, body).is_held
-    assert np.mean(garment.is_pinned[held]) == 1.0
-    assert held.sum() > 0.6 * garment.is_pinned.sum()
-
-
-@pytest.mark.parametrize("name", ["tshirt", "tank", "longsleeve", "dress", "shortsleeve", "tightdress"])
-def test_bundled_garments_with_shoulders_are_not_held(body, name):
-    garment = bundled(f"{name}_1k")
-    assert not find_waist(garment.rest_positions, garment.faces, body).is_held.any()
+def test_waistband_is_that_of_the_bundled_garments(body):
+    for name in ("shorts", "pants", "kneepants"):
+        garment = bundled(f"{name}_1k")
+        held = find_waist(garment.rest_positions, garment.faces, body).is_held
+        assert np.mean(garment.is_pinned[held]) == 1.0, name
+        assert held.sum() > 0.6 * garment.is_pinned.sum(), name
+    for name in ("tshirt", "tank", "longsleeve", "dress", "shortsleeve", "tightdress"):
+        garment = bundled(f"{name}_1k")
+        assert not find_waist(garment.rest_positions, garment.faces, body).is_held.any(), name
 
 
 def test_parts_are_judged_one_by_one(body):
@@ -98,8 +93,7 @@ def test_leg_warmers_fall_and_the_report_says_so(body):
     legs = [rings([(0.5, 0.09, 0.09, 0.02), (0.2, 0.09, 0.09, 0.0)], around=24, rows=16) for _ in range(2)]
     for (positions, _), side in zip(legs, (0.175, -0.175), strict=True):
         positions[:, 0] += side
-    options = FitOptions(units="m", up="y", front="z", arms="rest")
-    fitted = fit_garment(source(*joined(*legs)), body, options)
+    fitted = fit_garment(source(*joined(*legs)), body, FitOptions(**GIVEN))
     assert not fitted.is_pinned.any()
     texts = fitted.metadata["fit"]["warnings"]
     (warning,) = (text for text in texts if "nothing holds the garment up" in text)
@@ -107,11 +101,8 @@ def test_leg_warmers_fall_and_the_report_says_so(body):
 
 
 def test_pins_replace_the_waistband(body):
-    fast = {"units": "m", "up": "y", "front": "z", "arms": "rest"}
-    shape = source(*shorts())
-
     def fit(*pins):
-        return fit_garment(shape, body, FitOptions(pin=pins, **fast))
+        return fit_garment(source(*shorts()), body, FitOptions(pin=pins, **GIVEN))
 
     default = fit()
     assert default.metadata["fit"]["pinned"] == default.is_pinned.sum() > 50

@@ -2,9 +2,11 @@
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cloth import grid_faces
 
 GARMENTS = Path(__file__).parents[2] / "data" / "garments"
 
@@ -12,15 +14,11 @@ GARMENTS = Path(__file__).parents[2] / "data" / "garments"
 def make_tube(around=12, along=10, *, radius=0.15, length=0.6, flare=0.0, twist=0.0, depth=1.0):
     """An open tube around y, faces outwards; `twist` turns the rings, so that two meshes of a tube differ."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    height = np.linspace(0, length, along)
-    angle, height = np.meshgrid(angle, height, indexing="ij")
+    height, angle = np.meshgrid(np.linspace(0, length, along), angle, indexing="ij")
     angle = angle + twist * height
     size = radius + flare * (length - height)
-    positions = np.stack([size * np.cos(angle), height, depth * size * np.sin(angle)], axis=-1).reshape(-1, 3)
-    index = np.arange(around * along).reshape(around, along)
-    a, b = index[:, :-1].ravel(), np.roll(index, -1, axis=0)[:, :-1].ravel()
-    c, d = np.roll(index, -1, axis=0)[:, 1:].ravel(), index[:, 1:].ravel()
-    return positions, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    positions = np.stack([size * np.cos(angle), height, depth * size * np.sin(angle)], axis=-1)
+    return positions.reshape(-1, 3), grid_faces(along, around, is_closed=True)
 
 
 def make_sheet(rows=6, columns=7, *, jitter=0.0, seed=0):
@@ -29,9 +27,7 @@ def make_sheet(rows=6, columns=7, *, jitter=0.0, seed=0):
     positions = np.stack([x, y, np.zeros_like(x)], axis=-1)
     random = np.random.default_rng(seed)
     positions[1:-1, 1:-1] += random.uniform(-jitter, jitter, (rows - 2, columns - 2, 3))
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    return positions.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return positions.reshape(-1, 3), grid_faces(rows, columns)[:, ::-1]
 
 
 def make_octahedron(size=0.3):
@@ -58,24 +54,15 @@ def mesh(request):
     """Positions and faces of one small mesh after another."""
     if request.param == "permuted":
         return permute(*make_tube(7, 5))[:2]
-    return {"tube": make_tube, "sheet": lambda: make_sheet(jitter=0.03), "octahedron": make_octahedron}[
-        request.param
-    ]()
+    if request.param == "sheet":
+        return make_sheet(jitter=0.03)
+    return make_tube() if request.param == "tube" else make_octahedron()
 
 
 @pytest.fixture(scope="session")
 def builders():
     """The mesh builders, as attributes."""
-    return type(
-        "Builders",
-        (),
-        {
-            "tube": staticmethod(make_tube),
-            "sheet": staticmethod(make_sheet),
-            "octahedron": staticmethod(make_octahedron),
-            "permute": staticmethod(permute),
-        },
-    )
+    return SimpleNamespace(tube=make_tube, sheet=make_sheet, octahedron=make_octahedron, permute=permute)
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eslr_jax import prepare_garment
 from eslr_jax.errors import CapacityError, MeshError
 from eslr_jax.geometry.padding import choose_bucket, common_bucket, garment_bucket, pad_garment, round_up
-from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.numerics import gather_corners
 
 
@@ -129,24 +129,15 @@ def test_small_bucket_is_named(garment):
         pad_garment(garment, bucket._replace(faces=10))
     with pytest.raises(CapacityError, match="at least 154 vertices"):
         pad_garment(garment, bucket._replace(vertices=153))
-
-
-def test_own_bucket_changes_nothing(garment):
     assert pad_garment(garment, garment_bucket(garment)) is garment
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"skin_weights": np.ones((5, 4))},
-            "skin weights .5, 4. and indices .153, 4. do not fit 153 vertices",
-        ),
-        ({"skin_weights": np.zeros((153, 4))}, "skin weights of vertex 0"),
-        ({"skin_indices": np.full((153, 4), -1)}, "skin indices of vertex 0 .* joints are counted from 0"),
-        ({"is_pinned": np.zeros(4, bool)}, "is_pinned has shape .4,. and dtype bool for 153 vertices"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"skin_weights": np.ones((5, 4))}, "skin weights .5, 4. and indices .153, 4. do not fit 153 vertices"),
+    ({"skin_weights": np.zeros((153, 4))}, "skin weights of vertex 0"),
+    ({"skin_indices": np.full((153, 4), -1)}, "skin indices of vertex 0 .* joints are counted from 0"),
+    ({"is_pinned": np.zeros(4, bool)}, "is_pinned has shape .4,. and dtype bool for 153 vertices"),
+])  # fmt: skip
 def test_arrays_that_do_not_fit_are_named(builders, change, message):
     positions, faces = builders.tube(17, 9)
     options = {"skin_weights": np.ones((153, 4)), "skin_indices": np.zeros((153, 4), int)} | change

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cloth import grid_faces
 
 from eslr_jax.geometry.repair import consistent_orientation, join_components, largest_component, weld
 from eslr_jax.geometry.topology import face_areas, vertex_components
@@ -11,14 +12,7 @@ from eslr_jax.geometry.validate import validate_mesh
 def grid(columns, rows, spacing=0.1):
     x, y = np.meshgrid(np.arange(columns) * spacing, np.arange(rows) * spacing)
     positions = np.stack([x.ravel(), y.ravel(), 0.02 * np.sin(9 * x.ravel())], axis=1)
-    corner = (np.arange(columns - 1) + columns * np.arange(rows - 1)[:, None]).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + columns], 1),
-            np.stack([corner + 1, corner + columns + 1, corner + columns], 1),
-        ]
-    )
-    return positions, faces
+    return positions, grid_faces(rows, columns)[:, ::-1]
 
 
 def cut_along_seam(positions, faces, is_right):
@@ -121,14 +115,8 @@ def test_each_part_keeps_the_side_of_most_of_its_area():
 def test_surface_with_one_side_is_left_as_it_is():
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     width = np.array([-0.2, 0.2])[:, None]
-    ring = np.stack(
-        [
-            (1 + width * np.cos(angle / 2)) * np.cos(angle),
-            (1 + width * np.cos(angle / 2)) * np.sin(angle),
-            width * np.sin(angle / 2),
-        ],
-        axis=-1,
-    )
+    radius = 1 + width * np.cos(angle / 2)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), width * np.sin(angle / 2)], axis=-1)
     low, high = np.arange(12), np.arange(12, 24)
     after, above = np.append(low[1:], 12), np.append(high[1:], 0)
     faces = np.concatenate([np.stack([low, after, high], 1), np.stack([after, above, high], 1)])

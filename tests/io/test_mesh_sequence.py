@@ -9,8 +9,8 @@ import trimesh
 from broken import refuses
 from scipy.spatial.transform import Rotation
 
+from eslr_jax.body.rig import UnitsWarning
 from eslr_jax.body.sequence import pose_sequence
-from eslr_jax.body.units import UnitsWarning
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.io.animated import AnimatedMesh, Skin
 from eslr_jax.io.garment import GarmentFile, in_outfit_order, in_vertex_order

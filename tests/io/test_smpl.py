@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax.body.motion import Motion, pose_body, shape_body
 from eslr_jax.body.retarget import local_rotations
-from eslr_jax.body.rig import make_body, make_motion
-from eslr_jax.body.units import UnitsWarning
+from eslr_jax.body.rig import UnitsWarning, make_body, make_motion
 from eslr_jax.errors import AssetError
 from eslr_jax.io.smpl import read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.types import Body
