@@ -18,7 +18,7 @@ from eslr_jax.evaluation.fields import FIELDS, Field, run_field
 from eslr_jax.extras import require
 from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import Run
-from eslr_jax.render.colors import color_scale
+from eslr_jax.render import color_scale
 from eslr_jax.viewer.curves import add_plot, frame_values, show_plot, worst_frame
 
 PLAIN = "fabric"  # colour by nothing
