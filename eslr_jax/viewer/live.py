@@ -102,6 +102,7 @@ class Live:
     recorded: list[Recorded] = dataclasses.field(default_factory=list)
     setting: tuple[Material, tuple[float, float, float]] | None = None  # fabric, wind [m/s] of the recording
     asked: threading.Event = dataclasses.field(default_factory=threading.Event)  # for one step
+    anew: threading.Event = dataclasses.field(default_factory=threading.Event)  # for a new start
 
     @property
     def url(self) -> str:
@@ -194,7 +195,7 @@ def _one_frame(live: Live, choice: Choice) -> bool:
         is_over = not live.controls["record"].value or len(live.recorded) >= MOST_RECORDED
         # A run has one garment, body, motion, fabric and wind, and puts the garment on once.
         is_another = is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting)
-        if is_over or is_another or live.state is None:
+        if is_over or is_another or live.anew.is_set():
             live.controls["record"].value = False
             _save(live)
     if is_due:
@@ -203,8 +204,10 @@ def _one_frame(live: Live, choice: Choice) -> bool:
     if cast is None or choice == live.refused or not is_asked:
         return False
     live.asked.clear()
-    if live.state is None:
+    if live.state is None or live.anew.is_set():
+        live.anew.clear()
         live.state, live.step = cast.stage.scene.initial_state, 0
+        live.times, live.iterations = [], MOST_ITERATIONS
     began = time.perf_counter()
     before, frame = cast.frames(live.step)
     compiling = _busy(live, "compiling, which is kept for the next time")
@@ -215,8 +218,6 @@ def _one_frame(live: Live, choice: Choice) -> bool:
         stage = changed(cast.stage, fabric, wind, hand)
         tolerance = 0.01 * float(live.controls["tolerance"].value)  # of the gap that a frame begins with
         step = jax.block_until_ready(advance(stage, live.state, (before, frame), live.iterations, tolerance))
-    if live.state is None:  # restarted meanwhile
-        return False
     status = Status(int(step.state.status))
     if status != Status.OK:
         restart(live)
@@ -307,8 +308,7 @@ def _load(live: Live, choice: Choice) -> None:
     for _, mesh in drawn:
         mesh.on_click(lambda event: take_hold(live, event.ray_origin, event.ray_direction))
     live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
-    live.is_compiled, live.refused = False, None
-    restart(live)
+    live.is_compiled, live.refused, live.state = False, None, None
 
 
 def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, Any]:
@@ -327,8 +327,8 @@ def _draw_body(live: Live, poses: BodyMotion, rig: Body, spot: np.ndarray) -> li
 
 
 def restart(live: Live) -> None:
-    """Put the garment on again at the motion's first frame."""
-    live.state, live.times, live.iterations = None, [], MOST_ITERATIONS
+    """Let the next frame put the garment on again at the motion's first frame."""
+    live.anew.set()
 
 
 def next_iterations(iterations: int, took: float, timestep: float) -> int:
