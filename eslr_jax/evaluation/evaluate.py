@@ -1,17 +1,12 @@
-"""Evaluate a model on a split: optimality gap, and free rollouts (host).
-
-A control is the network without one of its parts, which shows what that part contributes.
-"""
+"""Evaluate a model on a split: optimality gap, and free rollouts (host)."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -19,17 +14,15 @@ from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, s
 from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError, Status
+from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import mean_energies
 from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.models.registry import init_model
 from eslr_jax.scene.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
-from eslr_jax.types import Garment, Scene, Trajectory
+from eslr_jax.types import Scene, Trajectory
 
-Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
-EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
@@ -48,7 +41,7 @@ class EvaluationOptions:
     gap_frames: int = 40  # frames of each clip for the gap; 0: it is not measured
     every: int = 4  # of those, measure one in so many
     rollout_frames: int = 300  # of the free rollout; clips are played back and forth
-    control: Control | None = None  # what the network is deprived of; see `control_params`, `control_garment`
+    control: Control | None = None  # what the network is deprived of; see `controls`
 
     def __post_init__(self) -> None:
         """Reject lengths that leave nothing to measure.
@@ -61,51 +54,6 @@ class EvaluationOptions:
                 raise ConfigError(
                     f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
                 )
-
-
-def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
-    """Return weights without what a control takes away.
-
-    Args:
-        control: "untrained" has weights of a new network, on the trained one's statistics of features.
-            "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
-        params: Weights of the trained network.
-        config: Architecture.
-
-    Raises:
-        ConfigError: The network has no such part.
-    """
-    if control in EMBEDDING_CONTROLS and not config.attention_blocks:
-        raise ConfigError(f"control {control} takes geodesic coordinates away, which only attention reads")
-    if control == "untrained":
-        return {**params, "params": init_model(config)["params"]}
-    if control == "no_decoder":
-        decoder, last = params["params"]["decoder"], config.hidden_layers
-        names = (f"kernel_{last}", f"bias_{last}")
-        zeros = {name: jnp.zeros_like(decoder[name]) for name in names}
-        return {**params, "params": {**params["params"], "decoder": {**decoder, **zeros}}}
-    return params
-
-
-def control_garment(control: Control, garment: Garment) -> Garment:
-    """Return a garment without what a control takes away.
-
-    Args:
-        control: "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same
-            spread, equal for equal garments however they are padded.
-        garment: The garment.
-    """
-    embedding = garment.geodesic_embedding
-    if control == "no_embedding":
-        return garment.replace(geodesic_embedding=jnp.zeros_like(embedding))
-    if control == "random_embedding":
-        is_real = garment.vertex_mask[:, None]
-        # One key a vertex, so that padding does not change what is drawn.
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.arange(len(embedding)))
-        noise = jax.vmap(lambda key: jax.random.normal(key, embedding.shape[1:]))(keys)
-        spread = jnp.std(embedding, axis=0, keepdims=True, where=is_real)
-        return garment.replace(geodesic_embedding=jnp.where(is_real, noise * spread, 0.0))
-    return garment
 
 
 def evaluate(
@@ -163,10 +111,16 @@ def evaluate(
                 policy.append(on_policy)
             scene = scene_of(options.rollout_frames)
             free = _roll(params, scene, config)
-            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
-            apart = distance_mm(free, optimum, scene)
-            row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
-            scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
+            reference = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
+            scenes.append(
+                {
+                    "garment": garment,
+                    "clip": clip,
+                    **measure_rollout(free, scene),
+                    "distance_mm": distance_mm(free, reference, scene),
+                    "optimum": measure_rollout(reference, scene),
+                }
+            )
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
         resting = prepare_scene(cloth, pose_body(body, still), surface=surface)

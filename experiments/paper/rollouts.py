@@ -21,13 +21,8 @@ from worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, not_finite, w
 from eslr_jax.assets.models import model_record
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
-from eslr_jax.evaluation.evaluate import (
-    EMBEDDING_CONTROLS,
-    Control,
-    control_garment,
-    control_params,
-    distance_mm,
-)
+from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
+from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.io.atomic import atomic_write
@@ -77,7 +72,7 @@ def read_system(name: str) -> System:
     Args:
         name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
             NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
-            CHANGE is a control of `evaluation.evaluate` or another mode of the geodesic embedding.
+            CHANGE is a control of `evaluation.controls` or another mode of the geodesic embedding.
             SYSTEM@FOLDER is one of `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there.
             Their control is `SKINNED`, the garment carried by the joints; mat's is "mat@FOLDER~untrained".
     """

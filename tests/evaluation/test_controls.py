@@ -13,7 +13,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.evaluation.evaluate import Control, control_garment, control_params
+from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import stepped_potentials, trajectory_gap
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.models.registry import MODELS, init_model

@@ -1,0 +1,62 @@
+"""Controls: a network without one of its parts, which shows what that part contributes."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from eslr_jax.config import ModelConfig
+from eslr_jax.errors import ConfigError
+from eslr_jax.models.registry import init_model
+from eslr_jax.types import Garment
+
+Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
+EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
+
+
+def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
+    """Return weights without what a control takes away.
+
+    Args:
+        control: "untrained" has weights of a new network, on the trained one's statistics of features.
+            "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
+        params: Weights of the trained network.
+        config: Architecture.
+
+    Raises:
+        ConfigError: The network has no such part.
+    """
+    if control in EMBEDDING_CONTROLS and not config.attention_blocks:
+        raise ConfigError(f"control {control} takes geodesic coordinates away, which only attention reads")
+    if control == "untrained":
+        return {**params, "params": init_model(config)["params"]}
+    if control == "no_decoder":
+        decoder, last = params["params"]["decoder"], config.hidden_layers
+        names = (f"kernel_{last}", f"bias_{last}")
+        zeros = {name: jnp.zeros_like(decoder[name]) for name in names}
+        return {**params, "params": {**params["params"], "decoder": {**decoder, **zeros}}}
+    return params
+
+
+def control_garment(control: Control, garment: Garment) -> Garment:
+    """Return a garment without what a control takes away.
+
+    Args:
+        control: "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same
+            spread, equal for equal garments however they are padded.
+        garment: The garment.
+    """
+    embedding = garment.geodesic_embedding
+    if control == "no_embedding":
+        return garment.replace(geodesic_embedding=jnp.zeros_like(embedding))
+    if control == "random_embedding":
+        is_real = garment.vertex_mask[:, None]
+        # One key a vertex, so that padding does not change what is drawn.
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.arange(len(embedding)))
+        noise = jax.vmap(lambda key: jax.random.normal(key, embedding.shape[1:]))(keys)
+        spread = jnp.std(embedding, axis=0, keepdims=True, where=is_real)
+        return garment.replace(geodesic_embedding=jnp.where(is_real, noise * spread, 0.0))
+    return garment
