@@ -111,16 +111,10 @@ def evaluate(
                 policy.append(on_policy)
             scene = scene_of(options.rollout_frames)
             free = _roll(params, scene, config)
-            reference = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
-            scenes.append(
-                {
-                    "garment": garment,
-                    "clip": clip,
-                    **measure_rollout(free, scene),
-                    "distance_mm": distance_mm(free, reference, scene),
-                    "optimum": measure_rollout(reference, scene),
-                }
-            )
+            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
+            apart = distance_mm(free, optimum, scene)
+            row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
+            scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
         resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
