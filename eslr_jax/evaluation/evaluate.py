@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -90,9 +91,8 @@ def evaluate(
     drifts: dict[str, float | None] = {}
     total = len(garments) * len(clips)
     # Padded to one bucket: all scenes then share one compiled rollout.
-    cloths = pad_alike(
-        [load_garment(name, vertices=options.vertices, **model.garment_options) for name in garments]  # type: ignore[arg-type]
-    )
+    load = partial(load_garment, vertices=options.vertices, **model.garment_options)  # type: ignore[arg-type]
+    cloths = pad_alike([load(name) for name in garments])
     if options.control is not None:
         params = control_params(options.control, params, model)
         cloths = [control_garment(options.control, cloth) for cloth in cloths]

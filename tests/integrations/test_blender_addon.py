@@ -204,30 +204,6 @@ def test_a_garment_goes_to_the_simulator_with_its_texture(tmp_path, monkeypatch,
     np.testing.assert_allclose(read.corner_uvs, uvs[[[0, 1, 2], [0, 2, 3], [4, 5, 6]]])
 
 
-def test_a_shape_is_that_of_the_mixed_keys_which_stay_as_they_are(monkeypatch):
-    exchange = without_blender(monkeypatch)
-    drawn, mixed = np.zeros((4, 3)), np.arange(12.0).reshape(4, 3)
-    keys = ["Basis", "Fat"]
-
-    def remove(key):
-        keys.remove(key)
-        thing.active_shape_key_index = 0
-
-    def add(from_mix):
-        assert from_mix
-        keys.append(mix)
-        return mix
-
-    mix = SimpleNamespace(data=_Values(mixed))
-    mesh = SimpleNamespace(vertices=_Values(drawn), shape_keys=keys)
-    thing = SimpleNamespace(data=mesh, active_shape_key_index=1, shape_key_add=add, shape_key_remove=remove)
-    np.testing.assert_array_equal(exchange.shown_shape(thing), mixed)
-    assert keys == ["Basis", "Fat"]
-    assert thing.active_shape_key_index == 1
-    mesh.shape_keys = None
-    np.testing.assert_array_equal(exchange.shown_shape(thing), drawn)
-
-
 @pytest.mark.slow
 @needs_blender
 def test_body_and_garment_go_to_the_simulator_as_their_shape_keys_shape_them(folder):
