@@ -284,8 +284,10 @@ def _load(live: Live, choice: Choice) -> None:
         poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
         spots, drawn_body = np.array(poses.positions).mean(axis=1), []
         spots[:, 1] = float(ground_height(poses))
+        body = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
+        standing = np.asarray(poses.positions[0]) - spots[0]
         if live.cast is None:  # there is something to see while the rest loads
-            drawn_body = _draw_body(live, poses, rig, spots[0])
+            drawn_body = _draw(live, "/body", body, standing)
         # A shape of the body is tried once: its garments are not kept on disk.
         garments = [
             load_garment_file(name, vertices=choice.vertices, body=rig, cache=not choice.betas)  # type: ignore[arg-type]
@@ -300,30 +302,24 @@ def _load(live: Live, choice: Choice) -> None:
     if live.cast is not None:
         for _, mesh in (*live.cast.drawn, *live.cast.drawn_body):
             mesh.remove()
-        drawn_body = _draw_body(live, poses, rig, spots[0])
-    drawn = [
-        _draw(live, f"/garments/{number}", piece, np.asarray(stage.scene.initial_state.position) - spots[0])
-        for number, piece in enumerate(garment_pieces(np.asarray(cloth.faces), stored.outfit))
-    ]
+        drawn_body = _draw(live, "/body", body, standing)
+    pieces = garment_pieces(np.asarray(cloth.faces), stored.outfit)
+    drawn = _draw(live, "/garments", pieces, np.asarray(stage.scene.initial_state.position) - spots[0])
     for _, mesh in drawn:
         mesh.on_click(lambda event: take_hold(live, event.ray_origin, event.ray_direction))
-    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
     live.is_compiled, live.refused, live.state = False, None, None
+    live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
 
 
-def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, Any]:
-    """Draw a piece of garment or body, given where the whole is [m]; return it with its mesh on the page."""
-    mesh = live.server.scene.add_mesh_simple(
-        name, piece.place(positions), piece.faces, color=byte_color(piece.color), side="double"
-    )
-    return piece, mesh
-
-
-def _draw_body(live: Live, poses: BodyMotion, rig: Body, spot: np.ndarray) -> list[tuple[Piece, Any]]:
-    """Draw a body at the first frame of its motion, where it stands on a spot [m]."""
-    positions = np.asarray(poses.positions[0]) - spot
-    pieces = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
-    return [_draw(live, f"/body/{piece.name}", piece, positions) for piece in pieces]
+def _draw(live: Live, folder: str, pieces: list[Piece], positions: np.ndarray) -> list[tuple[Piece, Any]]:
+    """Draw the pieces of a garment or a body, given where the whole is [m]; return them with their meshes."""
+    drawn = []
+    for number, piece in enumerate(pieces):
+        name, color = f"{folder}/{number}", byte_color(piece.color)
+        place = piece.place(positions)
+        mesh = live.server.scene.add_mesh_simple(name, place, piece.faces, color=color, side="double")
+        drawn.append((piece, mesh))
+    return drawn
 
 
 def restart(live: Live) -> None:
