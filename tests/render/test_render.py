@@ -24,6 +24,7 @@ SMALL = {"size": (48, 64), "samples": 4}
 @pytest.fixture
 def scene():
     """A ball as body and a smaller one as cloth on its +X side, three frames moving along +Z."""
+    pytest.importorskip("mitsuba")
     body = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     cloth = trimesh.creation.icosphere(subdivisions=2, radius=0.2)
     steps = np.arange(3)[:, None, None] * np.array([0.0, 0.0, 0.5])
@@ -51,7 +52,6 @@ def blue_columns(picture):
 
 
 def test_render_frame_shows_the_cloth_on_the_right_side_of_the_body(scene):
-    pytest.importorskip("mitsuba")
     front = render_frame(**first_frame(scene), camera="front", **SMALL)
     back = render_frame(**first_frame(scene), camera="back", **SMALL)
     assert front.shape == (64, 48, 3)
@@ -62,14 +62,12 @@ def test_render_frame_shows_the_cloth_on_the_right_side_of_the_body(scene):
 
 
 def test_render_frame_repeats_and_needs_no_body(scene):
-    pytest.importorskip("mitsuba")
     arguments = first_frame(scene) | {"body_positions": None, "body_faces": None}
     first, second = (render_frame(**arguments, **SMALL).astype(int) for _ in range(2))
     assert np.abs(first - second).max() <= 1  # threads add up a pixel's samples in any order
 
 
 def test_render_frame_paints_vertex_colors(scene):
-    pytest.importorskip("mitsuba")
     arguments = first_frame(scene)
     colors = np.tile([0.1, 0.8, 0.1], (len(arguments["garment_positions"]), 1))
     picture = render_frame(**arguments, vertex_colors=colors, **SMALL).astype(int)
@@ -77,7 +75,6 @@ def test_render_frame_paints_vertex_colors(scene):
 
 
 def test_render_frames_follow_the_body(scene):
-    pytest.importorskip("mitsuba")
     first, last = render_frames(**scene, frame_indices=[0, 2], **SMALL)
     # The subject moves as a whole, so the camera sees the same picture but for noise of the light.
     assert np.abs(first.astype(int) - last).mean() < 3
@@ -85,7 +82,6 @@ def test_render_frames_follow_the_body(scene):
 
 def test_the_front_turns_with_the_body(scene):
     """Cloth at the body's left is on the right of every picture, wherever the body faces."""
-    pytest.importorskip("mitsuba")
     quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # +Z becomes +X
     rest = scene["body_positions"][0] * [1.0, 1.3, 0.4]  # wider than deep, as a person
     cloth = scene["garment_positions"][0]
@@ -100,7 +96,6 @@ def test_the_front_turns_with_the_body(scene):
 
 
 def test_the_front_turns_evenly_through_whole_turns(scene):
-    pytest.importorskip("mitsuba")
     turns = np.linspace(0.0, 7.0, 40)
     cosine, sine, zero = np.cos(turns), np.sin(turns), np.zeros(40)
     rows = [(cosine, zero, sine), (zero, zero + 1.0, zero), (-sine, zero, cosine)]
@@ -116,7 +111,6 @@ def test_the_front_turns_evenly_through_whole_turns(scene):
 
 
 def test_zoom_enlarges_the_garment_and_looks_at_it(scene):
-    pytest.importorskip("mitsuba")
     whole, close = (is_blue(next(render_frames(**scene, zoom=zoom, **SMALL))) for zoom in (1.01, 2.02))
     assert close.sum() == pytest.approx(4 * whole.sum(), rel=0.15)
     row, column = np.argwhere(close).mean(axis=0)
@@ -138,7 +132,6 @@ def test_a_color_bar_spans_the_scale_under_the_picture():
 
 
 def test_contact_sheet_tiles_frames_and_reports_progress(scene):
-    pytest.importorskip("mitsuba")
     done = []
     sheet = contact_sheet(
         **scene, num_frames=8, columns=2, on_picture=lambda *counts: done.append(counts), **SMALL
@@ -164,7 +157,6 @@ def test_contact_sheet_tiles_frames_and_reports_progress(scene):
     ],
 )
 def test_render_frame_names_what_is_wrong(scene, change, error):
-    pytest.importorskip("mitsuba")
     with pytest.raises(error):
         render_frame(**(first_frame(scene) | SMALL | change))
 
@@ -199,7 +191,6 @@ def test_the_whole_subject_fills_the_picture_from_anywhere(extents, size):
 
 
 def test_the_side_is_the_left(scene):
-    pytest.importorskip("mitsuba")
     by_name, by_angle = (render_frame(**first_frame(scene), camera=name, **SMALL) for name in ("side", 90.0))
     np.testing.assert_array_equal(by_name, by_angle)
     assert blue_columns(by_name) == pytest.approx(0.5, abs=0.03)  # the cloth is before the body
@@ -207,7 +198,6 @@ def test_the_side_is_the_left(scene):
 
 def test_few_rays_are_as_good_as_many(scene):
     """The denoiser takes the grain, and keeps the edges."""
-    pytest.importorskip("mitsuba")
     arguments = first_frame(scene) | {"size": (48, 64)}
     few, many = (render_frame(**arguments, samples=samples).astype(int) for samples in (9, 200))
     assert np.abs(few - many).mean() < 0.01 * 255
@@ -222,16 +212,6 @@ def test_write_png_round_trips(tmp_path):
         np.testing.assert_array_equal(np.asarray(image), picture)
 
 
-@pytest.mark.parametrize(
-    "picture", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)]
-)
-def test_write_png_refuses_what_is_no_picture(tmp_path, picture):
-    pytest.importorskip("PIL")
-    with pytest.raises(AssetError, match="not uint8"):
-        write_png(tmp_path / "a.png", picture)
-    assert not os.listdir(tmp_path)
-
-
 def test_write_video_holds_every_frame(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     frames = [np.full((49, 65, 3), value, np.uint8) for value in (0, 80, 160, 240)]
@@ -242,7 +222,18 @@ def test_write_video_holds_every_frame(tmp_path):
     assert os.listdir(tmp_path) == ["a.mp4"]
 
 
-@pytest.mark.parametrize("frames", [[], [np.zeros((4, 4, 3), np.uint8), np.zeros((6, 4, 3), np.uint8)]])
+PICTURE = np.zeros((4, 4, 3), np.uint8)
+
+
+@pytest.mark.parametrize("picture", [PICTURE[..., 0], PICTURE.astype(float), PICTURE[:0]])
+def test_write_png_refuses_what_is_no_picture(tmp_path, picture):
+    pytest.importorskip("PIL")
+    with pytest.raises(AssetError, match="not uint8"):
+        write_png(tmp_path / "a.png", picture)
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("frames", [[], [PICTURE, PICTURE[:2]]])
 def test_write_video_refuses_no_frames_and_mixed_sizes(tmp_path, frames):
     pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(AssetError):
