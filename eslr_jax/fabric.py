@@ -126,22 +126,19 @@ def on_threads(
         fabrics: The real faces of each fabric; later ones replace earlier ones.
     """
     count, num_faces = len(warp), len(np.asarray(garment.rest_areas))
-    stiffness, rigidity, limits = (
-        np.zeros((num_faces, 4)),
-        np.zeros((count, 2)),
-        np.full((num_faces, 2), np.inf),
-    )
+    stiffness, rigidity = np.zeros((num_faces, 4)), np.zeros((count, 2))
+    limits = np.full((num_faces, 2), np.inf)
     weaves = [one.weave or Weave() for _, one in fabrics]
+    has_limits = any(weave.limits is not None for weave in weaves)
     for (is_own, one), weave in zip(fabrics, weaves, strict=True):
         stiffness[:count][is_own] = weave.stiffness or _sheet_stiffness(one.sheet)
         rigidity[is_own] = weave.rigidity or [RIGIDITY_PER_STIFFNESS * float(one.sheet.bending_stiffness)] * 2
         if weave.limits is not None:  # a length 1 + e has the Green strain e + e^2 / 2
             limits[:count][is_own] = [limit + 0.5 * limit**2 for limit in weave.limits]
     threads = plate = None
-    if any(weave.stiffness is not None or weave.limits is not None for weave in weaves):
+    if has_limits or any(weave.stiffness is not None for weave in weaves):
         directions = np.zeros((num_faces, 2), np.float32)
         directions[:count] = warp
-        has_limits = any(weave.limits is not None for weave in weaves)
         threads = Threads(
             warp=jnp.asarray(directions),
             stiffness=jnp.asarray(stiffness.T, jnp.float32),
@@ -209,19 +206,19 @@ def describe_fabric(text: str) -> Described:
                 f"no fabric {text!r}: {hint}there are {', '.join(names)}; or write {FABRIC_FORMS}"
             )
         return Described(fabric_material(text), None)
-    values = {}
+    values: dict[str, np.float32] = {}
     for word in text.split(","):
-        key, _, number = word.partition("=")
-        if key.strip() not in _NUMBERS:
-            raise ConfigError(f"fabric {text!r}: {key.strip()!r} is unknown; use {', '.join(_NUMBERS)}")
+        key, _, number = (part.strip() for part in word.partition("="))
+        if key not in _NUMBERS:
+            raise ConfigError(f"fabric {text!r}: {key!r} is unknown; use {', '.join(_NUMBERS)}")
         try:
-            values[key.strip()] = np.float32(number)
+            values[key] = np.float32(number)
         except ValueError as error:
             raise ConfigError(f"fabric {text!r}: {number!r} is not a number") from error
-        if not (np.isfinite(values[key.strip()]) and values[key.strip()] > 0):
-            raise ConfigError(f"fabric {text!r}: {key.strip()} must be positive")
-    sheet = COTTON.replace(**{key: value for key, value in values.items() if key in _SHEET})
-    weave = _weave({key: float(value) for key, value in values.items() if key not in _SHEET}, sheet, text)
+        if not (np.isfinite(values[key]) and values[key] > 0):
+            raise ConfigError(f"fabric {text!r}: {key} must be positive")
+    sheet = COTTON.replace(**{key: values.pop(key) for key in _SHEET if key in values})
+    weave = _weave({key: float(value) for key, value in values.items()}, sheet, text)
     return Described(sheet if weave is None else isotropic_nearest(weave, sheet), weave)
 
 
@@ -267,11 +264,12 @@ def _mixed(whole: Material, parts: dict[int, Material], face_parts: np.ndarray, 
     num_vertices = len(garment.vertex_areas)
     mass = vertex_areas(areas * by_face("density"), faces, num_vertices)
     area = vertex_areas(areas, faces, num_vertices)
+    density = np.where(area > 0, mass / np.where(area > 0, area, 1.0), float(whole.density))
     bending = np.full(len(garment.hinges), float(whole.bending_stiffness))
     hinge_faces = find_hinges(faces[: len(face_parts)])[1]  # in the order of the garment's hinges
     bending[: len(hinge_faces)] = by_face("bending_stiffness")[hinge_faces].mean(axis=1)
     return Material(
-        density=np.float32(np.where(area > 0, mass / np.where(area > 0, area, 1.0), float(whole.density))),
+        density=np.float32(density),
         lame_mu=np.float32(by_face("lame_mu")),
         lame_lambda=np.float32(by_face("lame_lambda")),
         bending_stiffness=np.float32(bending),

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -107,9 +106,11 @@ def test_padding_does_not_change_the_fabric_of_parts(two_fabrics):
         np.testing.assert_array_equal(getattr(padded, name)[: len(values)], values)
 
 
-def test_fabrics_beyond_the_networks_are_told():
+def test_what_networks_have_not_seen_is_named():
     assert beyond_training(COTTON) == ()
     assert beyond_training(fabric_material("denim")) == ("lame_mu", "lame_lambda")
+    assert beyond_training(COTTON.replace(thickness=np.float32(2e-3))) == ("lame_mu", "lame_lambda")
+    assert beyond_training(COTTON.replace(density=np.float32(3.0))) == ("density",)
     assert beyond_training(COTTON.replace(bending_stiffness=np.float32(1e-9))) == ("bending_stiffness",)
 
 
@@ -120,19 +121,15 @@ def test_fabric_of_the_file_is_the_default(two_fabrics):
     assert garment_material(("denim",), garment, stored).density == fabric_material("denim").density
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("denin", "did you mean denim"),
-    ("weight=3", "'weight' is unknown; use density"),
-    ("density=heavy", "is not a number"),
-    ("density=-1", "must be positive"),
-    ("density=nan", "must be positive"),
-    ("warp_stretch=100,coupling=100", "coupling must be less"),
-    ("collar:silk", "no part 'collar'; parts: right, left"),
+@pytest.mark.parametrize(("text", "named"), [
+    ("denin", "denim"), ("weight=3", "density"), ("density=heavy", "heavy"), ("density=-1", "density"),
+    ("density=nan", "density"), ("warp_stretch=100,coupling=100", "coupling"), ("collar:silk", "right, left"),
 ])  # fmt: skip
-def test_unknown_fabrics_are_named(two_fabrics, text, message):
+def test_a_fabric_that_can_not_be_is_refused_in_one_line(two_fabrics, text, named):
     stored, garment = two_fabrics
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=named) as caught:
         garment_material([text], garment, stored)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", list(WOVEN))
@@ -147,6 +144,14 @@ def test_woven_fabrics_bear_their_coupling(name):
     assert WOVEN[name].source
 
 
+def strains_of_threads(garment, threads, scale):
+    """Return the strain along warp and weft of every face of a garment that is scaled."""
+    pulled = jnp.asarray(np.asarray(garment.rest_positions) * scale)
+    corners = gather_corners(pulled, garment.faces, garment.face_incidence)
+    along, across, _ = thread_strains(green_strains(corners, garment), threads)
+    return np.asarray(along), np.asarray(across)
+
+
 def test_woven_fabric_lies_on_the_garment_with_its_warp_up(two_fabrics):
     stored, garment = two_fabrics
     material = garment_material(["silk", "left:denim-woven"], garment, stored)
@@ -157,14 +162,10 @@ def test_woven_fabric_lies_on_the_garment_with_its_warp_up(two_fabrics):
     np.testing.assert_allclose(threads.stiffness[:, left].T, np.tile(expected, (left.sum(), 1)), rtol=1e-5)
     silk = fabric_material("silk")
     np.testing.assert_allclose(threads.stiffness[3, ~left], silk.lame_mu * silk.thickness, rtol=1e-5)
-    pulled = np.asarray(garment.rest_positions) * [1.0, 1.02, 1.0]
-    strains = green_strains(
-        gather_corners(jnp.asarray(pulled), garment.faces, garment.face_incidence), garment
-    )
-    along, across, _ = thread_strains(strains, threads)
-    steep = np.asarray(along) > 0.015  # faces of the body, which hang
+    along, across = strains_of_threads(garment, threads, [1.0, 1.02, 1.0])
+    steep = along > 0.015  # faces of the body, which hang
     assert steep.mean() > 0.3
-    assert np.abs(np.asarray(across)[steep]).max() < 0.005
+    assert np.abs(across[steep]).max() < 0.005
 
 
 def test_texture_coordinates_turn_the_warp(two_fabrics):
@@ -173,16 +174,12 @@ def test_texture_coordinates_turn_the_warp(two_fabrics):
     stored = dataclasses.replace(stored, corner_uvs=corners[:, :, [1, 0]])  # v along x
     threads = garment_material(["suiting-woven"], garment, stored).threads
     assert threads is not None
-    pulled = np.asarray(garment.rest_positions) * [1.02, 1.0, 1.0]
-    strains = green_strains(
-        gather_corners(jnp.asarray(pulled), garment.faces, garment.face_incidence), garment
-    )
-    along, across, _ = thread_strains(strains, threads)
+    along, across = strains_of_threads(garment, threads, [1.02, 1.0, 1.0])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     is_front = np.abs(normals[:, 2]) > 0.98 * np.linalg.norm(normals, axis=1)
     assert is_front.sum() > 50
-    assert np.asarray(along)[is_front].min() > 0.018
-    assert np.abs(np.asarray(across)[is_front]).max() < 0.003
+    assert along[is_front].min() > 0.018
+    assert np.abs(across[is_front]).max() < 0.003
 
 
 def test_fabric_by_flexural_rigidity(two_fabrics):
@@ -201,10 +198,3 @@ def test_a_weave_of_another_mesh_is_refused(two_fabrics):
     material = garment_material(["suiting-woven"], garment, stored)
     with pytest.raises(ConfigError, match="plate is of"):
         validate_material(material, prepare_stored(stored, pad=True))
-
-
-def test_what_networks_have_not_seen_is_named():
-    thick = COTTON.replace(thickness=np.float32(2e-3))
-    assert beyond_training(COTTON) == ()
-    assert beyond_training(thick) == ("lame_mu", "lame_lambda")
-    assert beyond_training(COTTON.replace(density=np.float32(3.0))) == ("density",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,16 +18,17 @@ from eslr_jax.errors import ConfigError, Status
 from eslr_jax.evaluation.controls import Control, control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
-from eslr_jax.evaluation.report import simulated_terms
+from eslr_jax.evaluation.report import mean_energies
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.scene.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
-from eslr_jax.types import Garment, Scene, Trajectory
+from eslr_jax.types import Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
+_REACH = 0.06  # [m] of cloth, within which a body vertex counts as covered
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +90,9 @@ def evaluate(
     scenes, forced, policy = [], [], []
     drifts: dict[str, float | None] = {}
     total = len(garments) * len(clips)
-    cloths = _load_alike(garments, options.vertices, model)
+    # Padded to one bucket: all scenes then share one compiled rollout.
+    load = partial(load_garment, vertices=options.vertices, **model.garment_options)  # type: ignore[arg-type]
+    cloths = pad_alike([load(name) for name in garments])
     if options.control is not None:
         params = control_params(options.control, params, model)
         cloths = [control_garment(options.control, cloth) for cloth in cloths]
@@ -105,28 +109,27 @@ def evaluate(
                 on_truth, on_policy = _gaps(params, scene_of(options.gap_frames), config, options.every)
                 forced.append(on_truth)
                 policy.append(on_policy)
-            free = _free_rollout(params, scene_of(options.rollout_frames), config)
-            scenes.append({"garment": garment, "clip": clip, **free})
+            scene = scene_of(options.rollout_frames)
+            free = _roll(params, scene, config)
+            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
+            apart = distance_mm(free, optimum, scene)
+            row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
+            scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
         resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
         drifts[garment] = _drift(params, resting, config)
+    known = [drift for drift in drifts.values() if drift is not None]
+    largest = max(known) if len(known) == len(drifts) else None
     return {
         "split": None if options.clips else options.split,
         "vertices": options.vertices,
         "garments": list(garments),
         "clips": list(clips),
         **({**_summarize(forced), "on_policy": _summarize(policy)} if forced else {}),
-        "rollout": _pool_rollouts(scenes) | _pool_drifts(drifts),
+        "rollout": _pool_rollouts(scenes) | {"drift_mm_s": largest, "drift_mm_s_of": drifts},
         "scenes": scenes,
     }
-
-
-def _load_alike(names: tuple[str, ...], vertices: str, model: ModelConfig) -> list[Garment]:
-    """Load garments padded to one bucket: all scenes then share one compiled rollout."""
-    return pad_alike(
-        [load_garment(name, vertices=vertices, **model.garment_options) for name in names]  # type: ignore[arg-type]
-    )
 
 
 def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[OptimalityGap, OptimalityGap]:
@@ -159,19 +162,6 @@ def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
     }
 
 
-def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any]:
-    """Return the measures of one free rollout, beside those of the solver's on the same scene."""
-    trajectory = _roll(params, scene, config)
-    measured = measure_rollout(trajectory, scene)
-    near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
-    reference = _roll(None, scene, near_optimum)
-    return {
-        **measured,
-        "distance_mm": distance_mm(trajectory, reference, scene),
-        "optimum": measure_rollout(reference, scene),
-    }
-
-
 def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> float:
     """Return how far two rollouts of a scene are apart: mean over vertices and simulated frames [mm]."""
     apart = np.asarray(trajectory.positions)[1:] - np.asarray(reference.positions)[1:]
@@ -181,10 +171,6 @@ def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> 
 def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     """Return plain measures of a trajectory; `num_frames` are those before the first bad one.
 
-    Args:
-        trajectory: What is measured.
-        scene: Its scene.
-
     Raises:
         ConfigError: The scene has no body, against which penetration and coverage are measured.
     """
@@ -193,18 +179,17 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
-    terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}
-    body = np.asarray(scene.body.positions)
     jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
+    skin = np.asarray(scene.body.positions)[-1]
+    apart, _ = cKDTree(positions[-1]).query(skin, distance_upper_bound=_REACH)
     return {
         "finite": bool(np.isfinite(positions).all())
         and Status.NON_FINITE not in Status(int(trajectory.status)),
         "num_frames": good_frames(trajectory).num_frames,
-        "terms": terms,
-        "total": sum(terms.values()),
+        **mean_energies(trajectory),
         **extremes(measures, is_real),
         "jitter_m_s3": float(np.median(np.linalg.norm(jerk, axis=-1))),
-        "coverage": _coverage(positions[-1], body[-1]),
+        "coverage": float(np.isfinite(apart).mean()),
     }
 
 
@@ -221,19 +206,6 @@ def _drift(params: Any, scene: Scene, config: SimConfig) -> float | None:
     frames = round(1.0 / float(scene.timestep))
     moved = centre[-1] - centre[-1 - frames]
     return float(np.hypot(moved[0], moved[2]) * 1e3)
-
-
-def _coverage(cloth: np.ndarray, body: np.ndarray, reach: float = 0.06) -> float:
-    """Return the share of the reachable body vertices that lie within `reach` [m] of the cloth."""
-    distance, _ = cKDTree(cloth).query(body, distance_upper_bound=reach)
-    return float(np.isfinite(distance).mean())
-
-
-def _pool_drifts(drifts: dict[str, float | None]) -> dict[str, Any]:
-    """Return the largest drift, and that of every garment [mm/s]; None stands for a rollout that went wrong."""
-    known = [drift for drift in drifts.values() if drift is not None]
-    largest = max(known) if len(known) == len(drifts) else None
-    return {"drift_mm_s": largest, "drift_mm_s_of": drifts}
 
 
 def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:

@@ -53,9 +53,7 @@ def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -
 def extremes(measures: FrameMeasures, is_real: np.ndarray) -> dict[str, float]:
     """Return the largest stretch that 99 % of the frames stay below, and the penetration of a scene with a body.
 
-    Args:
-        measures: Of a trajectory.
-        is_real: Which vertices are no padding, shape [vertices].
+    `is_real` tells which vertices are no padding, shape [vertices].
     """
     depth = -np.asarray(measures.distances)[:, is_real]
     stretch = float(np.quantile(measures.max_stretch, 0.99))

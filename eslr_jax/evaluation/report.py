@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from eslr_jax.evaluation.metrics import FrameMeasures, face_stretches, measure_frames, penetration_p999_mm
-from eslr_jax.geometry.closest import closest_points
+from eslr_jax.evaluation.metrics import face_stretches, measure_frames, penetration_p999_mm
+from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.crossing import find_crossings
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.garment import split_outfit
@@ -52,62 +52,69 @@ def trajectory_report(
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
         any, of every tenth simulated frame and the last; None where self-contact is not modelled.
     """
-    measures: FrameMeasures = jax.device_get(measure_frames(trajectory.positions, scene))
+    measures = jax.device_get(measure_frames(trajectory.positions, scene))
     trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
     is_real = np.asarray(scene.garment.vertex_mask)
     positions = np.asarray(trajectory.positions)[:, is_real]
-    terms = {name: float(np.mean(values)) for name, values in simulated_terms(trajectory).items()}
-    report: dict[str, Any] = {
-        "finite": bool(np.isfinite(positions).all()),
-        "num_frames": trajectory.num_frames,
-        "num_vertices": int(is_real.sum()),
-        "terms": terms,
-        "total": sum(terms.values()),
-        "max_principal_stretch": float(measures.max_stretch.max()),
-        "p99_principal_stretch": float(measures.p99_stretch.max()),
-        "start_principal_stretch": float(_stretches(trajectory, scene, 0).max()),
-        "worst_stretch": _worst_stretch(trajectory, scene, int(np.argmax(measures.max_stretch)) + 1, parts),
-        "penetration_p999_mm": None,
-        "penetration_max_mm": None,
-        "penetrating_share": None,
-        "worst_penetration": None,
-        "rms_speed_m_s": float(measures.speed.mean()),
-        "residual_median": float(np.median(trajectory.residuals[1:])),
-        "iterations_mean": float(np.mean(trajectory.iterations[1:])),
-    }
-    depth = None
+
+    def stretches(frame: int) -> np.ndarray:
+        return np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
+
+    depth, worst = None, None
     if measures.distances is not None:
         depth = -measures.distances[:, is_real]
         if poses is not None:
             depth = _measured_again(depth, positions[1:], poses)
-        report["penetration_p999_mm"] = penetration_p999_mm(depth)
-        report["penetration_max_mm"] = float(max(depth.max(), 0.0) * 1e3)
-        report["penetrating_share"] = float((depth > 0).mean())
         if depth.max() > 0:
             frame, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
-            vertex = int(np.flatnonzero(is_real)[column])
-            report["worst_penetration"] = _place(int(frame) + 1, vertex, scene, parts)
+            worst = _place(int(frame) + 1, int(np.flatnonzero(is_real)[column]), scene, parts)
+    stretched = int(np.argmax(measures.max_stretch)) + 1
+    torn = int(np.asarray(scene.garment.faces)[stretches(stretched).argmax(), 0])
     several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
-    report["garments"] = None if several is None else _garments(trajectory, scene, depth, several)
-    return report | _crossings(trajectory, scene, parts)
+    return {
+        "finite": bool(np.isfinite(positions).all()),
+        "num_frames": trajectory.num_frames,
+        "num_vertices": int(is_real.sum()),
+        **mean_energies(trajectory),
+        "max_principal_stretch": float(measures.max_stretch.max()),
+        "p99_principal_stretch": float(measures.p99_stretch.max()),
+        "start_principal_stretch": float(stretches(0).max()),
+        "worst_stretch": _place(stretched, torn, scene, parts),
+        "penetration_p999_mm": None if depth is None else penetration_p999_mm(depth),
+        **_penetration(depth),
+        "worst_penetration": worst,
+        "rms_speed_m_s": float(measures.speed.mean()),
+        "residual_median": float(np.median(trajectory.residuals[1:])),
+        "iterations_mean": float(np.mean(trajectory.iterations[1:])),
+        "garments": None if several is None else _garments(trajectory, scene, depth, several),
+        **_crossings(trajectory, scene, parts),
+    }
+
+
+def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
+    """Return the largest of depths in a body [m], and the share that is inside; None without a body."""
+    return {
+        "penetration_max_mm": None if depth is None else float(max(depth.max(), 0.0) * 1e3),
+        "penetrating_share": None if depth is None else float((depth > 0).mean()),
+    }
 
 
 def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
     """Return where cloth passes through cloth in spite of self-contact."""
-    found: dict[str, Any] = {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
     if scene.self_contact is None:
-        return found
+        return {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
     faces = _real_faces(scene)
     last = trajectory.num_frames - 1
     frames = sorted({*range(_EVERY, last, _EVERY), last})
     pairs = [find_crossings(np.asarray(trajectory.positions[frame]), faces).faces for frame in frames]
     counts = [len(rows) for rows in pairs]
     worst = int(np.argmax(counts))
-    found |= {"crossing_pairs": counts[worst], "crossing_share": float(np.mean(np.array(counts) > 0))}
-    if counts[worst]:
-        vertex = int(faces[pairs[worst][0, 0], 0])
-        found["worst_crossing"] = _place(frames[worst], vertex, scene, parts)
-    return found
+    vertex = int(faces[pairs[worst][0, 0], 0]) if counts[worst] else None
+    return {
+        "crossing_pairs": counts[worst],
+        "crossing_share": float(np.mean(np.array(counts) > 0)),
+        "worst_crossing": None if vertex is None else _place(frames[worst], vertex, scene, parts),
+    }
 
 
 def _real_faces(scene: Scene) -> np.ndarray:
@@ -146,24 +153,18 @@ def _garments(
 ) -> dict[str, dict[str, Any]]:
     """Return stretch and penetration of the garments of an outfit, as the report has them of the whole.
 
-    Args:
-        trajectory: What to measure.
-        scene: Its scene.
-        depth: Inside the body [m], of real vertices in simulated frames; None without a body.
-        outfit: Numbers of vertices, by name and in order.
+    `depth` is that of real vertices in simulated frames [m], None without a body.
     """
     stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))
     is_face = np.asarray(scene.garment.rest_areas) > 0
     found: dict[str, dict[str, Any]] = {}
     for name, rows, is_own in split_outfit(np.asarray(scene.garment.faces), outfit):
         stretch = stretches[:, is_own & is_face]
-        own = None if depth is None else depth[:, rows]
         found[name] = {
             "num_vertices": outfit[name],
             "p99_principal_stretch": float(np.quantile(stretch, 0.99, axis=1, method="lower").max()),
             "max_principal_stretch": float(stretch.max()),
-            "penetration_max_mm": None if own is None else float(max(own.max(), 0.0) * 1e3),
-            "penetrating_share": None if own is None else float((own > 0).mean()),
+            **_penetration(None if depth is None else depth[:, rows]),
         }
     return found
 
@@ -172,32 +173,15 @@ def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion)
     """Return depths [m], shape [frames, vertices], with the large ones as they are in the whole body.
 
     Contacts are searched among the faces in reach, approximately. Where that part ends, they may be far off.
-
-    Args:
-        depth: Depths as the contacts have them.
-        positions: Vertices of the same frames [m], shape [frames, vertices, 3].
-        poses: The body; one frame more, the first.
+    `positions` are of the same frames; the body has one more, the first.
     """
     faces, depth = np.asarray(poses.faces), np.array(depth)
     for frame in np.flatnonzero((depth > _DEEP).any(axis=1)):
         body, deep = np.asarray(poses.positions[frame + 1]), np.flatnonzero(depth[frame] > _DEEP)
-        nearest, weights = closest_points(positions[frame, deep], body, faces)
-        corners = faces[nearest]
-        away = positions[frame, deep] - np.einsum("pk,pkx->px", weights, body[corners])
-        outward = np.einsum("pk,pkx->px", weights, vertex_normals(body, faces)[corners])
-        depth[frame, deep] = -np.sign(np.sum(away * outward, axis=1)) * np.linalg.norm(away, axis=1)
+        place = nearest_places(positions[frame, deep], body, faces, vertex_normals(body, faces))
+        is_outside = np.einsum("px,px->p", place.offsets, place.normals) > 0
+        depth[frame, deep] = np.where(is_outside, -1, 1) * np.linalg.norm(place.offsets, axis=1)
     return depth
-
-
-def _worst_stretch(trajectory: Trajectory, scene: Scene, frame: int, parts: Parts) -> dict[str, Any]:
-    """Return where a frame is stretched most."""
-    stretch = _stretches(trajectory, scene, frame)
-    return _place(frame, int(np.asarray(scene.garment.faces)[stretch.argmax(), 0]), scene, parts)
-
-
-def _stretches(trajectory: Trajectory, scene: Scene, frame: int) -> np.ndarray:
-    """Return the larger principal stretch of every face in a frame, shape [faces]."""
-    return np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
 
 
 def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any]:
@@ -210,27 +194,25 @@ def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any
     return {"frame": frame, "time_s": frame * float(scene.timestep), "vertex": vertex, "part": part}
 
 
-def simulated_terms(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the energies of every simulated frame by name [J], each of shape [frames - 1]."""
-    return {name: np.asarray(values)[1:] for name, values in trajectory.energies.items()}
+def mean_energies(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the energies as means over simulated frames by name [J], `terms`, and their `total`."""
+    means = {name: float(np.mean(np.asarray(values)[1:])) for name, values in trajectory.energies.items()}
+    return {"terms": means, "total": sum(means.values())}
 
 
 def environment() -> dict[str, Any]:
     """Return the device and the versions that a figure was measured with."""
     device = jax.devices()[0]
-    kind = device.device_kind if device.platform != "cpu" else f"{platform.machine()}, {_processor()}"
+    kind = device.device_kind
+    if device.platform == "cpu":
+        try:
+            lines = Path("/proc/cpuinfo").read_text().splitlines()
+        except OSError:  # not Linux
+            lines = []
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        kind = f"{platform.machine()}, {names[0] if names else platform.processor()}"
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {
         "device": f"{device.platform}: {kind}",
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
-        | {"python": platform.python_version()},
+        "versions": versions | {"python": platform.python_version()},
     }
-
-
-def _processor() -> str:
-    """Return the name of the CPU, as far as the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:  # not Linux
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()

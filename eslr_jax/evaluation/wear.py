@@ -64,10 +64,6 @@ def wear_report(
         "slide_m": float(slides[farthest]),
         "worst_slide": {"frame": farthest, "time_s": farthest * timestep},
         "below_feet_at": int(is_below.argmax()) if is_below.any() else None,
-        "coverage": None,
-        "skin_through_mm": None,
-        "skin_through_share": None,
-        "worst_skin_through": None,
     }
     skin = np.unique(skin_faces[np.asarray(poses.is_obstacle)])
     hem = is_on_boundary(faces, cloth.shape[1])
@@ -76,7 +72,8 @@ def wear_report(
     side, distance, _ = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
     covered = skin[(side < 0) & (distance < _COVER)]
     if not len(covered):
-        return result
+        unknown = ("coverage", "skin_through_mm", "skin_through_share", "worst_skin_through")
+        return result | dict.fromkeys(unknown)
     frames = sorted({*range(0, len(cloth), _EVERY), len(cloth) - 1})
     through, shares, fronts = [], [], []
     for frame in frames:
@@ -88,25 +85,21 @@ def wear_report(
         fronts.append(nearest)
     depth = np.stack(through)
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-    result |= {
-        "coverage": min(shares),
-        "skin_through_mm": float(depth.max() * 1e3),
-        "skin_through_share": float(np.mean(depth > _VISIBLE)),
-    }
+    worst = None
     if depth.max() > 0:
-        result["worst_skin_through"] = {
+        (owners, names), face = parts, np.flatnonzero(is_face)[fronts[row][column]]
+        worst = {
             "frame": frames[row],
             "time_s": frames[row] * timestep,
             "body_vertex": int(covered[column]),
-            "part": _part(np.flatnonzero(is_face)[fronts[row][column]], parts),
+            "part": names[owners[face]] if owners is not None and names else None,
         }
-    return result
-
-
-def _part(face: int, parts: Parts) -> str | None:
-    """Return the name of a face's part, if parts are known."""
-    owners, names = parts
-    return names[owners[face]] if owners is not None and names else None
+    return result | {
+        "coverage": min(shares),
+        "skin_through_mm": float(depth.max() * 1e3),
+        "skin_through_share": float(np.mean(depth > _VISIBLE)),
+        "worst_skin_through": worst,
+    }
 
 
 def _sides(

@@ -27,65 +27,57 @@ def describe_report(report: dict[str, Any]) -> Words:
         report: Values of `trajectory_report`, of `wear_report`, and the `tolerance` that was asked for with the
             share of frames within it, `within_tolerance`.
     """
-    words = Words([], [])
+    good, warnings = words = Words([], [])
     if report["error"] is not None:
-        words.warnings.append(report["error"])
+        warnings.append(report["error"])
     if report["tolerance"] is not None:
-        _describe_tolerance(report, words)
-    _describe_penetration(report, words)
-    _describe_layers(report, words)
-    _describe_place(report, words)
-    stretch, most = report["max_principal_stretch"], report["p99_principal_stretch"]
-    text = f"cloth is stretched by {100 * (most - 1):.0f} % (99 % of it), {100 * (stretch - 1):.0f} % at most"
-    if most > _STRETCH or stretch > _TORN:
-        words.warnings.append(f"{text}, {_where(report['worst_stretch'])}")
-    else:
-        words.good.append(text)
-    return words
+        tolerance, late = 100 * report["tolerance"], 100 * (1 - report["within_tolerance"])
+        if late:
+            warnings.append(
+                f"{late:.1f} % of the frames ended before they were within a gap of {tolerance:g} %"
+            )
+        else:
+            good.append(f"within a gap of {tolerance:g} % on every frame")
 
-
-def _describe_tolerance(report: dict[str, Any], words: Words) -> None:
-    """Say in how many frames a tolerance was kept."""
-    tolerance, share = 100 * report["tolerance"], report["within_tolerance"]
-    if share == 1.0:
-        words.good.append(f"within a gap of {tolerance:g} % on every frame")
-    else:
-        words.warnings.append(
-            f"{100 * (1 - share):.1f} % of the frames ended before they were within a gap of {tolerance:g} %"
-        )
-
-
-def _describe_penetration(report: dict[str, Any], words: Words) -> None:
-    """Say how deep cloth is in the body, and skin in front of cloth."""
-    depth, through = report["penetration_max_mm"], report["skin_through_mm"]
+    depth, through, pairs = (
+        report[name] for name in ("penetration_max_mm", "skin_through_mm", "crossing_pairs")
+    )
     if depth is not None and depth > _PENETRATION_MM:
         place = _where(report["worst_penetration"])
-        words.warnings.append(f"cloth is up to {depth:.1f} mm inside the body, {place}")
-    elif depth:
-        words.good.append(f"no vertex deeper than {depth:.2g} mm inside the body")
+        warnings.append(f"cloth is up to {depth:.1f} mm inside the body, {place}")
     elif depth is not None:
-        words.good.append("no vertex inside the body")
+        good.append(f"no vertex {f'deeper than {depth:.2g} mm ' if depth else ''}inside the body")
     if through is not None and through > _THROUGH_MM:
-        place, share = _where(report["worst_skin_through"]), report["skin_through_share"]
-        words.warnings.append(
-            f"skin shows through the cloth, by up to {through:.1f} mm, {place}; "
-            f"{100 * share:.2f} % of the covered skin"
-        )
+        share = f"{100 * report['skin_through_share']:.2f} % of the covered skin"
+        place = _where(report["worst_skin_through"])
+        warnings.append(f"skin shows through the cloth, by up to {through:.1f} mm, {place}; {share}")
     elif through is not None:
-        words.good.append("no skin shows through the cloth")
-
-
-def _describe_layers(report: dict[str, Any], words: Words) -> None:
-    """Say whether cloth passes through cloth, where that is kept from it."""
-    pairs = report["crossing_pairs"]
+        good.append("no skin shows through the cloth")
     if pairs:
-        place, share = _where(report["worst_crossing"]), report["crossing_share"]
-        words.warnings.append(
-            f"cloth passes through cloth: {pairs} pairs of faces intersect, {place}; "
-            f"in {100 * share:.0f} % of the frames that were looked at"
-        )
+        share = f"in {100 * report['crossing_share']:.0f} % of the frames that were looked at"
+        place = _where(report["worst_crossing"])
+        warnings.append(f"cloth passes through cloth: {pairs} pairs of faces intersect, {place}; {share}")
     elif pairs is not None:
-        words.good.append("no cloth passes through cloth")
+        good.append("no cloth passes through cloth")
+
+    slide, frame, coverage = report["slide_m"], report["below_feet_at"], report["coverage"]
+    if frame is not None:
+        warnings.append(f"the garment fell off: in frame {frame} it is below the feet")
+    elif slide > _SLID_M:
+        place = _where(report["worst_slide"])
+        warnings.append(f"the garment slid or fell: its centre is {slide:.2f} m from its place, {place}")
+    elif coverage is not None and coverage < _LEFT:
+        warnings.append(f"the garment left skin that it covered: {100 * (1 - coverage):.0f} % of it")
+    else:
+        good.append("the garment stays where it was put on")
+
+    most, largest = report["p99_principal_stretch"], report["max_principal_stretch"]
+    text = f"cloth is stretched by {100 * (most - 1):.0f} % (99 % of it), {100 * (largest - 1):.0f} % at most"
+    if most > _STRETCH or largest > _TORN:
+        warnings.append(f"{text}, {_where(report['worst_stretch'])}")
+    else:
+        good.append(text)
+    return words
 
 
 def describe_start(crossing: dict[str, Any] | None, *, is_put_on: bool) -> str | None:
@@ -105,22 +97,6 @@ def describe_start(crossing: dict[str, Any] | None, *, is_put_on: bool) -> str |
         f"{z:.2f} m, {place}, with {crossing['crossing_pairs']} pairs of faces. What is deeper than "
         f"{_UNTANGLED_MM:.0f} mm may stay: {'' if is_put_on else other}mend the garment there"
     )
-
-
-def _describe_place(report: dict[str, Any], words: Words) -> None:
-    """Say whether the garment is where it was put on."""
-    slide, frame, coverage = report["slide_m"], report["below_feet_at"], report["coverage"]
-    if frame is not None:
-        words.warnings.append(f"the garment fell off: in frame {frame} it is below the feet")
-    elif slide > _SLID_M:
-        place = _where(report["worst_slide"])
-        words.warnings.append(
-            f"the garment slid or fell: its centre is {slide:.2f} m from its place, {place}"
-        )
-    elif coverage is not None and coverage < _LEFT:
-        words.warnings.append(f"the garment left skin that it covered: {100 * (1 - coverage):.0f} % of it")
-    else:
-        words.good.append("the garment stays where it was put on")
 
 
 def _where(place: dict[str, Any], moment: str | None = None) -> str:

@@ -1,7 +1,6 @@
 """Pictures and video without a display or a GPU (extra `render`)."""
 
-from eslr_jax.render.annotate import add_color_bar, side_by_side, write_label
-from eslr_jax.render.colors import color_scale
+from eslr_jax.render.annotate import add_color_bar, color_scale, side_by_side, write_label
 from eslr_jax.render.files import write_png, write_video
 from eslr_jax.render.pictures import contact_sheet, moment_text, render_frame, render_frames
 

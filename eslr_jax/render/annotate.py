@@ -1,27 +1,38 @@
-"""Text on pictures, colour bars beside them, and pictures in rows."""
+"""Numbers as colours, text and colour bars on pictures, and pictures in rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from eslr_jax.extras import require
-from eslr_jax.render.colors import color_scale
 
+# Eight evenly spaced colours of viridis (matplotlib, CC0): even in lightness, and legible to the colour-blind.
+_VIRIDIS = np.array([
+    (0.267, 0.005, 0.329), (0.275, 0.195, 0.496), (0.213, 0.359, 0.552), (0.153, 0.497, 0.558),
+    (0.122, 0.632, 0.531), (0.290, 0.759, 0.428), (0.622, 0.854, 0.226), (0.993, 0.906, 0.144),
+])  # fmt: skip
 _INK = (60, 60, 66)  # sRGB bytes
 _PAPER = 255
 _GAP = 4  # [pixels] between pictures
 _LEAST_TEXT = 14  # [pixels] high; smaller is not read on a scaled sheet
 
 
-def write_label(picture: np.ndarray, text: str) -> np.ndarray:
-    """Return a picture with a small text in its upper left corner.
+def color_scale(
+    values: Float[np.ndarray, "*shape"], low: float, high: float
+) -> Float[np.ndarray, "*shape 3"]:
+    """Return sRGB colours in [0, 1], dark blue at `low` and below or for NaN, yellow at `high` and above."""
+    share = np.nan_to_num((np.asarray(values, np.float64) - low) / max(high - low, 1e-30))
+    position = np.clip(share, 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    below = np.minimum(position.astype(int), len(_VIRIDIS) - 2)
+    blend = (position - below)[..., None]
+    return ((1.0 - blend) * _VIRIDIS[below] + blend * _VIRIDIS[below + 1]).astype(np.float32)
 
-    Args:
-        picture: sRGB picture, uint8, shape [height, width, 3].
-        text: One line.
-    """
+
+def write_label(picture: np.ndarray, text: str) -> np.ndarray:
+    """Return a picture, uint8 [height, width, 3], with a line of text in its upper left corner."""
     image = require("PIL.Image").fromarray(picture)
     height = max(_LEAST_TEXT, picture.shape[0] // 26)
     _draw_text(image, (height // 2, height // 3), text, height)
@@ -32,13 +43,10 @@ def add_color_bar(picture: np.ndarray, low: float, high: float, title: str) -> n
     """Return a picture with a colour bar under it.
 
     Args:
-        picture: sRGB picture, uint8, shape [height, width, 3].
+        picture: sRGB picture, uint8, shape [height, width, 3]; the bar makes it higher.
         low: Value of the bar's left end.
         high: Value of its right end.
         title: What is shown, with its unit.
-
-    Returns:
-        sRGB picture, uint8, shape [height + bar, width, 3].
     """
     width = picture.shape[1]
     height = int(np.clip(width // 24, 10, 16))  # of the text and of the bar [pixels]

@@ -29,10 +29,7 @@ class Camera:
 
 
 def parse_angle(camera: str | float) -> float:
-    """Turn a camera's name or its angle in degrees into an angle in radians.
-
-    Args:
-        camera: "front", "side" (the subject's left), "back", or degrees from the front towards the left.
+    """Return an angle [rad] from "front", "side" (the subject's left), "back", or degrees from front to left.
 
     Raises:
         ConfigError: If the name is unknown or the angle is not finite.
@@ -51,11 +48,7 @@ def facing_angles(
 ) -> Float[np.ndarray, " frames"]:
     """Return where a body faces in every frame, around +Y from +Z towards +X [rad], without jumps of a turn.
 
-    It is the turn about the vertical that brings the resting body closest to the posed one.
-
-    Args:
-        positions: Body vertices [m], shape [frames, vertices, 3].
-        rest_positions: The same vertices of a body that faces +Z [m], shape [vertices, 3].
+    It is the turn about the vertical that brings the resting body, which faces +Z, closest to the posed one.
     """
     rest = rest_positions - rest_positions.mean(axis=0)
     posed = positions - positions.mean(axis=1, keepdims=True)
@@ -72,7 +65,7 @@ def follow(
     zoom: float = 1.0,
     focus: Float[np.ndarray, "frames points 3"] | None = None,
 ) -> tuple[list[Camera], float]:
-    """Place a camera per frame that keeps the subject in the middle at one distance.
+    """Place a camera per frame that keeps the subject in the middle, and sees all of it, at one distance.
 
     Args:
         subject: Vertices of what is to be seen [m], shape [frames, vertices, 3].
@@ -89,34 +82,17 @@ def follow(
     centers[:, 1] = (floor + top) / 2
     offsets = subject - centers[:, None]
     radius = float(np.hypot(offsets[..., 0], offsets[..., 2]).max())
+    half_view = math.atan(math.tan(_VIEW_ANGLE / 2) / max(aspect, 1.0))
+    # An upright cylinder around the subject is seen whole, from whatever side.
+    half_needed = max((top - floor) / 2 + radius * math.sin(_ELEVATION), radius / aspect, 1e-3)
+    distance = _MARGIN * half_needed / math.tan(half_view)
+    zoomed_view, level = 2 * math.atan(math.tan(half_view) / zoom), math.cos(_ELEVATION)
+    cameras = []
     targets = _calm(centers if focus is None else focus.mean(axis=1))
-    cameras = [
-        place_camera(target, (top - floor) / 2, radius, angle, aspect, zoom=zoom)
-        for target, angle in zip(targets, _calm(angles), strict=True)
-    ]
+    for target, angle in zip(targets, _calm(angles), strict=True):
+        direction = np.array([math.sin(angle) * level, math.sin(_ELEVATION), math.cos(angle) * level])
+        cameras.append(Camera(target + distance * direction, target, zoomed_view, float(angle)))
     return cameras, floor
-
-
-def place_camera(
-    center: np.ndarray, half_height: float, radius: float, angle: float, aspect: float, *, zoom: float = 1.0
-) -> Camera:
-    """Return a camera that looks at an upright cylinder and sees all of it, from whatever side.
-
-    Args:
-        center: Centre of the cylinder [m], shape [3].
-        half_height: Half its height [m].
-        radius: Its radius [m].
-        angle: Direction of the camera around +Y, from +Z towards +X [rad].
-        aspect: Picture width over height.
-        zoom: How many times larger than the whole cylinder in the picture.
-    """
-    view_angle = 2 * math.atan(math.tan(_VIEW_ANGLE / 2) / max(aspect, 1.0))
-    half_needed = max(half_height + radius * math.sin(_ELEVATION), radius / aspect, 1e-3)
-    distance = _MARGIN * half_needed / math.tan(view_angle / 2)
-    level = math.cos(_ELEVATION)
-    direction = np.array([math.sin(angle) * level, math.sin(_ELEVATION), math.cos(angle) * level])
-    narrowed = 2 * math.atan(math.tan(view_angle / 2) / zoom)
-    return Camera(center + distance * direction, np.asarray(center), narrowed, float(angle))
 
 
 def _calm(values: np.ndarray) -> np.ndarray:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from eslr_jax.body.clothing import Piece, body_pieces
+from eslr_jax.body.clothing import body_pieces
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
 from eslr_jax.extras import require
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.palette import GARMENT_COLORS
-from eslr_jax.io.skin import Skin
 from eslr_jax.render.annotate import side_by_side
-from eslr_jax.render.camera import Camera, facing_angles, follow, parse_angle
+from eslr_jax.render.camera import facing_angles, follow, parse_angle
 from eslr_jax.render.scene import Surface, trace_picture
 from eslr_jax.types import Body
 
@@ -71,40 +70,44 @@ def render_frames(
         MissingExtraError: If the extra `render` is not installed.
     """
     angle = parse_angle(camera)
-    _check_picture(size, samples, zoom)
+    if min(size) < 1 or max(size) > _MAX_SIZE:
+        raise ConfigError(f"picture size is {size[0]} x {size[1]}; use 1 to {_MAX_SIZE} pixels")
+    if samples < 1:
+        raise ConfigError(f"samples is {samples}; use 1 or more")
+    if not 1 / _MAX_ZOOM <= zoom <= _MAX_ZOOM:
+        raise ConfigError(f"zoom is {zoom}; use {1 / _MAX_ZOOM:g} to {_MAX_ZOOM:g}")
     require("mitsuba")
-    garment = _checked_mesh("garment", garment_positions, garment_faces)
-    body = None if body_positions is None else _checked_mesh("body", body_positions, body_faces)
-    if body is not None and len(body.positions) != len(garment.positions):
+    cloth, cloth_faces = _checked_mesh("garment", garment_positions, garment_faces)
+    num_frames, num_vertices, _ = cloth.shape
+    subject, angles, pieces = cloth, np.full(num_frames, angle), []
+    if body_positions is not None:
+        subject, skin_faces = _checked_mesh("body", body_positions, body_faces)
+        if len(subject) != num_frames:
+            raise MeshError(f"body has {len(subject)} frames and garment has {num_frames}; they must agree")
+        rest = subject[0] if rest_positions is None else np.asarray(rest_positions)
+        pieces = body_pieces(rest, skin_faces, None if rest_positions is None else rig)
+        if rest_positions is not None and follows:
+            angles += facing_angles(subject, rest)
+    colors = np.asarray(garment_color if vertex_colors is None else vertex_colors, np.float32)
+    if vertex_colors is not None and colors.shape not in ((num_vertices, 3), cloth.shape):
         raise MeshError(
-            f"body has {len(body.positions)} frames and garment has {len(garment.positions)}; they must agree"
+            f"vertex_colors have shape {colors.shape}; they must be [{num_vertices}, 3] or "
+            f"[{num_frames}, {num_vertices}, 3]"
         )
-    colors = _frame_colors(garment, garment_color, vertex_colors)
-    angles = np.full(len(garment.positions), angle)
-    if body is not None and rest_positions is not None and follows:
-        angles += facing_angles(body.positions, np.asarray(rest_positions))
-    subject = garment if body is None else body
-    focus = garment.positions if zoom > 1 else None
-    cameras, ground_height = follow(
-        subject.positions, angles, aspect=size[0] / size[1], zoom=zoom, focus=focus
-    )
-    indices = range(len(garment.positions)) if frame_indices is None else list(frame_indices)
+    colors = np.broadcast_to(colors, cloth.shape)
+    focus = cloth if zoom > 1 else None
+    cameras, ground_height = follow(subject, angles, aspect=size[0] / size[1], zoom=zoom, focus=focus)
 
-    pieces: list[Piece] = []
-    if body is not None and rest_positions is not None:
-        pieces = body_pieces(np.asarray(rest_positions), body.faces, rig)
-    elif body is not None:
-        pieces = body_pieces(body.positions[0], body.faces, None)
-
-    def trace(index: int, view: Camera) -> np.ndarray:
-        surfaces = [Surface("garment", garment.positions[index], garment.faces, colors[index], True)]
+    def trace(index: int) -> np.ndarray:
+        surfaces = [Surface("garment", cloth[index], cloth_faces, colors[index], True)]
         for piece in pieces:
-            assert body is not None
-            place = piece.place(body.positions[index])
+            place = piece.place(subject[index])
             surfaces.append(Surface(f"body {piece.name}", place, piece.faces, piece.color, False))
-        return trace_picture(surfaces, view, ground_height=ground_height, size=size, samples=samples)
+        return trace_picture(
+            surfaces, cameras[index], ground_height=ground_height, size=size, samples=samples
+        )
 
-    return (trace(index, cameras[index]) for index in indices)
+    return map(trace, range(num_frames) if frame_indices is None else list(frame_indices))
 
 
 def render_frame(
@@ -116,21 +119,9 @@ def render_frame(
     vertex_colors: np.ndarray | None = None,
     **options: Any,
 ) -> np.ndarray:
-    """Render one picture.
+    """Render one picture, [height, width, 3].
 
-    Args:
-        body_positions: Body vertex positions [m], shape [body_vertices, 3]; None without a body.
-        body_faces: Body triangles, shape [body_faces, 3]; None without a body.
-        garment_positions: Garment vertex positions [m], shape [vertices, 3].
-        garment_faces: Garment triangles, shape [faces, 3].
-        vertex_colors: sRGB in [0, 1] per garment vertex, shape [vertices, 3].
-        options: Passed on to `render_frames`.
-
-    Returns:
-        sRGB picture, uint8, shape [height, width, 3].
-
-    Raises:
-        EslrError: See `render_frames`.
+    Arguments and errors are those of `render_frames`; positions and colours have no axis of frames.
     """
     frames = render_frames(
         None if body_positions is None else np.asarray(body_positions)[None],
@@ -158,11 +149,13 @@ def contact_sheet(
 ) -> np.ndarray:
     """Render frames spread evenly over a motion, first and last included, into one picture.
 
+    The meshes are given as for `render_frames`.
+
     Args:
-        body_positions: Body vertex positions [m], shape [frames, body_vertices, 3]; None without a body.
-        body_faces: Body triangles, shape [body_faces, 3]; None without a body.
-        garment_positions: Garment vertex positions [m], shape [frames, vertices, 3].
-        garment_faces: Garment triangles, shape [faces, 3].
+        body_positions: Of the body, or None.
+        body_faces: Of the body, or None.
+        garment_positions: Of the garment.
+        garment_faces: Of the garment.
         num_frames: How many pictures, or fewer when the motion is shorter.
         columns: Pictures per row.
         size: Width and height of one picture [pixels].
@@ -205,26 +198,10 @@ def moment_text(frame: int, timestep: float) -> str:
     return f"{frame}  {frame * timestep:.2f} s"
 
 
-@dataclasses.dataclass(frozen=True)
-class _Moving:
-    """A checked mesh over time."""
-
-    positions: np.ndarray  # [frames, vertices, 3], [m]
-    faces: np.ndarray  # [faces, 3]
-
-
-def _check_picture(size: tuple[int, int], samples: int, zoom: float) -> None:
-    """Raise ConfigError unless such a picture can be made."""
-    if min(size) < 1 or max(size) > _MAX_SIZE:
-        raise ConfigError(f"picture size is {size[0]} x {size[1]}; use 1 to {_MAX_SIZE} pixels")
-    if samples < 1:
-        raise ConfigError(f"samples is {samples}; use 1 or more")
-    if not 1 / _MAX_ZOOM <= zoom <= _MAX_ZOOM:
-        raise ConfigError(f"zoom is {zoom}; use {1 / _MAX_ZOOM:g} to {_MAX_ZOOM:g}")
-
-
-def _checked_mesh(name: str, positions: np.ndarray, faces: np.ndarray | None) -> _Moving:
-    """Raise a named error unless positions and faces form a finite animated mesh."""
+def _checked_mesh(
+    name: str, positions: np.ndarray, faces: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and faces; raise a named error unless they form a finite animated mesh."""
     points, triangles = np.asarray(positions, np.float32), np.asarray(faces)
     if points.ndim != 3 or points.shape[2] != 3 or 0 in points.shape:
         raise MeshError(f"{name} positions have shape {points.shape}; they must be [frames, vertices, 3]")
@@ -238,20 +215,4 @@ def _checked_mesh(name: str, positions: np.ndarray, faces: np.ndarray | None) ->
         raise NonFiniteError(
             f"{name} positions are NaN or infinite from frame {int(np.argmin(is_finite))} on"
         )
-    return _Moving(points, triangles)
-
-
-def _frame_colors(
-    garment: _Moving, garment_color: tuple[float, float, float], vertex_colors: np.ndarray | None
-) -> np.ndarray:
-    """Return one colour per frame, [frames, 3], or one per frame and vertex, [frames, vertices, 3]."""
-    num_frames, num_vertices, _ = garment.positions.shape
-    if vertex_colors is None:
-        return np.broadcast_to(np.asarray(garment_color, np.float32), (num_frames, 3))
-    colors = np.asarray(vertex_colors, np.float32)
-    if colors.shape not in ((num_vertices, 3), (num_frames, num_vertices, 3)):
-        raise MeshError(
-            f"vertex_colors have shape {colors.shape}; they must be [{num_vertices}, 3] or "
-            f"[{num_frames}, {num_vertices}, 3]"
-        )
-    return np.broadcast_to(colors, garment.positions.shape)
+    return points, triangles

@@ -17,17 +17,24 @@ import numpy as np
 from eslr_jax.extras import require
 from eslr_jax.io.palette import linear_to_srgb, srgb_to_linear
 from eslr_jax.render.camera import Camera
-from eslr_jax.render.denoise import smooth_grain
 
 _VARIANT = "scalar_rgb"
 # Direct light only: at equal time a third of the noise of a path tracer, and folds keep their contrast.
 _LIGHT_SAMPLES = 4  # per camera ray
-_GUIDE_SAMPLES = 4  # camera rays per pixel for the features that guide the denoiser
-_GUIDE_RANGE = 3.0  # between the features of two surfaces, whose normals span two
 _BACKGROUND = (0.86, 0.87, 0.88)  # sRGB; the lit floor has the same colour, so no horizon shows
 _SKY_RADIANCE = np.array([0.20, 0.21, 0.23])  # the fill; radiances are scaled so that 1 is white
 _SKY_SHARE = 0.25  # of the light samples
 _KNEE = 0.75  # radiance from which highlights bend
+_INSIDE = 0.75  # colour of the inside of cloth, over that of its outside
+# Denoising.
+_GUIDE_SAMPLES = 4  # camera rays per pixel for the features that guide it
+_GUIDE_RANGE = 3.0  # between the features of two surfaces, whose normals span two
+_GUIDE_SCALE = 0.12  # difference of features that parts two surfaces
+_RADIUS = 2  # [steps] of a pass
+_SPREAD = 1.5  # of the Gaussian over distance [steps]
+# Step [pixels], and the difference of radiance that is a shadow's edge rather than grain (1 is white): what is
+# left after the first pass is weaker and wider.
+_PASSES = ((1, 0.30), (3, 0.10))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,11 +47,6 @@ class _Lamp:
     spread: float  # angle that it fills, seen from the subject [rad]
     irradiance: np.ndarray  # [3], on a surface facing it
     sample_share: float  # of the light samples
-
-    @property
-    def floor_irradiance(self) -> np.ndarray:
-        """Irradiance of level ground, shape [3]."""
-        return self.irradiance * math.sin(self.height)
 
 
 _LAMPS = (
@@ -66,7 +68,7 @@ class Surface:
     positions: np.ndarray  # [vertices, 3], [m]
     faces: np.ndarray  # [faces, 3]
     color: np.ndarray | tuple[float, ...]  # sRGB in [0, 1], shape [3] or per vertex [vertices, 3]
-    is_cloth: bool  # seen from both sides, darker inside
+    is_cloth: bool  # darker inside
 
 
 def trace_picture(
@@ -91,65 +93,18 @@ def trace_picture(
     """
     mitsuba = require("mitsuba")
     with _variant(mitsuba):
-        scene = _build_scene(mitsuba, surfaces, camera, ground_height, size, samples)
-        pixels = np.array(mitsuba.render(scene, seed=0))
-        guide = np.array(mitsuba.render(_build_guide(mitsuba, surfaces, camera, size), seed=0))[..., :3]
+        scene = {"sensor": _sensor(mitsuba, camera, size, samples)}
+        scene |= _studio(mitsuba, camera, ground_height) | _lit(mitsuba, surfaces)
+        pixels = _render(mitsuba, scene)
+        guide = {"sensor": _sensor(mitsuba, camera, size, _GUIDE_SAMPLES)} | _shining(mitsuba, surfaces)
+        features = _render(mitsuba, guide)[..., :3]
     color, opacity = pixels[..., :3], np.clip(pixels[..., 3:], 0.0, 1.0)
-    color = smooth_grain(color + (1 - opacity) * srgb_to_linear(_BACKGROUND), guide)
-    return np.round(255 * linear_to_srgb(_soft_clip(color))).astype(np.uint8)
-
-
-def _build_scene(
-    mitsuba: ModuleType,
-    surfaces: Sequence[Surface],
-    camera: Camera,
-    ground_height: float,
-    size: tuple[int, int],
-    samples: int,
-):
-    """Return a Mitsuba scene; see `trace_picture` for the arguments."""
-    description: dict[str, Any] = {
-        "type": "scene",
-        "integrator": {
-            "type": "direct",
-            "emitter_samples": _LIGHT_SAMPLES,
-            "bsdf_samples": 0,
-            "hide_emitters": True,
-        },
-        "sensor": _sensor(mitsuba, camera, size, samples),
-        "sky": {"type": "constant", "radiance": _rgb(_SKY_RADIANCE), "sampling_weight": _SKY_SHARE},
-        "floor": _floor(mitsuba, camera.target, ground_height),
-    }
-    # Mitsuba orders shapes that it makes from nested descriptions by chance, and samples lights in that order:
-    # made one by one they keep our order, and the grain repeats from run to run.
-    lamps = {lamp.name: _lamp(mitsuba, lamp, camera.target, camera.angle) for lamp in _LAMPS}
-    description |= {name: mitsuba.load_dict(lamp) for name, lamp in lamps.items()}
-    description |= {surface.name: _mesh(mitsuba, surface) for surface in surfaces}
-    return mitsuba.load_dict(description, parallel=False)
-
-
-def _build_guide(mitsuba: ModuleType, surfaces: Sequence[Surface], camera: Camera, size: tuple[int, int]):
-    """Return a scene whose surfaces shine in the colour of their normals, each in a range of its own.
-
-    Its picture is free of noise and tells surfaces apart for the denoiser. Mitsuba's own integrator for such
-    features takes ten times as long.
-    """
-    description: dict[str, Any] = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 1},
-        "sensor": _sensor(mitsuba, camera, size, _GUIDE_SAMPLES),
-    }
-    for number, surface in enumerate(surfaces):
-        properties = mitsuba.Properties()
-        light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_feature"}}
-        properties["light"] = mitsuba.load_dict(light)
-        mesh = _empty_mesh(mitsuba, surface, properties)
-        mesh.add_attribute("vertex_feature", 3, np.zeros(3 * len(surface.positions)))
-        parameters = _place_vertices(mitsuba, mesh, surface)
-        parameters["vertex_feature"] = np.array(parameters["vertex_normals"]) + _GUIDE_RANGE * (number + 1)
-        parameters.update()
-        description[surface.name] = mesh
-    return mitsuba.load_dict(description, parallel=False)
+    color = color + (1 - opacity) * srgb_to_linear(_BACKGROUND)
+    for step, color_scale in _PASSES:
+        color = _smooth(color, features / _GUIDE_SCALE, step, color_scale)
+    excess = np.maximum(color - _KNEE, 0.0)  # highlights bend towards one, and keep their shape
+    color = np.minimum(color, _KNEE) + (1 - _KNEE) * (1 - np.exp(-excess / (1 - _KNEE)))
+    return np.round(255 * linear_to_srgb(color)).astype(np.uint8)
 
 
 @contextlib.contextmanager
@@ -159,6 +114,11 @@ def _variant(mitsuba: ModuleType) -> Iterator[None]:
         mitsuba.set_variant(_VARIANT)  # variant_context can't return to "none chosen"
     with mitsuba.variant_context(_VARIANT):
         yield
+
+
+def _render(mitsuba: ModuleType, description: dict[str, Any]) -> np.ndarray:
+    scene = mitsuba.load_dict({"type": "scene"} | description, parallel=False)
+    return np.array(mitsuba.render(scene, seed=0))
 
 
 def _sensor(mitsuba: ModuleType, camera: Camera, size: tuple[int, int], samples: int) -> dict[str, Any]:
@@ -179,79 +139,89 @@ def _sensor(mitsuba: ModuleType, camera: Camera, size: tuple[int, int], samples:
     }
 
 
-def _lamp(mitsuba: ModuleType, lamp: _Lamp, target: np.ndarray, angle: float) -> dict[str, Any]:
-    """Return a square light that looks at the target."""
-    turn, level = angle + lamp.turn, math.cos(lamp.height)
-    direction = np.array([level * math.sin(turn), math.sin(lamp.height), level * math.cos(turn)])
-    half_size = _LAMP_DISTANCE * math.tan(lamp.spread / 2)
-    radiance = lamp.irradiance * _LAMP_DISTANCE**2 / (2 * half_size) ** 2
-    place = _look_at(mitsuba, target + _LAMP_DISTANCE * direction, target)
-    return {
-        "type": "rectangle",
-        "to_world": place @ mitsuba.ScalarTransform4f().scale(half_size),
-        "emitter": {"type": "area", "radiance": _rgb(radiance), "sampling_weight": lamp.sample_share},
+def _studio(mitsuba: ModuleType, camera: Camera, ground_height: float) -> dict[str, Any]:
+    """Return lamps that look at the camera's target, sky, and a floor that looks like the background."""
+    studio: dict[str, Any] = {
+        "integrator": {
+            "type": "direct",
+            "emitter_samples": _LIGHT_SAMPLES,
+            "bsdf_samples": 0,
+            "hide_emitters": True,
+        },
+        "sky": {"type": "constant", "radiance": _rgb(_SKY_RADIANCE), "sampling_weight": _SKY_SHARE},
     }
-
-
-def _floor(mitsuba: ModuleType, target: np.ndarray, height: float) -> dict[str, Any]:
-    """Return level ground that looks like the background where no shadow falls."""
-    irradiance = np.pi * _SKY_RADIANCE + sum(lamp.floor_irradiance for lamp in _LAMPS)
+    irradiance, target = np.pi * _SKY_RADIANCE, camera.target
+    for lamp in _LAMPS:
+        turn, level = camera.angle + lamp.turn, math.cos(lamp.height)
+        direction = np.array([level * math.sin(turn), math.sin(lamp.height), level * math.cos(turn)])
+        half_size = _LAMP_DISTANCE * math.tan(lamp.spread / 2)
+        radiance = _rgb(lamp.irradiance * _LAMP_DISTANCE**2 / (2 * half_size) ** 2)
+        place = _look_at(mitsuba, target + _LAMP_DISTANCE * direction, target)
+        # Mitsuba orders shapes that it makes from nested descriptions by chance, and samples lights in that
+        # order: made one by one they keep our order, and the grain repeats from run to run.
+        studio[lamp.name] = mitsuba.load_dict(
+            {
+                "type": "rectangle",
+                "to_world": place @ mitsuba.ScalarTransform4f().scale(half_size),
+                "emitter": {"type": "area", "radiance": radiance, "sampling_weight": lamp.sample_share},
+            }
+        )
+        irradiance = irradiance + lamp.irradiance * math.sin(lamp.height)
+    place = mitsuba.ScalarTransform4f().translate([float(target[0]), ground_height, float(target[2])])
     reflectance = np.pi * srgb_to_linear(_BACKGROUND) / irradiance
-    place = mitsuba.ScalarTransform4f().translate([float(target[0]), height, float(target[2])])
-    return {
+    studio["floor"] = {
         "type": "rectangle",
         "to_world": place.rotate([1, 0, 0], -90).scale(200.0),
         "bsdf": {"type": "diffuse", "reflectance": _rgb(reflectance)},
     }
+    return studio
 
 
-def _mesh(mitsuba: ModuleType, surface: Surface):
-    """Return a smooth-shaded Mitsuba mesh of a surface."""
-    color = srgb_to_linear(surface.color)
-    has_vertex_colors = color.ndim == 2
+def _lit(mitsuba: ModuleType, surfaces: Sequence[Surface]) -> dict[str, Any]:
+    """Return matte meshes of surfaces."""
+
+    def matte(scale: float) -> dict[str, Any]:
+        color = {"type": "mesh_attribute", "name": "vertex_color", "scale": scale}
+        return {"type": "diffuse", "reflectance": color}
+
+    meshes = {}
+    for surface in surfaces:
+        inside = matte(_INSIDE if surface.is_cloth else 1.0)
+        material = {"type": "twosided", "outside": matte(1.0), "inside": inside}
+        colors = np.broadcast_to(srgb_to_linear(surface.color), surface.positions.shape)
+        meshes[surface.name], _ = _mesh(mitsuba, surface, "vertex_color", colors, material=material)
+    return meshes
+
+
+def _shining(mitsuba: ModuleType, surfaces: Sequence[Surface]) -> dict[str, Any]:
+    """Return meshes that shine in the colour of their normals, each in a range of its own.
+
+    Their picture is free of noise and tells surfaces apart for the denoiser. Mitsuba's own integrator for such
+    features takes ten times as long.
+    """
+    scene: dict[str, Any] = {"integrator": {"type": "path", "max_depth": 1}}
+    light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_feature"}}
+    for number, surface in enumerate(surfaces):
+        black = np.zeros(surface.positions.shape)
+        scene[surface.name], parameters = _mesh(mitsuba, surface, "vertex_feature", black, light=light)
+        parameters["vertex_feature"] = np.array(parameters["vertex_normals"]) + _GUIDE_RANGE * (number + 1)
+        parameters.update()
+    return scene
+
+
+def _mesh(mitsuba: ModuleType, surface: Surface, attribute: str, values: np.ndarray, **plugins: Any):
+    """Return a smooth-shaded Mitsuba mesh with three values a vertex, and its parameters."""
     properties = mitsuba.Properties()
-    properties["material"] = mitsuba.load_dict(_material(surface, None if has_vertex_colors else color))
-    mesh = _empty_mesh(mitsuba, surface, properties)
-    if has_vertex_colors:
-        mesh.add_attribute("vertex_color", 3, color.reshape(-1))
-    _place_vertices(mitsuba, mesh, surface)
-    return mesh
-
-
-def _empty_mesh(mitsuba: ModuleType, surface: Surface, properties):
-    """Return a Mitsuba mesh of a surface's size, without its vertices."""
+    for name, plugin in plugins.items():
+        properties[name] = mitsuba.load_dict(plugin)
     counts = len(surface.positions), len(surface.faces)
-    return mitsuba.Mesh(surface.name, *counts, has_vertex_normals=True, props=properties)
-
-
-def _place_vertices(mitsuba: ModuleType, mesh, surface: Surface):
-    """Write a surface's vertices and faces into its mesh, which computes normals; return its parameters."""
+    mesh = mitsuba.Mesh(surface.name, *counts, has_vertex_normals=True, props=properties)
+    mesh.add_attribute(attribute, 3, values.reshape(-1))
     parameters = mitsuba.traverse(mesh)
     parameters["vertex_positions"] = np.asarray(surface.positions, np.float32).reshape(-1)
     parameters["faces"] = np.asarray(surface.faces, np.uint32).reshape(-1)
-    parameters.update()
-    return parameters
-
-
-def _material(surface: Surface, color: np.ndarray | None) -> dict[str, Any]:
-    """Return a matte material; the inside of cloth has three quarters of its colour.
-
-    Args:
-        surface: What is made of it.
-        color: Linear colour, shape [3]; None reads it from the vertices.
-    """
-
-    def diffuse(scale: float) -> dict[str, Any]:
-        if color is None:
-            return {
-                "type": "diffuse",
-                "reflectance": {"type": "mesh_attribute", "name": "vertex_color", "scale": scale},
-            }
-        return {"type": "diffuse", "reflectance": _rgb(scale * color)}
-
-    if not surface.is_cloth:
-        return {"type": "twosided", "both": diffuse(1.0)}
-    return {"type": "twosided", "outside": diffuse(1.0), "inside": diffuse(0.75)}
+    parameters.update()  # which computes normals
+    return mesh, parameters
 
 
 def _look_at(mitsuba: ModuleType, origin: np.ndarray, target: np.ndarray):
@@ -261,12 +231,37 @@ def _look_at(mitsuba: ModuleType, origin: np.ndarray, target: np.ndarray):
     )
 
 
-def _rgb(values) -> dict[str, Any]:
-    """Return a linear colour or radiance as Mitsuba describes it."""
+def _rgb(values: np.ndarray) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(value) for value in values]}
 
 
-def _soft_clip(radiance: np.ndarray) -> np.ndarray:
-    """Bend radiance above the knee towards one, so that highlights keep their shape."""
-    excess = np.maximum(radiance - _KNEE, 0.0)
-    return np.minimum(radiance, _KNEE) + (1 - _KNEE) * (1 - np.exp(-excess / (1 - _KNEE)))
+def _smooth(color: np.ndarray, guide: np.ndarray, step: int, color_scale: float) -> np.ndarray:
+    """Average every pixel with the neighbours that show the same surface under the same light.
+
+    A neighbour weighs a Gaussian of its distance, its difference in guide and its difference in colour.
+
+    Args:
+        color: Noisy linear radiance, shape [height, width, 3].
+        guide: Noise-free features, shape [height, width, features]; a difference of one parts two surfaces.
+        step: Distance of the neighbours [pixels].
+        color_scale: Difference of radiance that is an edge.
+
+    Source: edge-avoiding a-trous filter, Dammertz et al. 2010, doi:10.2312/EGGH.HPG10.067-075.
+    """
+    height, width = color.shape[:2]
+    features = np.concatenate([color / color_scale, guide], axis=-1, dtype=np.float32)
+    border = _RADIUS * step
+    margin = ((border, border), (border, border), (0, 0))
+    padded_color, padded = np.pad(color, margin, mode="edge"), np.pad(features, margin, mode="edge")
+    total, weights = np.zeros(color.shape, np.float32), np.zeros((height, width, 1), np.float32)
+    for row in range(-_RADIUS, _RADIUS + 1):
+        for column in range(-_RADIUS, _RADIUS + 1):
+            top, left = border + step * row, border + step * column
+            window = (slice(top, top + height), slice(left, left + width))
+            distance = (row**2 + column**2) / _SPREAD**2
+            difference = padded[window] - features
+            squares = np.einsum("hwf,hwf->hw", difference, difference)
+            weight = np.exp(-0.5 * (squares + np.float32(distance)))[..., None]
+            total += weight * padded_color[window]
+            weights += weight
+    return total / weights

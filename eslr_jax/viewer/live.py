@@ -29,7 +29,6 @@ from eslr_jax.physics.materials import constants_for
 from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
-    Hand,
     Stage,
     advance,
     changed,
@@ -46,7 +45,6 @@ from eslr_jax.viewer.live_controls import (
     describe_fabric,
     read_choice,
     read_fabric,
-    read_tolerance,
     read_wind,
 )
 
@@ -69,6 +67,10 @@ class Cast:
     stage: Stage
     drawn: list[tuple[Piece, Any]]  # of the garments, with their meshes on the page
     drawn_body: list[tuple[Piece, Any]]
+
+    def frames(self, step: int) -> tuple[int, int]:
+        """Return the two frames of the motion that a step goes from and to; the garment is put on once."""
+        return there_and_back(step, self.stage.scene.num_frames, SETTLE_FRAMES)
 
 
 class Recorded(NamedTuple):
@@ -100,6 +102,7 @@ class Live:
     recorded: list[Recorded] = dataclasses.field(default_factory=list)
     setting: tuple[Material, tuple[float, float, float]] | None = None  # fabric, wind [m/s] of the recording
     asked: threading.Event = dataclasses.field(default_factory=threading.Event)  # for one step
+    anew: threading.Event = dataclasses.field(default_factory=threading.Event)  # for a new start
 
     @property
     def url(self) -> str:
@@ -134,10 +137,14 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
     server.initial_camera.fov = np.deg2rad(40.0)
     server.initial_camera.up = (0.0, 1.0, 0.0)
     live = Live(server, controls, choice.body, Path(out).expanduser())
-    controls["playing"].on_update(lambda _: _show_single(live))
+
+    @controls["playing"].on_update
+    def offer_single_frames(_: Any) -> None:
+        controls["single"].visible = not controls["playing"].value
+
     controls["single"].on_click(lambda _: live.asked.set())
-    controls["restart"].on_click(lambda _: _restart(live))
-    controls["let_go"].on_click(lambda _: _let_go(live))
+    controls["restart"].on_click(lambda _: restart(live))
+    controls["let_go"].on_click(lambda _: let_go(live))
     return live
 
 
@@ -157,7 +164,7 @@ def run_live(
         while not until.is_set():
             choice = read_choice(live.controls, live.body)
             try:
-                is_moved = one_frame(live, choice)
+                is_moved = _one_frame(live, choice)
             except EslrError as error:
                 live.refused = choice  # not what the controls say by now
                 live.controls["status"].content = f"**{error}**"
@@ -174,12 +181,8 @@ def run_live(
             _save(live)
 
 
-def one_frame(live: Live, choice: Choice) -> bool:
+def _one_frame(live: Live, choice: Choice) -> bool:
     """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did.
-
-    Args:
-        live: Of `open_live`.
-        choice: What the controls put on stage.
 
     Raises:
         EslrError: What is chosen does not load, or the body is too fast.
@@ -191,43 +194,48 @@ def one_frame(live: Live, choice: Choice) -> bool:
     if live.recorded:
         is_over = not live.controls["record"].value or len(live.recorded) >= MOST_RECORDED
         # A run has one garment, body, motion, fabric and wind, and puts the garment on once.
-        is_over = is_over or live.state is None
-        if is_over or is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting):
+        is_another = is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting)
+        if is_over or is_another or live.anew.is_set():
             live.controls["record"].value = False
             _save(live)
     if is_due:
         _load(live, choice)
-    cast = live.cast
-    if cast is None or choice == live.refused:
-        return False
-    if not (live.controls["playing"].value or live.asked.is_set()):
+    cast, is_asked = live.cast, live.controls["playing"].value or live.asked.is_set()
+    if cast is None or choice == live.refused or not is_asked:
         return False
     live.asked.clear()
-    if live.state is None:
+    if live.state is None or live.anew.is_set():
+        live.anew.clear()
         live.state, live.step = cast.stage.scene.initial_state, 0
+        live.times, live.iterations = [], MOST_ITERATIONS
     began = time.perf_counter()
-    frames = _frames_of(live.step, cast)
-    with (
-        contextlib.nullcontext()
-        if live.is_compiled
-        else _busy(live, "compiling, which is kept for the next time")
-    ):
-        stage = changed(cast.stage, fabric, wind, _hand(live))
-        tolerance = read_tolerance(live.controls)
-        step = jax.block_until_ready(advance(stage, live.state, frames, live.iterations, tolerance))
-    if live.state is None:  # restarted meanwhile
-        return False
+    before, frame = cast.frames(live.step)
+    compiling = _busy(live, "compiling, which is kept for the next time")
+    with contextlib.nullcontext() if live.is_compiled else compiling:
+        handle, held, hand = live.controls.get("hand"), live.held, no_hand()
+        if handle is not None and held is not None:
+            hand = grasp(held, np.asarray(handle.position) + cast.spots[frame])
+        stage = changed(cast.stage, fabric, wind, hand)
+        tolerance = 0.01 * float(live.controls["tolerance"].value)  # of the gap that a frame begins with
+        step = jax.block_until_ready(advance(stage, live.state, (before, frame), live.iterations, tolerance))
     status = Status(int(step.state.status))
     if status != Status.OK:
-        _restart(live)
+        restart(live)
         live.controls["status"].content = f"put on anew: {status.describe()}"
         return False
     live.state, live.step = step.state, live.step + 1
     if live.controls["record"].value:
         state, residual = jax.tree.map(np.asarray, (step.state, step.report.residual))
-        live.recorded.append(Recorded(frames[1], state, residual, is_held="hand" in live.controls))
+        live.recorded.append(Recorded(frame, state, residual, is_held="hand" in live.controls))
         live.setting = setting
-    _show(live, cast, frames[1])
+    # The body walks on the spot.
+    body = np.asarray(cast.poses.positions[frame]) - cast.spots[frame]
+    cloth = np.asarray(step.state.position) - cast.spots[frame]
+    with live.server.atomic():
+        for piece, mesh in cast.drawn_body:
+            mesh.vertices = piece.place(body)
+        for piece, mesh in cast.drawn:
+            mesh.vertices = piece.place(cloth)
     if live.is_compiled:
         live.times = [*live.times[-_SHOWN + 1 :], time.perf_counter() - began]
     live.is_compiled = True
@@ -268,20 +276,18 @@ def _busy(live: Live, text: str) -> Iterator[None]:
         thread.join()
 
 
-def _frames_of(step: int, cast: Cast) -> tuple[int, int]:
-    """Return the two frames of a step; the garment is put on once."""
-    return there_and_back(step, cast.stage.scene.num_frames, SETTLE_FRAMES)
-
-
 def _load(live: Live, choice: Choice) -> None:
     """Put what is chosen on stage."""
     live.refused = choice  # until it is there
     with _busy(live, f"preparing {' and '.join(choice.garments)} on {choice.motion}"):
         rig = load_body(choice.body, betas=choice.betas)
         poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
-        spots, drawn_body = _spots(poses), []
+        spots, drawn_body = np.array(poses.positions).mean(axis=1), []
+        spots[:, 1] = float(ground_height(poses))
+        body = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
+        standing = np.asarray(poses.positions[0]) - spots[0]
         if live.cast is None:  # there is something to see while the rest loads
-            drawn_body = _draw_body(live, poses, rig, spots[0])
+            drawn_body = _draw(live, "/body", body, standing)
         # A shape of the body is tried once: its garments are not kept on disk.
         garments = [
             load_garment_file(name, vertices=choice.vertices, body=rig, cache=not choice.betas)  # type: ignore[arg-type]
@@ -292,77 +298,54 @@ def _load(live: Live, choice: Choice) -> None:
         stored = wear_together(garments, choice.garments)
         cloth = prepare_stored(stored, name="+".join(Path(name).name for name in choice.garments))
         stage = set_stage(cloth, poses, read_fabric(live.controls))
-    _let_go(live)
+    let_go(live)
     if live.cast is not None:
         for _, mesh in (*live.cast.drawn, *live.cast.drawn_body):
             mesh.remove()
-        drawn_body = _draw_body(live, poses, rig, spots[0])
-    drawn = [
-        _draw(live, f"/garments/{number}", piece, np.asarray(stage.scene.initial_state.position) - spots[0])
-        for number, piece in enumerate(garment_pieces(np.asarray(cloth.faces), stored.outfit))
-    ]
+        drawn_body = _draw(live, "/body", body, standing)
+    pieces = garment_pieces(np.asarray(cloth.faces), stored.outfit)
+    drawn = _draw(live, "/garments", pieces, np.asarray(stage.scene.initial_state.position) - spots[0])
     for _, mesh in drawn:
-        mesh.on_click(lambda event: _take_hold(live, event.ray_origin, event.ray_direction))
+        mesh.on_click(lambda event: take_hold(live, event.ray_origin, event.ray_direction))
+    live.is_compiled, live.refused, live.state = False, None, None
     live.cast = Cast(choice, rig, stored, poses, spots, stage, drawn, drawn_body)
-    live.is_compiled, live.refused = False, None
-    _restart(live)
 
 
-def _draw(live: Live, name: str, piece: Piece, positions: Any) -> tuple[Piece, Any]:
-    """Draw a piece of garment or body, given where the whole is [m]; return it with its mesh on the page."""
-    mesh = live.server.scene.add_mesh_simple(
-        name, piece.place(positions), piece.faces, color=byte_color(piece.color), side="double"
-    )
-    return piece, mesh
+def _draw(live: Live, folder: str, pieces: list[Piece], positions: np.ndarray) -> list[tuple[Piece, Any]]:
+    """Draw the pieces of a garment or a body, given where the whole is [m]; return them with their meshes."""
+    drawn = []
+    for number, piece in enumerate(pieces):
+        name, color = f"{folder}/{number}", byte_color(piece.color)
+        place = piece.place(positions)
+        mesh = live.server.scene.add_mesh_simple(name, place, piece.faces, color=color, side="double")
+        drawn.append((piece, mesh))
+    return drawn
 
 
-def _draw_body(live: Live, poses: BodyMotion, rig: Body, spot: np.ndarray) -> list[tuple[Piece, Any]]:
-    """Draw a body at the first frame of its motion, where it stands on a spot [m]."""
-    positions = np.asarray(poses.positions[0]) - spot
-    pieces = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
-    return [_draw(live, f"/body/{piece.name}", piece, positions) for piece in pieces]
+def restart(live: Live) -> None:
+    """Let the next frame put the garment on again at the motion's first frame."""
+    live.anew.set()
 
 
-def _show_single(live: Live) -> None:
-    """Offer single frames while the simulation is paused."""
-    live.controls["single"].visible = not live.controls["playing"].value
+def next_iterations(iterations: int, took: float, timestep: float) -> int:
+    """Return how many iterations the next frame gets at most, to keep up with real time.
 
-
-def _restart(live: Live) -> None:
-    """Put the garment on again at the motion's first frame."""
-    live.state, live.times, live.iterations = None, [], MOST_ITERATIONS
-
-
-def _show(live: Live, cast: Cast, frame: int) -> None:
-    """Show the cloth, and the body at a frame, which walks on the spot."""
-    body = np.asarray(cast.poses.positions[frame])
-    assert live.state is not None
-    place = cast.spots[frame]
-    cloth = np.asarray(live.state.position) - place
-    with live.server.atomic():
-        for piece, mesh in cast.drawn_body:
-            mesh.vertices = piece.place(body - place)
-        for piece, mesh in cast.drawn:
-            mesh.vertices = piece.place(cloth)
-
-
-def _spots(poses: BodyMotion) -> np.ndarray:
-    """Return the place under the body on the ground in every frame [m]; on the page it is the origin."""
-    spots = np.array(poses.positions).mean(axis=1)
-    spots[:, 1] = float(ground_height(poses))
-    return spots
+    Args:
+        iterations: Of the frames before, at most.
+        took: Time that they took [s].
+        timestep: Time that there is [s].
+    """
+    share = (timestep - _PAGE) / took
+    wanted = 0.9 * share * iterations if share < 1.0 else 1.1 * iterations + 1.0
+    return int(np.clip(wanted, _FEWEST, MOST_ITERATIONS))
 
 
 def _tell(live: Live, cast: Cast, report: FrameReport, tolerance: float) -> None:
     """Say how fast it goes and how exact it is, and fit the iterations to the time that there is."""
     iterations, bound = int(report.iterations), float(report.gap_bound)
     took, timestep = float(np.median(live.times)), float(cast.poses.timestep)
-    if live.controls["keep_up"].value:
-        share = (timestep - _PAGE) / took
-        wanted = 0.9 * share * live.iterations if share < 1.0 else 1.1 * live.iterations + 1.0
-        live.iterations = int(np.clip(wanted, _FEWEST, MOST_ITERATIONS))
-    else:
-        live.iterations = MOST_ITERATIONS
+    keeps_up = live.controls["keep_up"].value
+    live.iterations = next_iterations(live.iterations, took, timestep) if keeps_up else MOST_ITERATIONS
     exact = (
         f"within a gap of {100 * tolerance:.3g} %"
         if keeps_tolerance(report.gap_bound, report.residual, tolerance)
@@ -373,11 +356,11 @@ def _tell(live: Live, cast: Cast, report: FrameReport, tolerance: float) -> None
     live.controls["status"].content = f"**{speed}**\n\n{figures}"
 
 
-def _take_hold(live: Live, origin: Any, direction: Any) -> None:
-    """Take the vertex that was clicked on, with a handle to drag it by."""
+def take_hold(live: Live, origin: Any, direction: Any) -> None:
+    """Take the vertex nearest to a ray of the page, with a handle to drag it by."""
     if live.cast is None or live.state is None:
         return
-    _, frame = _frames_of(live.step - 1, live.cast)
+    _, frame = live.cast.frames(live.step - 1)
     positions = np.asarray(live.state.position) - live.cast.spots[frame]
     live.held = nearest_vertex(positions, origin, direction)
     handle = live.server.scene.add_transform_controls(
@@ -387,22 +370,13 @@ def _take_hold(live: Live, origin: Any, direction: Any) -> None:
     live.controls["let_go"].visible = True
 
 
-def _let_go(live: Live) -> None:
+def let_go(live: Live) -> None:
     """Let go of the cloth."""
     live.held = None
     live.controls["let_go"].visible = False
     handle = live.controls.pop("hand", None)
     if handle is not None:
         handle.remove()
-
-
-def _hand(live: Live) -> Hand:
-    """Return what holds the cloth."""
-    handle, held, cast = live.controls.get("hand"), live.held, live.cast
-    if handle is None or held is None or cast is None:
-        return no_hand()
-    _, frame = _frames_of(live.step, cast)
-    return grasp(held, np.asarray(handle.position) + cast.spots[frame])
 
 
 def _save(live: Live) -> None:

@@ -12,8 +12,8 @@ from eslr_jax.assets import asset_names
 from eslr_jax.physics.materials import fabric_material, fabric_names
 from eslr_jax.types import Material
 
-NOTHING = "nothing"  # no garment over the others
-FACTORS = (0.1, 10.0)  # of a fabric's constants
+_NOTHING = "nothing"  # no garment over the others
+_FACTORS = (0.1, 10.0)  # of a fabric's constants
 _MOST_BETAS = 2.5  # [standard deviations], of the sliders unless more is asked for
 _STRONGEST = 12.0  # [m/s], of the wind
 _TOLERANCES = (0.1, 10.0)  # [%]
@@ -33,12 +33,9 @@ class Choice:
 
 
 def add_controls(gui: Any, choice: Choice, num_shapes: int) -> dict[str, Any]:
-    """Add the controls of a page and return them by name; `betas` and `garments` are lists.
+    """Add the controls of a page, which say `choice` at first; return them by name.
 
-    Args:
-        gui: Of viser.
-        choice: What they say at first.
-        num_shapes: Of the body.
+    `betas` and `garments` are lists; `gui` is viser's, `num_shapes` the body's.
     """
     controls: dict[str, Any] = {"status": gui.add_markdown("loading")}
     controls["playing"] = gui.add_checkbox("play", True, hint="pause and go on")
@@ -50,7 +47,7 @@ def add_controls(gui: Any, choice: Choice, num_shapes: int) -> dict[str, Any]:
         controls["fabric"] = gui.add_dropdown("fabric", fabric_names(), initial_value="cotton")
         for name, label in (("density", "weight x"), ("stretch", "stretch x"), ("bending", "bending x")):
             hint = "times the fabric's own"
-            controls[name] = gui.add_slider(label, *FACTORS, 0.1, 1.0, hint=hint)
+            controls[name] = gui.add_slider(label, *_FACTORS, 0.1, 1.0, hint=hint)
         controls["constants"] = gui.add_markdown("")
     with gui.add_folder("wind"):
         controls["wind"] = gui.add_slider("speed, m/s", 0.0, _STRONGEST, 0.1, 0.0)
@@ -65,10 +62,8 @@ def add_controls(gui: Any, choice: Choice, num_shapes: int) -> dict[str, Any]:
     with gui.add_folder("body", expand_by_default=bool(choice.betas)):
         clips = _with(sorted(asset_names("motion")), choice.motion)
         controls["motion"] = gui.add_dropdown("motion", clips, initial_value=choice.motion)
-        controls["betas"] = [
-            _shape(gui, k, choice)
-            for k in range(min(num_shapes, max(len(_BUNDLED_SHAPES), len(choice.betas))))
-        ]
+        count = min(num_shapes, max(len(_BUNDLED_SHAPES), len(choice.betas)))
+        controls["betas"] = [_shape(gui, k, choice) for k in range(count)]
     with gui.add_folder("speed"):
         hint = "a frame ends where its gap is below this share of the gap that it began with"
         controls["tolerance"] = gui.add_slider("tolerance, %", *_TOLERANCES, 0.1, 1.0, hint=hint)
@@ -79,15 +74,10 @@ def add_controls(gui: Any, choice: Choice, num_shapes: int) -> dict[str, Any]:
 
 def read_choice(controls: dict[str, Any], body: str) -> Choice:
     """Return what the controls put on stage."""
-    garments = tuple(control.value for control in controls["garments"] if control.value != NOTHING)
-    betas = [round(float(control.value), 2) for control in controls["betas"]]
-    return Choice(
-        garments,
-        controls["vertices"].value,
-        controls["motion"].value,
-        body,
-        tuple(betas) if any(betas) else (),
-    )
+    garments = tuple(control.value for control in controls["garments"] if control.value != _NOTHING)
+    betas = tuple(round(float(control.value), 2) for control in controls["betas"])
+    betas = betas if any(betas) else ()
+    return Choice(garments, controls["vertices"].value, controls["motion"].value, body, betas)
 
 
 def read_fabric(controls: dict[str, Any]) -> Material:
@@ -117,16 +107,11 @@ def read_wind(controls: dict[str, Any]) -> tuple[float, float, float]:
     return float(speed * np.sin(angle)), 0.0, float(speed * np.cos(angle))
 
 
-def read_tolerance(controls: dict[str, Any]) -> float:
-    """Return the share of a frame's initial gap that the controls allow to be left."""
-    return 0.01 * float(controls["tolerance"].value)
-
-
 def _garment(gui: Any, number: int, names: Sequence[str], choice: Choice) -> Any:
     """Add the choice of one garment of an outfit."""
     given = choice.garments[number : number + 1]
-    options = _with(names, *given) if number == 0 else (NOTHING, *_with(names, *given))
-    return gui.add_dropdown("over it" if number else "garment", options, initial_value=(*given, NOTHING)[0])
+    options = _with(names, *given) if number == 0 else (_NOTHING, *_with(names, *given))
+    return gui.add_dropdown("over it" if number else "garment", options, initial_value=(*given, _NOTHING)[0])
 
 
 def _shape(gui: Any, number: int, choice: Choice) -> Any:

@@ -7,10 +7,11 @@ import io
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.errors import AssetError, EslrError
@@ -18,20 +19,14 @@ from eslr_jax.evaluation.fields import FIELDS, Field, run_field
 from eslr_jax.extras import require
 from eslr_jax.io.palette import byte_color
 from eslr_jax.io.run import Run
-from eslr_jax.render.colors import color_scale
-from eslr_jax.viewer.curves import add_plot, frame_values, show_plot, worst_frame
+from eslr_jax.render import color_scale
 
 PLAIN = "fabric"  # colour by nothing
 _SPACING = 1.3  # [m] between runs: arms held out pass each other
 _LABEL_HEIGHT = 0.2  # [m] of a run's name above its head
 _PICTURE_SIZE = (1280, 960)  # width, height [pixels]
-
-
-class Figure(NamedTuple):
-    """What is drawn of a run."""
-
-    garments: list[Piece]
-    body: list[Piece]
+_CURVE_COLORS = ("#4d80b3", "#d9822b", "#4c9f70", "#b3485b", "#7a5fa8")  # of the runs, repeated
+_PLOT_HEIGHT = 180  # [pixels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +37,8 @@ class View:
     runs: tuple[Run, ...]
     fields: dict[tuple[int, str], Field]  # of a run's number and a field's name, filled as they are asked for
     controls: dict[str, Any]
-    pieces: tuple[Figure, ...]  # of every run
+    garments: tuple[list[Piece], ...]  # what is drawn of every run
+    bodies: tuple[list[Piece], ...]
     lock: threading.Lock
 
     @property
@@ -73,7 +69,13 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
         raise AssetError("nothing to view; give one run or more")
     viser = require("viser", extra="view")
     server = viser.ViserServer(host=host, port=port, verbose=False)
-    num_frames = max(run.trajectory.num_frames for run in runs)
+    count, num_frames = len(runs), max(run.trajectory.num_frames for run in runs)
+    middle = 0.5 * _SPACING * (count - 1)
+    server.scene.set_up_direction("+y")
+    server.scene.add_grid("/floor", width=4.0 + _SPACING * count, height=4.0, plane="xz", cell_size=0.25)
+    server.initial_camera.position = (middle, 1.2, 2.6 + 0.8 * count)
+    server.initial_camera.look_at = (middle, 0.9, 0.0)
+    server.initial_camera.up = (0.0, 1.0, 0.0)
     gui = server.gui
     controls = {
         "frame": gui.add_slider("frame", 0, max(num_frames - 1, 1), 1, 0),
@@ -81,15 +83,20 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
         "speed": gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0),
         "color": gui.add_dropdown("colour by", (PLAIN, *FIELDS), initial_value=PLAIN),
         "legend": gui.add_markdown(""),
-        "plot": add_plot(gui, [run.name for run in runs], num_frames, runs[0].trajectory.timestep),
+        "plot": _add_plot(gui, runs, num_frames),
         "worst": gui.add_button("go to the worst frame", visible=False),
         "wireframe": gui.add_checkbox("wireframe", False),
         "body": gui.add_checkbox("body", True),
         "follow": gui.add_checkbox("follow", True),
         "save": gui.add_button("save picture"),
     }
-    view = View(server, tuple(runs), {}, controls, tuple(map(_figure, runs)), threading.Lock())
-    _place_scene(view)
+    garments, bodies = [], []
+    for run in runs:
+        trajectory, body = run.trajectory, run.trajectory.body
+        outfit = {"garment": trajectory.positions.shape[1]} if run.garment is None else run.garment.outfit
+        garments.append(garment_pieces(trajectory.faces, outfit))
+        bodies.append([] if body is None else body_pieces(body.rest_positions, body.faces, body.skin))
+    view = View(server, tuple(runs), {}, controls, tuple(garments), tuple(bodies), threading.Lock())
     for name in ("frame", "wireframe", "body", "follow"):
         controls[name].on_update(lambda _: show(view))
     controls["color"].on_update(lambda _: _change_color(view))
@@ -97,6 +104,23 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
     controls["save"].on_click(lambda event: _save_picture(event.client))
     show(view)
     return view
+
+
+def _add_plot(gui: Any, runs: Sequence[Run], num_frames: int) -> Any:
+    """Add an empty plot over time [s] with a curve a run; return its handle."""
+    uplot = require("viser.uplot", extra="view")
+    series = [uplot.Series(label="s")]
+    for number, run in enumerate(runs):
+        color = _CURVE_COLORS[number % len(_CURVE_COLORS)]
+        series.append(uplot.Series(label=run.name, stroke=color, width=2))
+    time = np.arange(num_frames) * runs[0].trajectory.timestep
+    return gui.add_uplot(
+        (time, *np.zeros((len(runs), num_frames))),
+        tuple(series),
+        scales={"x": uplot.Scale(time=False)},
+        height=_PLOT_HEIGHT,
+        visible=False,
+    )
 
 
 def show(view: View) -> None:
@@ -112,9 +136,9 @@ def show(view: View) -> None:
         for k, run in enumerate(view.runs):
             frame = min(asked, run.trajectory.num_frames - 1)
             colors = color_scale(fields[k].values[frame], low, high) if fields else None
-            _show_run(view, k, run, frame, colors)
+            _show_run(view, k, frame, colors)
             if fields:
-                now.append(f"{frame_values(fields[k].values[frame : frame + 1], color)[0]:.3g}")
+                now.append(f"{_frame_values(fields[k].values[frame : frame + 1], color)[0]:.3g}")
         legend = message
         if fields:
             moment = f"frame {asked}, {asked * view.runs[0].trajectory.timestep:.2f} s: {', '.join(now)}"
@@ -126,9 +150,11 @@ def go_to_worst(view: View) -> None:
     """Move the timeline to the frame with the worst value of what is coloured by."""
     name = view.controls["color"].value
     curves = _curves(view, name)
-    if curves:
+    if curves is not None:
         view.controls["playing"].value = False
-        view.controls["frame"].value = worst_frame(curves, name)
+        is_least = name == "distance"
+        worst = curves.min(axis=0).argmin() if is_least else curves.max(axis=0).argmax()
+        view.controls["frame"].value = int(worst)
 
 
 def play(view: View, *, until: threading.Event | None = None) -> None:
@@ -143,43 +169,25 @@ def play(view: View, *, until: threading.Event | None = None) -> None:
         until.wait(max(pause - (time.perf_counter() - began), 0.005))
 
 
-def _place_scene(view: View) -> None:
-    """Set up the vertical, the camera and the floor."""
-    scene, count = view.server.scene, len(view.runs)
-    scene.set_up_direction("+y")
-    middle = 0.5 * _SPACING * (count - 1)
-    view.server.initial_camera.position = (middle, 1.2, 2.6 + 0.8 * count)
-    view.server.initial_camera.look_at = (middle, 0.9, 0.0)
-    view.server.initial_camera.up = (0.0, 1.0, 0.0)
-    scene.add_grid("/floor", width=4.0 + _SPACING * count, height=4.0, plane="xz", cell_size=0.25)
+def _show_run(view: View, k: int, frame: int, colors: np.ndarray | None) -> None:
+    """Show a frame of the run that is the k-th from the left, with its name above it.
 
-
-def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | None) -> None:
-    """Show one frame of one run, with its name above it.
-
-    Args:
-        view: The page.
-        k: Number of the run, counted from the left.
-        run: The run.
-        frame: Which frame.
-        colors: sRGB per garment vertex in [0, 1], shape [vertices, 3]; None for the fabric's colour.
+    `colors` are sRGB per garment vertex in [0, 1], shape [vertices, 3]; None shows the fabric's colour.
     """
-    scene, trajectory = view.server.scene, run.trajectory
+    scene, run, trajectory = view.server.scene, view.runs[k], view.runs[k].trajectory
     wireframe = bool(view.controls["wireframe"].value)
     subject = trajectory.positions if trajectory.body is None else trajectory.body.positions
-    walked = (subject[frame].mean(axis=0) - subject[0].mean(axis=0)) * [1.0, 0.0, 1.0]
+    center = subject[frame].mean(axis=0) * [1.0, 0.0, 1.0]
+    walked = center - subject[0].mean(axis=0) * [1.0, 0.0, 1.0]
     # Where the subjects walk, the runs walk beside each other, or on the spot if the page follows.
     offset = np.array([_SPACING * k, 0.0, 0.0]) - (walked if view.controls["follow"].value else 0.0)
-    top = subject[frame].mean(axis=0) * [1.0, 0.0, 1.0] + [
-        0.0,
-        subject[frame][:, 1].max() + _LABEL_HEIGHT,
-        0.0,
-    ]
-    scene.add_label(f"/runs/{k}/name", run.name, position=tuple(top + offset))
+    top = offset + center
+    top[1] += subject[frame][:, 1].max() + _LABEL_HEIGHT
+    scene.add_label(f"/runs/{k}/name", run.name, position=tuple(top))
     points = (trajectory.positions[frame] + offset).astype(np.float32)
-    name, figure = f"/runs/{k}/garment", view.pieces[k]
+    name, garments = f"/runs/{k}/garment", view.garments[k]
     if colors is None or wireframe:
-        for number, piece in enumerate(figure.garments):
+        for number, piece in enumerate(garments):
             scene.add_mesh_simple(
                 name if number == 0 else f"{name}_{number}",
                 piece.place(points),
@@ -189,14 +197,14 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
                 side="double",
             )
     else:
-        for number in range(1, len(figure.garments)):
+        for number in range(1, len(garments)):
             scene.remove_by_name(f"{name}_{number}")
         mesh = trimesh.Trimesh(
             points, trajectory.faces, vertex_colors=np.round(255 * colors).astype(np.uint8), process=False
         )
         scene.add_mesh_trimesh(name, mesh)
     if trajectory.body is not None:
-        for number, piece in enumerate(figure.body):
+        for number, piece in enumerate(view.bodies[k]):
             scene.add_mesh_simple(
                 f"/runs/{k}/body" if number == 0 else f"/runs/{k}/body_{piece.name}",
                 piece.place(trajectory.body.positions[frame] + offset),
@@ -204,16 +212,6 @@ def _show_run(view: View, k: int, run: Run, frame: int, colors: np.ndarray | Non
                 color=byte_color(piece.color),
                 visible=bool(view.controls["body"].value),
             )
-
-
-def _figure(run: Run) -> Figure:
-    """Return what is drawn of a run."""
-    trajectory, body = run.trajectory, run.trajectory.body
-    outfit = run.garment.outfit if run.garment is not None else {"garment": trajectory.positions.shape[1]}
-    return Figure(
-        garment_pieces(trajectory.faces, outfit),
-        [] if body is None else body_pieces(body.rest_positions, body.faces, body.skin),
-    )
 
 
 def _fields(view: View, name: str) -> tuple[list[Field], str]:
@@ -230,17 +228,29 @@ def _fields(view: View, name: str) -> tuple[list[Field], str]:
     return [view.fields[k, name] for k in range(len(view.runs))], ""
 
 
-def _curves(view: View, name: str) -> list[np.ndarray]:
-    """Return what is coloured by as one number a frame for every run; nothing without a field."""
+def _frame_values(values: Float[np.ndarray, "frames vertices"], name: str) -> Float[np.ndarray, " frames"]:
+    """Return one number a frame: the largest stretch, the smallest distance, or the mean of anything else."""
+    if name == "stretch":
+        return values.max(axis=1)
+    return values.min(axis=1) if name == "distance" else values.mean(axis=1)
+
+
+def _curves(view: View, name: str) -> Float[np.ndarray, "runs frames"] | None:
+    """Return a field as one number a frame, None without it; a run that is shorter keeps its last value."""
     with view.lock:
-        return [frame_values(field.values, name) for field in _fields(view, name)[0]]
+        curves = [_frame_values(field.values, name) for field in _fields(view, name)[0]]
+    if not curves:
+        return None
+    longest = max(map(len, curves))
+    return np.stack([np.pad(curve, (0, longest - len(curve)), "edge") for curve in curves])
 
 
 def _change_color(view: View) -> None:
     """Show another field, and its plot."""
-    curves = _curves(view, view.controls["color"].value)
-    show_plot(view.controls["plot"], curves)
-    view.controls["worst"].visible = bool(curves)
+    curves, plot = _curves(view, view.controls["color"].value), view.controls["plot"]
+    plot.visible = view.controls["worst"].visible = curves is not None
+    if curves is not None:
+        plot.data = (plot.data[0], *curves.astype(np.float64))
     show(view)
 
 

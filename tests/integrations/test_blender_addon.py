@@ -31,8 +31,7 @@ sys.path.insert(0, str(ADDON))
 from build import build  # noqa: E402
 
 sys.path.insert(0, str(ADDON / "eslr_garments"))
-import job  # noqa: E402
-from job import Job, JobError, simulation_steps  # noqa: E402
+from job import Job, JobError, Step, simulation_steps  # noqa: E402
 
 
 @pytest.fixture
@@ -44,6 +43,12 @@ def folder(tmp_path, body):
 
 def steps(folder, python=sys.executable, fabric="cotton"):
     return simulation_steps(python, folder, fabric, "5%", False)
+
+
+def scripted(folder, *scripts):
+    """A job whose steps are lines of Python."""
+    commands = [[sys.executable, "-c", script] for script in scripts]
+    return Job([Step("working", command, f"{number}.txt") for number, command in enumerate(commands)], folder)
 
 
 def run(job):
@@ -82,6 +87,33 @@ def test_a_python_without_the_simulator_is_told_in_one_line(tmp_path):
         run(Job(steps(tmp_path, python=str(bare)), tmp_path))
 
 
+def test_warnings_are_collected_and_a_refusal_names_no_folder_that_is_gone(tmp_path):
+    job = scripted(
+        tmp_path,
+        """print('{"warnings": ["the place is doubtful"], "pinned": 0}')""",
+        r"""print("good: stretched by 3 %\n\x1b[33mwarning:\x1b[0m skin shows\nframes 3")""",
+        """import sys
+print("compiling 3/9", file=sys.stderr)
+sys.exit("eslr: frame 3 is not finite; the frames before are kept in a folder")""",
+    )
+    with pytest.raises(JobError, match=r"^frame 3 is not finite$"):
+        run(job)
+    assert job.warnings == ["the place is doubtful", "skin shows"]
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no list of processes")
+def test_a_cancelled_job_leaves_no_process(tmp_path):
+    job = scripted(tmp_path, "import os, time; print(os.getpid(), flush=True); time.sleep(60)")
+    deadline = time.monotonic() + 30
+    while not job.poll() and not (process := (tmp_path / "0.txt").read_text()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    job.cancel()
+    while Path("/proc", process.strip()).exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 class _Modifiers(list):
     """A garment's modifiers, as far as `lay_cache` knows them."""
 
@@ -94,6 +126,10 @@ class _Modifiers(list):
 
     def move(self, start, end):
         self.insert(end, self.pop(start))
+
+
+def shirt(**more):
+    return SimpleNamespace(name="shirt", matrix_world=np.eye(4), modifiers=_Modifiers(), **more)
 
 
 def without_blender(monkeypatch):
@@ -112,9 +148,8 @@ def test_the_cache_begins_where_the_simulation_does(tmp_path, monkeypatch, first
     exchange = without_blender(monkeypatch)
     (tmp_path / "report.json").write_text(json.dumps(report))
     start = exchange.read_start(tmp_path / "report.json")
-    garment = SimpleNamespace(matrix_world=np.eye(4), modifiers=_Modifiers())
     scene = SimpleNamespace(frame_start=first, render=SimpleNamespace(fps=fps, fps_base=1.0))
-    cache = exchange.lay_cache(garment, np.zeros((3, 4, 3)), tmp_path / "a.pc2", scene, start=start)
+    cache = exchange.lay_cache(shirt(), np.zeros((3, 4, 3)), tmp_path / "a.pc2", scene, start=start)
     frame = first + fps * report.get("motion_start_s", 0.0)  # that the first sample belongs to
     assert cache.frame_scale * frame - cache.frame_start == pytest.approx(0.0)
     assert cache.frame_scale * (frame + fps) - cache.frame_start == pytest.approx(30.0)
@@ -122,7 +157,7 @@ def test_the_cache_begins_where_the_simulation_does(tmp_path, monkeypatch, first
 
 def test_a_cache_that_can_t_be_written_leaves_the_last_one(tmp_path, monkeypatch):
     exchange = without_blender(monkeypatch)
-    garment = SimpleNamespace(matrix_world=np.eye(4), modifiers=_Modifiers())
+    garment = shirt()
     scene = SimpleNamespace(frame_start=0, render=SimpleNamespace(fps=24, fps_base=1.0))
     exchange.lay_cache(garment, np.zeros((3, 4, 3)), tmp_path / "a.pc2", scene, start=0.0)
     before = (tmp_path / "a.pc2").read_bytes()
@@ -169,30 +204,6 @@ def test_a_garment_goes_to_the_simulator_with_its_texture(tmp_path, monkeypatch,
     np.testing.assert_allclose(read.corner_uvs, uvs[[[0, 1, 2], [0, 2, 3], [4, 5, 6]]])
 
 
-def test_a_shape_is_that_of_the_mixed_keys_which_stay_as_they_are(monkeypatch):
-    exchange = without_blender(monkeypatch)
-    drawn, mixed = np.zeros((4, 3)), np.arange(12.0).reshape(4, 3)
-    keys = ["Basis", "Fat"]
-
-    def remove(key):
-        keys.remove(key)
-        thing.active_shape_key_index = 0
-
-    def add(from_mix):
-        assert from_mix
-        keys.append(mix)
-        return mix
-
-    mix = SimpleNamespace(data=_Values(mixed))
-    mesh = SimpleNamespace(vertices=_Values(drawn), shape_keys=keys)
-    thing = SimpleNamespace(data=mesh, active_shape_key_index=1, shape_key_add=add, shape_key_remove=remove)
-    np.testing.assert_array_equal(exchange.shown_shape(thing), mixed)
-    assert keys == ["Basis", "Fat"]
-    assert thing.active_shape_key_index == 1
-    mesh.shape_keys = None
-    np.testing.assert_array_equal(exchange.shown_shape(thing), drawn)
-
-
 @pytest.mark.slow
 @needs_blender
 def test_body_and_garment_go_to_the_simulator_as_their_shape_keys_shape_them(folder):
@@ -214,39 +225,50 @@ def test_body_and_garment_go_to_the_simulator_as_their_shape_keys_shape_them(fol
     assert bool(shown["is_as_before"])
 
 
+SIMULATOR = """#!{python}
+import json, sys
+from pathlib import Path
+import numpy as np
+
+command, *words = sys.argv[3:]
+if command == "fit":
+    print(json.dumps({{"placement": {{"moved_m": [0.0, 0.0, 0.0]}}}}))
+elif command == "simulate":
+    Path("run").mkdir()
+    Path("run/report.json").write_text("{{}}")
+else:
+    np.savez("motion.npz", positions=np.ones((2, 4, 3)))
+"""
+
+
 def test_a_garment_that_an_undo_made_anew_takes_the_simulation(tmp_path, monkeypatch):
     """Blender's objects don't outlive an undo; their names do."""
+    python = tmp_path / "python"
+    python.write_text(SIMULATOR.format(python=sys.executable))
+    python.chmod(0o755)
     kinds = ("AddonPreferences", "Object", "Operator", "Panel", "PropertyGroup")
     bpy = MagicMock(types=SimpleNamespace(**{kind: type(kind, (), {}) for kind in kinds}))
+    bpy.path.abspath = bpy.path.clean_name = lambda text: text
     monkeypatch.setitem(sys.modules, "bpy", bpy)
     for name in ("eslr_garments", "eslr_garments.exchange"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     addon = importlib.import_module("eslr_garments")
-    laid, said = [], []
-    monkeypatch.setattr(addon.exchange, "read_motion", lambda path, garment: [garment])
-    monkeypatch.setattr(addon.exchange, "read_start", lambda path: 0.0)
-    monkeypatch.setattr(addon.exchange, "lay_cache", lambda garment, *rest, **options: laid.append(garment))
-    operator, garment = addon.ESLR_OT_simulate(), SimpleNamespace(name="shirt")
-    context = MagicMock()
-    context.scene.eslr.garment = garment
+    for name in ("export_body", "export_garment"):  # what Blender writes
+        monkeypatch.setattr(addon.exchange, name, lambda *rest: None)
+    context, operator, said = MagicMock(), addon.ESLR_OT_simulate(), []
     operator.report = lambda kind, text: said.append(text)
-    monkeypatch.setattr(operator, "_cache_path", lambda settings: tmp_path / "a.pc2", raising=False)
-    monkeypatch.setattr(addon.exchange, "export_body", lambda *rest: None)
-    monkeypatch.setattr(addon.exchange, "export_garment", lambda *rest: None)
-    monkeypatch.setattr(addon, "simulation_steps", lambda *rest: [])
-    for objects, result in (({"shirt": "anew"}, "FINISHED"), ({}, "CANCELLED")):
+    context.scene.frame_start, context.scene.render = 0, SimpleNamespace(fps=24, fps_base=1.0)
+    settings = context.scene.eslr
+    settings.garment, settings.folder, settings.fabric = shirt(), str(tmp_path / "cache"), "cotton"
+    settings.tolerance, settings.self_contact = "1%", False
+    context.preferences.addons.__getitem__.return_value.preferences.python = str(python)
+    anew = shirt(data=SimpleNamespace(vertices=range(4)))
+    for objects, result in (({"shirt": anew}, "FINISHED"), ({}, "CANCELLED")):
         bpy.data.objects = objects
-        assert operator._begin(context)
-        operator._is_placed = True
-        operator._job = SimpleNamespace(
-            poll=lambda: True, text="", num_done=1, warnings=[], cancel=lambda: None
-        )
-        assert operator._go_on(context) == {result}
-    assert laid == ["anew"]
-    assert said == [
-        "shirt follows 1 simulated frames",
-        "shirt is gone or has another name; simulate it again",
-    ]
+        assert operator.execute(context) == {result}, said
+    assert [modifier.name for modifier in anew.modifiers] == ["ESLR Garments"]
+    assert (tmp_path / "cache" / "shirt.pc2").exists()
+    assert said[-1].startswith("shirt is gone")
 
 
 @pytest.mark.slow
@@ -264,16 +286,6 @@ def test_the_job_shows_how_far_it_is(folder):
 def test_a_refusal_of_the_simulator_is_the_job_s(folder):
     with pytest.raises(JobError, match="did you mean denim"):
         run(Job(steps(folder, fabric="denin"), folder))
-
-
-@pytest.mark.slow
-def test_a_cancelled_job_leaves_no_process(folder):
-    job = Job(steps(folder), folder)
-    job.poll()
-    process = job._process
-    job.cancel()
-    assert process.wait(15) != 0
-    assert not (folder / "motion.npz").exists()
 
 
 @pytest.mark.slow
@@ -312,14 +324,3 @@ def test_from_install_to_a_garment_that_moves_with_the_body_and_stays_out_of_it(
     refused = blender(folder / "refused.npz", sys.executable, "denin")
     assert "did you mean denim" in str(refused["error"])
     np.testing.assert_array_equal(refused["cloth"][-1], refused["before"])
-
-
-def test_warnings_of_fit_and_simulation_are_collected_and_no_lost_folder_is_named(tmp_path):
-    (tmp_path / "fit.txt").write_text(json.dumps({"warnings": ["the place is doubtful"], "pinned": 0}))
-    (tmp_path / "simulate.txt").write_text(
-        "good: stretched by 3 %\n\x1b[33mwarning:\x1b[0m skin shows\nframes 3\n"
-    )
-    assert job._warnings(tmp_path / "fit.txt") == ["the place is doubtful"]
-    assert job._warnings(tmp_path / "simulate.txt") == ["skin shows"]
-    log = "\n".join(["compiling 3/9", "eslr: frame 3 is not finite; the frames before are kept in /tmp/a"])
-    assert job._reason(log, 2) == "frame 3 is not finite"

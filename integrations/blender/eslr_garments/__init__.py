@@ -13,16 +13,6 @@ from . import exchange
 from .exchange import ExchangeError
 from .job import Job, JobError, simulation_steps
 
-bl_info = {
-    "name": "ESLR Garments",
-    "author": "eslr_jax contributors",
-    "version": (0, 1, 0),
-    "blender": (4, 2, 0),
-    "location": "View3D > Sidebar > Garment",
-    "description": "Simulate a garment on an animated character",
-    "category": "Physics",
-}
-
 _INTERVAL = 0.25  # [s] between looks at the process
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PROGRESS = re.compile(r"(?:compiling|simulating)\D.*?(\d+)/(\d+)")
+_WARNING = "warning: "
 _PATIENCE = 10.0  # [s] that a cancelled process gets to end by itself
 
 
@@ -33,16 +34,12 @@ class Job:
 
     def __init__(self, steps: list[Step], folder: Path) -> None:
         """Take steps and a folder to work in; nothing runs before the first poll."""
-        self._steps, self._folder = steps, folder
+        self._steps, self._folder, self._log = steps, folder, folder / "log.txt"
         self._process: subprocess.Popen | None = None
         self.text = "starting"
         self.share = 0.0  # of all frames that are simulated
         self.num_done = 0  # steps
         self.warnings: list[str] = []  # of the steps that are done
-
-    @property
-    def _log(self) -> Path:
-        return self._folder / "log.txt"
 
     def poll(self) -> bool:
         """Go on; return whether all steps are done.
@@ -53,7 +50,7 @@ class Job:
         if self._process is None:
             self._process = self._start(self._steps[self.num_done])
         code = self._process.poll()
-        log = self._log.read_text(encoding="utf-8", errors="replace")
+        log = _read(self._log)
         if found := _PROGRESS.findall(log):
             done, total = map(int, found[-1])
             self.share = done / max(total, 1)
@@ -63,7 +60,12 @@ class Job:
         self._process = None
         if code:
             raise JobError(_reason(log, code))
-        self.warnings += _warnings(self._folder / self._steps[self.num_done].output)
+        printed = _read(self._folder / self._steps[self.num_done].output)
+        try:
+            self.warnings += json.loads(printed).get("warnings", ())  # as `eslr fit --json` has them
+        except ValueError:  # lines of `eslr simulate`
+            lines = printed.splitlines()
+            self.warnings += [line.removeprefix(_WARNING) for line in lines if line.startswith(_WARNING)]
         self.num_done += 1
         return self.num_done == len(self._steps)
 
@@ -106,23 +108,14 @@ class Job:
         threading.Thread(target=insist, daemon=True).start()
 
 
-def _plain(text: str) -> str:
-    """Return text without the codes that colour it in a terminal."""
-    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
-
-
-def _warnings(output: Path) -> list[str]:
-    """Return the warnings in what a command printed: those of `eslr fit --json`, or lines of `eslr simulate`."""
-    text = _plain(output.read_text(encoding="utf-8", errors="replace"))
-    try:
-        return list(json.loads(text).get("warnings", ()))
-    except ValueError:  # it printed no JSON
-        return [line.removeprefix("warning: ") for line in text.splitlines() if line.startswith("warning: ")]
+def _read(path: Path) -> str:
+    """Return what a command printed, without the codes that colour it in a terminal."""
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", path.read_text(encoding="utf-8", errors="replace"))
 
 
 def _reason(log: str, code: int) -> str:
     """Return why a command failed: its own line, or the last one that it wrote."""
-    lines = [line.strip() for line in _plain(log).splitlines() if line.strip()]
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
     if any("No module named" in line and "eslr_jax" in line for line in lines):
         return (
             "this Python has no eslr_jax; install it there (pip install), or name another in the preferences"
