@@ -14,9 +14,9 @@ from jaxtyping import Float, Int
 
 from eslr_jax.body.joints import find_named_parts
 from eslr_jax.geometry.skinning import smooth
+from eslr_jax.io.animated import Skin
 from eslr_jax.io.garment import split_outfit
 from eslr_jax.io.palette import BODY_COLORS, Color, garment_color
-from eslr_jax.io.skin import Skin
 from eslr_jax.types import Body
 
 _SKIN, _TOP, _SHORTS = 0, 1, 2
