@@ -42,15 +42,14 @@ def skirt_of(dress: GarmentFile) -> GarmentFile:
     )
 
 
+def load(name: str) -> GarmentFile:
+    """Return a garment of an outfit by its name."""
+    return skirt_of(load_garment_file("dress")) if "skirt" in name else load_garment_file(name)
+
+
 def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1) -> dict[str, Any]:
     """Return the pairs of two garments, the inner one first, in every so many frames of a walk."""
-    outfit = combine_garments(
-        [
-            skirt_of(load_garment_file("dress")) if "skirt" in name else load_garment_file(name)
-            for name in names
-        ],
-        names,
-    )
+    outfit = combine_garments([load(name) for name in names], names)
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(CLIP), num_frames=frames), SETTLE_FRAMES, body)
     options = SceneOptions(has_skin=True, integrator="bdf2", substeps=substeps)

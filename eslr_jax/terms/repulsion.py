@@ -46,19 +46,21 @@ class Repulsion(Term):
 
     def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
         """Return the energy of every pair [J]; see `repulsion_energies`."""
-        layers = problem.layers
-        return (
-            _elements(x, layers.pairs, problem.constants.repulsion_stiffness, layers.thickness, layers.limit),
-        )  # type: ignore[union-attr]
+        return (_elements(x, *_layers(problem)),)
 
     def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
         """Return an estimate of the curvature [N/m]; see `repulsion_diagonal`."""
-        layers, stiffness = problem.layers, problem.constants.repulsion_stiffness
-        return repulsion_diagonal(x, layers.pairs, stiffness, layers.thickness, layers.limit)  # type: ignore[union-attr]
+        return repulsion_diagonal(x, *_layers(problem))
 
     def describe(self, garment: Garment) -> str:
         """Return what touches what."""
         return "layers of cloth"
+
+
+def _layers(problem: FrameProblem) -> tuple[Pairs, Any, Any, Any]:
+    """Return the pairs of layers with stiffness, thickness and limit; a scene with their term has found them."""
+    layers: Any = problem.layers
+    return layers.pairs, problem.constants.repulsion_stiffness, layers.thickness, layers.limit
 
 
 @struct.dataclass

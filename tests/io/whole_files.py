@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from formats import SMPL_PARENTS, write_amass, write_bvh, write_character, write_hood, write_vto
 
-from eslr_jax.body.joints import read_joint_map
+from eslr_jax.assets.motions import read_joint_map
 from eslr_jax.body.motion import Motion
 from eslr_jax.body.rig import make_body
 from eslr_jax.body.sequence import pose_sequence
