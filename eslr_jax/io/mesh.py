@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from eslr_jax.io.parsing import parsing
 from eslr_jax.io.registry import find_reader
 
 
@@ -47,10 +48,12 @@ def read_mesh_file(path: str | Path, *, like: MeshFile | None = None) -> MeshFil
         AssetError: The file is missing, unreadable or of an unknown kind.
         MeshError: A PLY file has faces that are not triangles, or an OBJ file some that can't be cut.
     """
-    mesh = find_reader("mesh", path)(path, like)
-    return dataclasses.replace(
-        mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
-    )
+    read = find_reader("mesh", path)
+    with parsing(path, "mesh"):
+        mesh = read(path, like)
+        return dataclasses.replace(
+            mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
+        )
 
 
 def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:

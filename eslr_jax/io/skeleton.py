@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.io.npz import check_layout
 
 MAX_JOINTS = 4096  # more than any character has; a damaged file may claim more
 MAX_FRAMES = 1 << 20  # nine hours at 30 frames per second
@@ -51,25 +52,21 @@ class SkeletonMotion:
     root_axes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Check the arrays.
-
-        Raises:
-            MotionError: No frames, too many of them, or values that are not finite.
-        """
-        frames, joints = len(self.rotations), len(self.skeleton)
-        if self.rotations.shape != (frames, joints, 3, 3) or self.positions.shape != (frames, joints, 3):
-            raise MotionError(
-                f"motion {self.name}: rotations {self.rotations.shape} and positions {self.positions.shape} "
-                f"do not fit {joints} joints; export it again"
-            )
+        """Raise a MotionError unless there are frames of finite values at a possible rate."""
+        what, frames = f"motion {self.name}", len(self.rotations)
+        layout = {
+            "parents": ("iu", "joints"),
+            "rotations": ("f", "frames joints 3 3"),
+            "positions": ("f", "frames joints 3"),
+        }
+        parents = np.array(self.skeleton.parents)
+        arrays = {"parents": parents, "rotations": self.rotations, "positions": self.positions}
+        check_layout(arrays, layout, what=what, remedy="export it again", error=MotionError)
         if not 0 < frames <= MAX_FRAMES:
-            raise MotionError(f"motion {self.name} has {frames} frames; give 1 to {MAX_FRAMES}")
-        for label, values in (("rotations", self.rotations), ("positions", self.positions)):
-            is_bad = ~np.isfinite(values.reshape(frames, -1)).all(axis=1)
-            if is_bad.any():
-                raise MotionError(
-                    f"motion {self.name}: {label} of frame {np.argmax(is_bad)} are not finite; cut or repair it"
-                )
+            raise MotionError(f"{what} has {frames} frames; give 1 to {MAX_FRAMES}")
+        is_finite = np.isfinite(self.rotations).all((1, 2, 3)) & np.isfinite(self.positions).all((1, 2))
+        if not is_finite.all():
+            raise MotionError(f"{what} is not finite in frame {np.argmin(is_finite)}; cut or repair it")
         if not (np.isfinite(self.fps) and 1.0 <= self.fps <= 1000.0):
             raise MotionError(f"motion {self.name}: {self.fps} frames per second; expected 1 to 1000")
 

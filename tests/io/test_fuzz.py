@@ -226,6 +226,8 @@ def fuzz(kind, folder, options):
     attempt()
 
 
+# A damaged file may be read with a warning: of its unit, or of a number of frames.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 KINDS = (*BYTES, *ARRAYS, *ACCLAIM, "tables")
 
 
