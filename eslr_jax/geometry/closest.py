@@ -84,9 +84,9 @@ def barycentric_of_closest(
     """
     a, b, c = (triangles[..., k, :] for k in range(3))
     ab, ac = b - a, c - a
-    d1, d2 = np.vecdot(ab, points - a), np.vecdot(ac, points - a)
-    d3, d4 = np.vecdot(ab, points - b), np.vecdot(ac, points - b)
-    d5, d6 = np.vecdot(ab, points - c), np.vecdot(ac, points - c)
+    d1, d2 = _dot(ab, points - a), _dot(ac, points - a)
+    d3, d4 = _dot(ab, points - b), _dot(ac, points - b)
+    d5, d6 = _dot(ab, points - c), _dot(ac, points - c)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     total = va + vb + vc
     inside = [area / np.where(total == 0, 1.0, total) for area in (va, vb, vc)]
@@ -105,6 +105,10 @@ def barycentric_of_closest(
     return np.stack(
         [np.select(is_here, [place[k] for place in places], inside[k]) for k in range(3)], axis=-1
     )
+
+
+def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.sum(first * second, axis=-1)  # in one order everywhere: equally near faces are told by rounding
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
