@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.timing import check_length
+from eslr_jax.body.motion import SHOULDERS, check_length
 from eslr_jax.contact.self_contact import SEARCH_RADIUS, starting_capacity
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.fit.postures import SHOULDERS
 from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.geometry.surface import prepare_surface
