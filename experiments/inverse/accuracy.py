@@ -4,7 +4,7 @@
 
 The loss is the garment's mean height, the parameters are stretch stiffness, bending stiffness, density and a lift
 of the body, in float32. They are compared with central differences in float64. A crumpled sheet has many minima
-beside each other; so float64 starts each frame where float32 came to rest, and goes on to where float64 ends. How
+beside each other, so float64 starts each frame where float32 came to rest, and goes on to where float64 ends. How
 far that is, is in the result. The cost is the processor time of loss and gradient over that of the loss alone,
 timed in turns. Writes accuracy.json.
 """
@@ -72,7 +72,7 @@ def height(change: Change, scene: Scene, frame: jax.Array | int) -> tuple[jax.Ar
 
 
 def differences(scene: Scene, rests: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the derivatives at every frame in float64, and how far the minima are from where float32 rests [m]."""
+    """Return the derivatives at every frame in float64, and how far each minimum is from where float32 rests."""
 
     @jax.jit
     def solved(scene: Scene, rests: jax.Array) -> tuple[jax.Array, jax.Array]:
