@@ -22,7 +22,7 @@ import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.body.motion import pose_body
-from eslr_jax.evaluation.calibrate import simulator_of
+from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import environment
 from eslr_jax.io.atomic import atomic_write
@@ -30,10 +30,9 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scene, prepare_scenes
 from eslr_jax.simulation.budget import (
     Calibration,
-    choose,
     device_name,
+    first_iterations,
     keep_budget,
-    methods_at,
     read_calibration,
 )
 from eslr_jax.simulation.rollout import rollout_scene
@@ -45,44 +44,34 @@ GARMENTS = ("tshirt", "dress", "pants")
 TOLERANCES = (0.01, 0.001)
 PARTS = ("tolerance", "budget")
 BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration knows of
+MOST_ITERATIONS = 500  # of a frame with a tolerance, as in `SimConfig`
 EVERY = 2  # frames between those whose gap is measured
 
 
-def vertex_count(scene: Scene) -> int:
-    """Return the number of vertices of a scene's garment, without padding."""
-    return int(np.sum(scene.garment.vertex_mask))
-
-
-def measure_tolerance(
-    calibration: Calibration, scenes: Sequence[Scene], tolerance: float, every: int
-) -> dict[str, Any]:
+def measure_tolerance(scenes: Sequence[Scene], tolerance: float, every: int) -> dict[str, Any]:
     """Return how many frames of free rollouts keep a tolerance.
 
     Args:
-        calibration: Measurements that the simulator is chosen from.
         scenes: Scenes of one resolution.
         tolerance: Relative gap that is asked for.
         every: Distance of the frames whose gap is measured.
     """
-    choices, shares, spent = [], [], []
+    config = SimConfig(iterations=MOST_ITERATIONS, tolerance=tolerance)
+    shares, spent = [], []
     for scene in scenes:
-        choice = choose(calibration, vertex_count(scene), tolerance=tolerance)
-        params, config = simulator_of(choice.method, tolerance=choice.tolerance)
-        trajectory = rollout_scene(params, scene, config, choice.iterations)
+        trajectory = rollout_scene(None, scene, config)
         gap = trajectory_gap(trajectory, scene, every=every)
-        choices.append(choice)
         shares.append(np.asarray(gap.share(gap.reached)))
         spent.append(float(np.mean(trajectory.iterations[1:])))
     joined = np.concatenate(shares)
     return {
         "tolerance": tolerance,
-        "methods": sorted({choice.method for choice in choices}),
         "frames": len(joined),
         "kept": float(np.mean(joined <= tolerance)),
         "gap_relative_median": float(np.median(joined)),
         "gap_relative_p99": float(np.quantile(joined, 0.99)),
         "iterations_mean": float(np.mean(spent)),
-        "iterations_allowed": max(choice.iterations for choice in choices),
+        "iterations_allowed": MOST_ITERATIONS,
     }
 
 
@@ -90,19 +79,17 @@ def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dic
     """Return how long the frames of a rollout take with a budget.
 
     Args:
-        calibration: Measurements that the simulator is chosen from.
+        calibration: Measurements that the first iterations are chosen from.
         scene: Scene to simulate.
         factor: Budget as a multiple of the fastest frame that the calibration knows of.
     """
-    count = vertex_count(scene)
-    fastest = min(method.fixed_ms + method.iteration_ms for method in methods_at(calibration, count))
-    budget = factor * fastest
-    choice = choose(calibration, count, budget_ms=budget)
-    params, config = simulator_of(choice.method, choice.iterations)
-    simulation = simulate(params, scene, config=config, pace=keep_budget(choice, budget))
+    cost = calibration.cost(int(np.sum(scene.garment.vertex_mask)))
+    budget = factor * cost.frame_ms(1)
+    iterations = first_iterations(cost, budget)
+    config = SimConfig(iterations=iterations, tolerance=0.0)
+    simulation = simulate(None, scene, config=config, pace=keep_budget(cost, budget))
     return {
-        "method": choice.method,
-        "iterations": choice.iterations,
+        "iterations": iterations,
         "iterations_mean": float(np.mean(simulation.trajectory.iterations[1:])),
         "budget_ms": budget,
         "frame_ms": simulation.timing.frame_ms,
@@ -148,7 +135,7 @@ def main() -> None:
         for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
         for tolerance in tasks:
-            row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
+            row = {"size": size, **measure_tolerance(scenes, tolerance, every)}
             kept["tolerance"].append(row)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
         for garment, cloth in cloths.items() if "budget" in arguments.parts else ():

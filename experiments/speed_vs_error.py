@@ -16,23 +16,20 @@ Writes speed_vs_error.json and .png after every size.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 
 import jax
 import numpy as np
+from methods import Method, interpolate_gap, measure_methods
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.models import START_MODEL
-from eslr_jax.evaluation.calibrate import (
-    example_scene,
-    measure_methods,
-    read_coarse_edges,
-    simulator_of,
-)
+from eslr_jax.evaluation.calibrate import example_scene, read_coarse_edges, simulator_of
 from eslr_jax.evaluation.report import environment, trajectory_report
 from eslr_jax.io.atomic import atomic_write
-from eslr_jax.simulation.budget import SOLVER, Method, device_name, interpolate_gap
+from eslr_jax.simulation.budget import SOLVER, device_name
 from eslr_jax.simulation.rollout import rollout_scene
 
 RESULTS = Path(__file__).parent / "results"
@@ -46,7 +43,7 @@ def points(method: Method) -> list[dict]:
     return [
         {
             "iterations": int(count),
-            "frame_ms": method.fixed_ms + int(count) * method.iteration_ms,
+            "frame_ms": method.cost.frame_ms(int(count)),
             "gap_relative_median": gap,
             "gap_relative_p99": method.p99[count],
         }
@@ -175,7 +172,7 @@ def main() -> None:
         ]
         methods = measure_methods(names, scenes)
         print(f"{size}: methods measured", flush=True)
-        measured = {method.name: points(method) for method in methods}
+        measured = {method.cost.name: points(method) for method in methods}
         about = environment()
         if arguments.peers:
             import peers
@@ -201,10 +198,7 @@ def main() -> None:
             "garments": garments,
             "frames": frames,
             "methods": measured,
-            "costs": [
-                {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
-                for method in methods
-            ],
+            "costs": [dataclasses.asdict(method.cost) for method in methods],
             "budgets": who_wins(measured, result["peers"]),
             "rollouts": rollouts,
             "environment": about,

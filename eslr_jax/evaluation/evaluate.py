@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
 from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import EvaluationOptions, ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.evaluation.controls import Control, control_garment, control_params
+from eslr_jax.evaluation.controls import control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import simulated_terms
@@ -27,32 +26,6 @@ _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
-
-
-@dataclasses.dataclass(frozen=True)
-class EvaluationOptions:
-    """What to evaluate, and how densely."""
-
-    split: str = "test"
-    garments: tuple[str, ...] = ()  # empty: the training garments
-    clips: tuple[str, ...] = ()  # empty: all of the split
-    vertices: str = "1k"
-    gap_frames: int = 40  # frames of each clip for the gap; 0: it is not measured
-    every: int = 4  # of those, measure one in so many
-    rollout_frames: int = 300  # of the free rollout; clips are played back and forth
-    control: Control | None = None  # what the network is deprived of; see `controls`
-
-    def __post_init__(self) -> None:
-        """Reject lengths that leave nothing to measure.
-
-        Raises:
-            ConfigError: Names the field and the least value.
-        """
-        for name, least in (("gap_frames", 3), ("every", 1), ("rollout_frames", 4)):
-            if getattr(self, name) < least and (name, getattr(self, name)) != ("gap_frames", 0):
-                raise ConfigError(
-                    f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
-                )
 
 
 def evaluate(

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from eslr_jax.cli.budget import parse_budget, parse_request, parse_share
+
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation.calibrate import example_scene, fit_costs, read_coarse_edges
 from eslr_jax.simulation.budget import (

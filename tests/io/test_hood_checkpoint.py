@@ -8,10 +8,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from eslr_jax.cli.convert import convert
 from reference_models import make_scene, quick_jit
 from test_torch_archive import Tensor, write_archive
 
-from eslr_jax.cli.convert import convert
 from eslr_jax.cli.simulate import simulate
 from eslr_jax.errors import AssetError, CheckpointError
 from eslr_jax.geometry.coarse import add_coarse_edges

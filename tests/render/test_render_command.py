@@ -4,9 +4,9 @@ import typing
 
 import numpy as np
 import pytest
+from eslr_jax.cli.moment import parse_seconds
 from example_runs import write_run
 
-from eslr_jax.cli.moment import parse_seconds
 from eslr_jax.cli.runs import render
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.fields import FIELDS
