@@ -107,7 +107,7 @@ def choose_method(options: Options) -> Method:
     if network is None and (options.simulator == "network" or iterations == 0):
         network = DEFAULT_MODEL
     budget_ms = None if options.budget is None else parse_budget(options.budget)
-    stops = {} if options.tolerance is None else {"tolerance": parse_share(options.tolerance)}
+    stops: dict[str, Any] = {} if options.tolerance is None else {"tolerance": parse_share(options.tolerance)}
     if iterations is None and network is not None and not stops and budget_ms is None:
         iterations = BEHIND_NETWORK
     if iterations is not None:

@@ -50,7 +50,7 @@ from rollouts import (
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
 from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
 from eslr_jax.body.motion import pose_body
-from eslr_jax.cli.train import train
+from eslr_jax.cli.train import Train
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
@@ -181,9 +181,9 @@ def run_training(training: Training, changes: tuple[str, ...]) -> None:
     if (training.folder / "model.npz").exists():
         return
     if has_checkpoint(training.folder):
-        train(training.folder, resume=True)
+        Train(training.folder, resume=True)()
     else:
-        train(training.folder, training.recipe, (*training.changes(), *changes))
+        Train(training.folder, training.recipe, (*training.changes(), *changes))()
     if not (training.folder / "model.npz").exists():
         raise SystemExit("the training was stopped; run the same command to go on")
 

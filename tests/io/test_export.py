@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import trimesh
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
-from eslr_jax.cli.runs import export
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, in_vertex_order
@@ -387,30 +385,10 @@ def test_point_caches_of_nothing_are_not_written(tmp_path, points):
     assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["garment.npz", "trajectory.npz", "report.json"])
-def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name):
-    write_trajectory(tmp_path / "trajectory.npz", run)
-    before = (tmp_path / "trajectory.npz").read_bytes()
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(AssetError, match="a file of the run itself"):
-        export(tmp_path, Path(name), format_="npz", content="garment")
-    assert os.listdir(tmp_path) == ["trajectory.npz"]
-    assert (tmp_path / "trajectory.npz").read_bytes() == before
-
-
 @pytest.mark.slow
 def test_the_command_exports_a_run(tmp_path, run):
     write_trajectory(tmp_path / "trajectory.npz", run)
-    command = [
-        sys.executable,
-        "-m",
-        "eslr_jax.cli",
-        "export",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "a.mdd"),
-    ]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = eslr("export", tmp_path, "--out", tmp_path / "a.mdd")
     assert result.returncode == 0, result.stderr
     assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
     assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes
