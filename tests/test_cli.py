@@ -15,9 +15,9 @@ from garment_files import scanned_tshirt
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion
 from eslr_jax.body.rig import skeleton_motion
+from eslr_jax.cli.method import choose_method
+from eslr_jax.cli.options import Options
 from eslr_jax.io.garment import read_garment_npz
-
-SMALL = ("--model", "smooth-small")
 
 
 @pytest.mark.slow
@@ -197,31 +197,49 @@ def test_a_home_folder_is_expanded_before_anything_is_read(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("options", "expected"),
     [
-        ((), ("physics", None, 0.01)),
-        (("--simulator", "physics"), ("physics", None, 0.01)),
-        (("--tolerance", "5%"), ("physics", None, 0.05)),
-        (("--iterations", 7), ("physics", None, None)),
-        (("--budget", "1s"), ("physics", None, None)),
-        ((*SMALL,), ("network", "smooth-small, then 10 iterations of the solver", None)),
-        ((*SMALL, "--iterations", 3), ("network", "smooth-small, then 3 iterations of the solver", None)),
-        ((*SMALL, "--tolerance", "5%"), ("network", "smooth-small, then the solver", 0.05)),
-        ((*SMALL, "--iterations", 0), ("network", "smooth-small", None)),
-        (("--iterations", 0), ("network", "eslr-small", None)),
+        ({}, (None, 500, 0.01)),
+        ({"simulator": "physics"}, (None, 500, 0.01)),
+        ({"tolerance": "0.1%"}, (None, 500, 0.001)),
+        ({"iterations": 7}, (None, 7, None)),
+        ({"model": "smooth-small"}, ("smooth-small, then 10 iterations of the solver", 10, None)),
+        (
+            {"model": "smooth-small", "iterations": 3},
+            ("smooth-small, then 3 iterations of the solver", 3, None),
+        ),
+        ({"model": "smooth-small", "tolerance": "5%"}, ("smooth-small, then the solver", 500, 0.05)),
+        ({"model": "smooth-small", "iterations": 0}, ("smooth-small", 0, None)),
+        ({"simulator": "network"}, ("eslr-small, then 10 iterations of the solver", 10, None)),
+        ({"iterations": 0}, ("eslr-small", 0, None)),
     ],
-)  # fmt: skip
-def test_the_report_says_what_solved_the_frames_and_added_iterations_are_announced(tmp_path, words, expected):
-    usual = ("--frames", 3, "--settle", 0, "--no-pictures", "--json", "--out", tmp_path)
-    done = eslr_here("simulate", *words, *usual)
+)
+def test_the_options_say_what_solves_a_frame(options, expected):
+    method = choose_method(Options(**options))
+    assert (method.model, method.config.iterations, method.tolerance) == expected
+
+
+def test_a_budget_buys_iterations_of_the_solver_and_of_a_network():
+    alone, behind = (
+        choose_method(Options(budget="12ms", model=model)).within_budget(1000, 1)
+        for model in (None, "smooth-small")
+    )
+    assert alone.config.iterations > behind.config.iterations > 1
+    assert behind.model == "smooth-small, then the solver"
+    assert (alone.tolerance, alone.budget_ms) == (None, 12.0)
+    assert alone.pace(alone.config.iterations, 1e3) == 5
+
+
+@pytest.mark.slow
+def test_iterations_that_are_added_to_a_network_are_announced(tmp_path):
+    words = ("--frames", 3, "--settle", 0, "--no-pictures", "--json", "--out", tmp_path)
+    done = eslr("simulate", "--model", "smooth-small", *words)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert (report["simulator"], report["model"], report["tolerance"]) == expected
-    if "--iterations" in words:
-        assert report["iterations_mean"] == words[-1]
-    is_added = "--model" in words and "--iterations" not in words
+    assert report["model"] == "smooth-small, then 10 iterations of the solver"
+    assert report["iterations_mean"] == 10
     line = f"a frame is solved by {report['model']}; --iterations 0 is the network alone"
-    assert done.stderr.splitlines().count(line) == is_added
+    assert done.stderr.splitlines().count(line) == 1
 
 
 def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path):

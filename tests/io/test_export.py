@@ -9,6 +9,7 @@ import numpy as np
 import pygltflib as gltf
 import pytest
 import trimesh
+from commands import eslr
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
