@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from eslr_jax.assets import load_body, load_garment_file, load_motion
 from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.cli.method import choose_method
 from eslr_jax.cli.options import Options
+from eslr_jax.config import from_dict
 from eslr_jax.io.garment import read_garment_npz
 
 
@@ -217,6 +219,18 @@ def test_a_home_folder_is_expanded_before_anything_is_read(tmp_path, monkeypatch
 def test_the_options_say_what_solves_a_frame(options, expected):
     method = choose_method(Options(**options))
     assert (method.model, method.config.iterations, method.tolerance) == expected
+
+
+def test_options_survive_the_record_that_a_run_goes_on_from():
+    options = Options(
+        garment=("pants", "tshirt"),
+        betas=(1.0, -2.0),
+        wind=(3.0, 0.0, 0.0),
+        joint_map=Path("map.json"),
+        iterations=30,
+        no_self_contact=True,
+    )
+    assert from_dict(Options, json.loads(json.dumps(options.record()))) == options
 
 
 def test_a_budget_buys_iterations_of_the_solver_and_of_a_network():

@@ -86,29 +86,22 @@ class _Setting(NamedTuple):
     scene: Scene  # with these frames
 
 
-class _Interrupted(NamedTuple):
-    """What an interrupted simulation goes on from."""
-
-    done: Trajectory  # the first frames
-    capacity: PairCapacity | None  # buffers of self-contact that sufficed
-
-
 def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report."""
     from eslr_jax.io.atomic import ensure_output_dir
 
-    interrupted = None
+    done, capacity = None, None
     if options.resume:
-        options, interrupted = _read_interrupted(options)
+        options, done, capacity = _read_interrupted(options)
     options.check()
     with waiting("preparing garment, body and motion"):
         setting = _prepare(options)
-        if interrupted is not None:
-            _check_same_scene(interrupted.done, setting.scene, options.out)
-            setting = setting._replace(scene=setting.scene.replace(self_contact=interrupted.capacity))
+    if done is not None:
+        _check_same_scene(done, setting.scene, options.out)
+        setting = setting._replace(scene=setting.scene.replace(self_contact=capacity))
     ensure_output_dir(options.out)
     _announce(options, setting)
-    simulation = _run(setting, None if interrupted is None else interrupted.done, stop)
+    simulation = _run(setting, done, stop)
     timing, budget_ms = simulation.timing, setting.method.budget_ms
     if timing.compile_s > _LONG:
         say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
@@ -124,8 +117,8 @@ def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
     return report
 
 
-def _read_interrupted(given: Simulate) -> tuple[Simulate, _Interrupted]:
-    """Return the options of the simulation that was interrupted in a folder, and what it goes on from.
+def _read_interrupted(given: Simulate) -> tuple[Simulate, Trajectory, PairCapacity | None]:
+    """Return the options of an interrupted simulation, its frames, and buffers of self-contact that sufficed.
 
     Raises:
         AssetError: The folder holds no interrupted simulation.
@@ -151,7 +144,7 @@ def _read_interrupted(given: Simulate) -> tuple[Simulate, _Interrupted]:
                 f"{_typed(value)}; leave out all options but --out to go on, or start in another folder without "
                 "--resume"
             )
-    return dataclasses.replace(given, **vars(own)), _Interrupted(done, capacity)
+    return dataclasses.replace(given, **vars(own)), done, capacity
 
 
 def _typed(value: Any) -> str:
