@@ -14,7 +14,7 @@ from rich.table import Table
 
 from eslr_jax.cli.actor import load_actor
 from eslr_jax.cli.console import app, print_report, progress, say, use_compile_cache, waiting
-from eslr_jax.cli.options import DEFAULT_GARMENT, Options
+from eslr_jax.cli.options import Options
 from eslr_jax.config import EvaluationOptions
 from eslr_jax.errors import ConfigError, MeshError, MotionError
 
@@ -164,7 +164,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
             "the innermost first, or score one mesh of the file as FILE#NAME"
         )
     options = Options(**given, frames=len(sequences[0].positions))
-    files = options.garment or (DEFAULT_GARMENT,)
+    files = options.garments
     check_resolution(files, options.vertices)
     rig, poses, motion, _ = load_actor(options)
     garments = [load_garment_file(file, vertices=options.vertices, body=rig) for file in files]

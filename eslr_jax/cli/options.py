@@ -93,6 +93,11 @@ class Options:
     # Internal damping of the fabric in seconds, such as 0.005; it calms fast ripples first.
     damping: float | None = None
 
+    @property
+    def garments(self) -> tuple[str, ...]:
+        """The garments, the innermost first."""
+        return self.garment or (DEFAULT_GARMENT,)
+
     def check(self) -> None:
         """Check what needs no file.
 

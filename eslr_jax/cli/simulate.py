@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from eslr_jax.cli.actor import Actor, load_actor
 from eslr_jax.cli.console import EXIT_CODE, app, print_report, progress, say, use_compile_cache, waiting
 from eslr_jax.cli.method import Method, choose_method
-from eslr_jax.cli.options import DEFAULT_GARMENT, Options
+from eslr_jax.cli.options import Options
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -185,8 +185,7 @@ def _prepare(options: Options) -> _Setting:
     from eslr_jax.scene.plan import SceneOptions, prepare_scene
     from eslr_jax.simulation.simulate import begin_compiling
 
-    names = options.garment or (DEFAULT_GARMENT,)
-    method = choose_method(options)
+    names, method = options.garments, choose_method(options)
     check_resolution(names, options.vertices)
     actor = load_actor(options)
 
