@@ -56,7 +56,7 @@ def evaluate(
         raise ConfigError(f"iterations = {iterations}; give 0 or more")
     garments = options.garments or tuple(load_splits()["garments"]["train"])
     clips = options.clips or split_clips(options.split)
-    config = SimConfig(model=model, iterations=iterations)
+    config = SimConfig(model=model, iterations=iterations, tolerance=0.0)
     body = load_body()
     scenes, forced, policy = [], [], []
     drifts: dict[str, float | None] = {}
@@ -106,7 +106,7 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
     """Return the gaps from the optimum's states and from those of the network's own rollout."""
     options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
-    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS)), (params, config)):
+    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)), (params, config)):
         trajectory = _roll(weights, scene, steps)
         measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
     return measured[0], measured[1]
@@ -136,7 +136,7 @@ def _free_rollout(params: Any, scene: Scene, config: SimConfig) -> dict[str, Any
     """Return the measures of one free rollout, beside those of the solver's on the same scene."""
     trajectory = _roll(params, scene, config)
     measured = measure_rollout(trajectory, scene)
-    near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS)
+    near_optimum = SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0)
     reference = _roll(None, scene, near_optimum)
     return {
         **measured,
