@@ -13,6 +13,9 @@ from eslr_jax.errors import ConfigError
 Criterion = Literal["postcvpr", "cvpr", "metric"]
 """Readings of HOOD's losses, see `terms.hood`."""
 
+Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
+"""What a network may be deprived of, see `evaluation.controls`."""
+
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 """Edge sets of a garment's coarse levels, finest first (HOOD)."""
 
@@ -176,6 +179,41 @@ class SimConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class EvaluationOptions:
+    """What to evaluate a network on, and how densely."""
+
+    # train, validation, test or unseen_motion.
+    split: str = "test"
+    # Resolution of the garments.
+    vertices: Literal["1k", "4k", "10k"] = "1k"
+    # Only these; the training garments if not given.
+    garments: tuple[str, ...] = ()
+    # Only these; all of the split if not given.
+    clips: tuple[str, ...] = ()
+    # Number of frames of each clip in which the gap is measured. 0 skips the gap, which takes most of the time.
+    gap_frames: int = 40
+    # Measure only every n-th of these frames.
+    every: int = 4
+    # Length of the free rollouts; clips are played back and forth.
+    rollout_frames: int = 300
+    # Take something away, to see what it does: weights that were never trained, a decoder of zeros, geodesic
+    # coordinates that are zero, or random ones.
+    control: Control | None = None
+
+    def __post_init__(self) -> None:
+        """Reject lengths that leave nothing to measure.
+
+        Raises:
+            ConfigError: Names the field and the least value.
+        """
+        for name, least in (("gap_frames", 3), ("every", 1), ("rollout_frames", 4)):
+            if getattr(self, name) < least and (name, getattr(self, name)) != ("gap_frames", 0):
+                raise ConfigError(
+                    f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
@@ -327,32 +365,11 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
             return tuple(_convert(get_args(candidate)[0], entry, name) for entry in value)
         if origin is int and isinstance(value, bool):
             continue
+        if origin is Path and isinstance(value, str):
+            return Path(value)
         if isinstance(origin, type) and isinstance(value, origin):
             return value
     raise ConfigError(f"{name} = {value!r} has the wrong type; expected {hint}")
-
-
-def describe_keys(cls: type, prefix: str = "") -> list[str]:
-    """Return a line for every key of a config: its name, its default, and what its source says of it.
-
-    Args:
-        cls: A frozen dataclass of this module.
-        prefix: What goes before the names, such as "model.".
-    """
-    said: dict[str, str] = {}
-    above: list[str] = []
-    source = Path(__file__).read_text()  # `inspect` would tokenise all of it
-    for line in source.partition(f"\nclass {cls.__name__}:")[2].partition("\n    def ")[0].splitlines():
-        text, _, comment = line.strip().partition("# ")
-        name, is_field, _ = text.partition(": ")
-        if is_field and name.isidentifier() and name in cls.__annotations__:
-            said[name] = " ".join([*above, comment]).strip()
-        above = [*above, comment] if comment and not text else []
-    lines = []
-    for field in dataclasses.fields(cls):
-        is_given = field.default is dataclasses.MISSING
-        lines.append(f"{prefix}{field.name}{'' if is_given else f' = {field.default}'}: {said[field.name]}")
-    return lines
 
 
 def to_dict(config: Any) -> dict[str, Any]:

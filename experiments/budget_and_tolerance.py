@@ -19,13 +19,13 @@ import jax
 import numpy as np
 from harness import kept, machine, parser, put
 
-from eslr_jax import load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.assets import load_splits
-from eslr_jax.evaluation.calibrate import simulator_of
+from eslr_jax.config import MOST_ITERATIONS
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scenes
-from eslr_jax.simulation.budget import Calibration, choose, keep_budget, methods_at, read_calibration
+from eslr_jax.simulation.budget import Calibration, first_iterations, keep_budget, read_calibration
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 
@@ -36,43 +36,36 @@ BUDGETS = (1.5, 3.0, 6.0)  # multiples of the fastest frame that the calibration
 EVERY = 2  # frames between those whose gap is measured
 
 
-def measure_tolerance(
-    calibration: Calibration, scenes: Sequence[Scene], tolerance: float, every: int
-) -> dict[str, Any]:
+def measure_tolerance(scenes: Sequence[Scene], tolerance: float, every: int) -> dict[str, Any]:
     """Return how many of every so many frames keep a relative gap; scenes are of one resolution."""
-    choices, shares, spent = [], [], []
+    config = SimConfig(iterations=MOST_ITERATIONS, tolerance=tolerance)
+    shares, spent = [], []
     for scene in scenes:
-        choice = choose(calibration, int(np.sum(scene.garment.vertex_mask)), tolerance=tolerance)
-        params, config = simulator_of(choice.method, tolerance=choice.tolerance)
-        trajectory = rollout_scene(params, scene, config, choice.iterations)
+        trajectory = rollout_scene(None, scene, config)
         gap = trajectory_gap(trajectory, scene, every=every)
-        choices.append(choice)
         shares.append(np.asarray(gap.share(gap.reached)))
         spent.append(float(np.mean(trajectory.iterations[1:])))
     joined = np.concatenate(shares)
     return {
         "tolerance": tolerance,
-        "methods": sorted({choice.method for choice in choices}),
         "frames": len(joined),
         "kept": float(np.mean(joined <= tolerance)),
         "gap_relative_median": float(np.median(joined)),
         "gap_relative_p99": float(np.quantile(joined, 0.99)),
         "iterations_mean": float(np.mean(spent)),
-        "iterations_allowed": max(choice.iterations for choice in choices),
+        "iterations_allowed": MOST_ITERATIONS,
     }
 
 
 def measure_budget(calibration: Calibration, scene: Scene, factor: float) -> dict[str, Any]:
     """Return how long frames take with a budget, a multiple of the fastest frame that the calibration knows."""
-    count = int(np.sum(scene.garment.vertex_mask))
-    fastest = min(method.fixed_ms + method.iteration_ms for method in methods_at(calibration, count))
-    budget = factor * fastest
-    choice = choose(calibration, count, budget_ms=budget)
-    params, config = simulator_of(choice.method, choice.iterations)
-    simulation = simulate(params, scene, config=config, pace=keep_budget(choice, budget))
+    cost = calibration.cost(int(np.sum(scene.garment.vertex_mask)))
+    budget = factor * cost.frame_ms(1)
+    iterations = first_iterations(cost, budget)
+    config = SimConfig(iterations=iterations, tolerance=0.0)
+    simulation = simulate(None, scene, config=config, pace=keep_budget(cost, budget))
     return {
-        "method": choice.method,
-        "iterations": choice.iterations,
+        "iterations": iterations,
         "iterations_mean": float(np.mean(simulation.trajectory.iterations[1:])),
         "budget_ms": budget,
         "frame_ms": simulation.timing.frame_ms,
@@ -104,7 +97,7 @@ def main() -> None:
         for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
             scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
         for tolerance in tasks:
-            row = {"size": size, **measure_tolerance(calibration, scenes, tolerance, every)}
+            row = {"size": size, **measure_tolerance(scenes, tolerance, every)}
             put(path, "tolerance", row, ("size", "tolerance"), about)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
         for garment, cloth in cloths.items() if "budget" in chosen.parts else ():

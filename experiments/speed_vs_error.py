@@ -15,16 +15,18 @@ Writes speed_vs_error.json and .png after every size.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
 from harness import keep, kept, parser, save
+from methods import Method, measure_methods
 
 from eslr_jax.assets import asset_names
 from eslr_jax.assets.models import START_MODEL
-from eslr_jax.evaluation.calibrate import example_scene, measure_methods, read_coarse_edges, simulator_of
+from eslr_jax.evaluation.calibrate import example_scene, read_coarse_edges, simulator_of
 from eslr_jax.evaluation.report import environment, trajectory_report
-from eslr_jax.simulation.budget import SOLVER, Method, device_name
+from eslr_jax.simulation.budget import SOLVER, device_name
 from eslr_jax.simulation.rollout import rollout_scene
 
 CLIP = "cmu_016_32"  # of the test split
@@ -37,7 +39,7 @@ def points(method: Method) -> list[dict]:
     return [
         {
             "iterations": int(count),
-            "frame_ms": method.fixed_ms + int(count) * method.iteration_ms,
+            "frame_ms": method.cost.frame_ms(int(count)),
             "gap_relative_median": gap,
             "gap_relative_p99": method.p99[count],
         }
@@ -124,7 +126,7 @@ def main() -> None:
         ]
         methods = measure_methods(names, scenes)
         print(f"{size}: methods measured", flush=True)
-        measured = {method.name: points(method) for method in methods}
+        measured = {method.cost.name: points(method) for method in methods}
         about = environment()
         if chosen.peers:
             import peers
@@ -150,10 +152,7 @@ def main() -> None:
             "garments": garments,
             "frames": frames,
             "methods": measured,
-            "costs": [
-                {key: getattr(method, key) for key in ("name", "vertices", "fixed_ms", "iteration_ms")}
-                for method in methods
-            ],
+            "costs": [dataclasses.asdict(method.cost) for method in methods],
             "rollouts": rollouts,
             "environment": about,
         }

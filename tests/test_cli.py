@@ -1,7 +1,6 @@
 """The command line as a user meets it."""
 
 import dataclasses
-import inspect
 import json
 import os
 import re
@@ -11,29 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
+from commands import eslr, eslr_here, refused
 from formats import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion
 from eslr_jax.body.rig import skeleton_motion
-from eslr_jax.errors import AssetError, ConfigError, MotionError
-from eslr_jax.fit.options import FitOptions
+from eslr_jax.cli.method import choose_method
+from eslr_jax.cli.options import Options
+from eslr_jax.config import from_dict
 from eslr_jax.io.garment import read_garment_npz
-
-
-def eslr(*arguments, cwd=None):
-    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
-
-
-def refused(result, *words):
-    lines = [line for line in result.stderr.strip().splitlines() if line.startswith("eslr: ")]
-    assert result.returncode == 2, result.stderr
-    assert len(lines) == 1, result.stderr
-    assert "Traceback" not in result.stderr
-    for word in words:
-        assert word in lines[0]
 
 
 @pytest.mark.slow
@@ -91,17 +77,8 @@ def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
     result = eslr("simulate", *options, "--out", tmp_path, "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
-    assert (report["model"], report["integrator"]) == ("smooth-small", integrator)
+    assert report["integrator"] == integrator
     assert report["finite"]
-
-
-@pytest.mark.parametrize("command", ["simulate", "play", "score"])
-def test_garments_may_be_given_again(command):
-    from eslr_jax.cli import _refuse_repetition
-
-    _refuse_repetition([command, "--garment", "pants", "--garment", "tshirt"])
-    with pytest.raises(ConfigError, match="--motion is given twice"):
-        _refuse_repetition([command, "--motion", "turn", "--motion=jump"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
@@ -144,91 +121,29 @@ def test_assets_lists_every_kind():
     assert {"body", "garment", "motion", "fabric"} <= kinds
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"body": "anny"}, "only --export takes a body; leave out --body"),
-        ({"kind": "fabric", "verify": True}, "fabrics have no files; leave out --verify"),
-        ({"export": Path("a.obj"), "kind": "body", "json_": True}, "lists nothing; leave out --kind, --json"),
-        ({"export": Path("a.obj"), "verify": True}, "lists nothing; leave out --verify"),
-    ],
-)
-def test_options_of_assets_that_would_do_nothing_are_refused(options, words):
-    from eslr_jax.cli.assets import assets
-
-    with pytest.raises(ConfigError, match=words):
-        assets(**options)
-
-
-def test_a_missing_file_is_told_with_the_damaged_ones(monkeypatch):
+def test_a_file_that_differs_from_its_checksum_is_told(monkeypatch):
     from eslr_jax.assets import catalog
-    from eslr_jax.cli.assets import assets
 
     lost = dataclasses.replace(catalog.list_assets()[0], file="lost.npz")
     monkeypatch.setattr(catalog, "list_assets", lambda: (lost,))
-    with pytest.raises(AssetError, match=r"damaged or missing: lost\.npz"):
-        assets(verify=True)
+    refused(eslr_here("assets", "--verify"), "damaged or missing: lost.npz")
 
 
-def test_info_takes_the_networks_that_simulate_takes(tmp_path, capsys, monkeypatch):
+def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
     from eslr_jax.assets.catalog import find_asset
-    from eslr_jax.cli.assets import info
 
-    info(model="eslr-small", json_=True)  # also an architecture, of twelve steps
-    assert json.loads(capsys.readouterr().out)["config"]["refinement_steps"] == 14
-    info(model="eslr-small:4", json_=True)
-    assert json.loads(capsys.readouterr().out)["config"]["refinement_steps"] == 4
+    def shown(model):
+        done = eslr_here("info", "--model", model, "--json")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    assert shown("eslr-small")["config"]["refinement_steps"] == 14  # also an architecture, of twelve steps
+    assert shown("eslr-small:4")["config"]["refinement_steps"] == 4
     bundled = find_asset("model", "eslr-small")
     (tmp_path / "mine").write_bytes(bundled.read_bytes())
     (tmp_path / "mine.json").write_bytes(bundled.with_suffix(".json").read_bytes())
     monkeypatch.chdir(tmp_path)
-    info(model="mine", json_=True)
-    assert json.loads(capsys.readouterr().out)["model"] == "mine"
-    with pytest.raises(
-        AssetError, match=r"did you mean eslr-small\? .* of architectures there are .*eslr-15"
-    ):
-        info(model="eslr-smal")
-    with pytest.raises(ConfigError, match="only a --scene takes these; leave out --motion, --self-contact"):
-        info(motion="turn", self_contact=True)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--garment", "tshrit"), ("no garment named", "tshirt")),
-        (("--motion", "moonwalk"), ("no motion named", "cmu_016_32")),
-        (("--body", "robot"), ("no body named", "anny")),
-        (("--garment", "missing.obj"), ("missing.obj",)),
-        (("--frames", "1"), ("two frames",)),
-        (("--budget", "20ms", "--model", "eslr-small"), ("leave out", "--model")),
-        (("--tolerance", "1%", "--iterations", "5"), ("leave out", "--iterations")),
-        (("--budget", "20ms", "--tolerance", "1%"), ("either",)),
-        (("--simulator", "physics", "--model", "eslr-small"), ("leave out --model",)),
-        (("--garment", "tshirt", "--garment", "tshirt"), ("worn once only",)),
-        (("--motion", "turn", "--motion", "jump"), ("--motion is given twice",)),
-        (("--frames", "100000", "--simulator", "physics"), ("fewer than",)),
-    ],
-)
-def test_unknown_names_are_refused_in_one_line(tmp_path, arguments, words):
-    refused(eslr("simulate", "--out", tmp_path / "out", *arguments), *words)
-    assert not list(tmp_path.glob("out/*"))
-
-
-def test_unwritable_output_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    refused(eslr("simulate", "--out", tmp_path / "file"), "is a file")
-
-
-@pytest.mark.slow
-def test_broken_mesh_is_refused(tmp_path):
-    def simulate(path):
-        return eslr("simulate", "--garment", path, "--simulator", "physics", "--out", tmp_path / "out")
-
-    mesh = trimesh.creation.icosphere(radius=2e4)
-    mesh.export(tmp_path / "large.obj")
-    refused(simulate(tmp_path / "large.obj"), "no garment's in m, cm, mm, in")
-    (tmp_path / "empty.obj").write_text("")
-    refused(simulate(tmp_path / "empty.obj"), "empty")
+    assert shown("mine")["model"] == "mine"
 
 
 def test_fabrics_are_listed_with_their_sources():
@@ -236,22 +151,6 @@ def test_fabrics_are_listed_with_their_sources():
     assert {"cotton", "denim", "silk"} <= set(fabrics)
     assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
     assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
-
-
-@pytest.mark.slow
-def test_render_and_view_refuse_what_is_no_run(tmp_path):
-    refused(eslr("render", tmp_path, "--out", tmp_path / "a.gif"), ".mp4", ".png")
-    refused(eslr("render", tmp_path, "--out", tmp_path / "a.png"), "is no run")
-    refused(eslr("view", tmp_path), "is no run")
-
-
-@pytest.mark.slow
-def test_fit_refuses_what_it_cannot_do(tmp_path, body):
-    scan = scanned_tshirt(tmp_path / "shirt.obj", body)
-    refused(eslr("fit", scan, "--out", tmp_path / "shirt.obj"), "npz")
-    refused(eslr("fit", scan, "--out", tmp_path / "a.npz", "--pin", "part:collar"), "front", "no such part")
-    refused(eslr("fit", scan, "--out", tmp_path / "a.npz", "--fabric", "denin"), "did you mean denim")
-    assert not (tmp_path / "a.npz").exists()
 
 
 @pytest.mark.slow
@@ -287,88 +186,94 @@ def test_fit_writes_a_garment_and_a_picture(tmp_path, body):
     assert (tmp_path / "run" / "garment.npz").exists()
 
 
-def test_fit_does_not_write_over_what_it_reads(tmp_path):
-    from eslr_jax.cli.garments import fit
-
-    np.savez(tmp_path / "mesh.npz", positions=np.eye(3), faces=np.arange(3)[None])
-    before = (tmp_path / "mesh.npz").read_bytes()
-    with pytest.raises(AssetError, match="a file that is read"):
-        fit(str(tmp_path / "mesh.npz"), tmp_path / "." / "mesh.npz")
-    assert (tmp_path / "mesh.npz").read_bytes() == before
-
-
-def test_a_bundled_garment_takes_no_options_of_a_fit(tmp_path):
-    from eslr_jax.cli.garments import fit
-
-    options = FitOptions(pin=("none",), edge_length=0.01)
-    with pytest.raises(ConfigError, match=r"pants is bundled.*leave out --edge-length, --pin"):
-        fit("pants", tmp_path / "a.npz", options=options)
-
-
-def test_a_garment_is_fitted_to_a_shape_of_the_body(tmp_path, capsys):
-    from eslr_jax.cli.garments import fit
-
-    fit("tank", tmp_path / "a.npz", betas=(2.0,), picture=False)
+def test_a_garment_is_fitted_to_a_shape_of_the_body(tmp_path):
+    done = eslr_here("fit", "tank", "--out", tmp_path / "a.npz", "--betas", 2, "--no-picture")
+    assert done.stdout.splitlines()[-1] == str(tmp_path / "a.npz"), done.stderr
     fitted, usual = read_garment_npz(tmp_path / "a.npz"), load_garment_file("tank")
     assert np.ptp(fitted.rest_positions[:, 1]) > 1.02 * np.ptp(usual.rest_positions[:, 1])
-    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "a.npz")
-    with pytest.raises(ConfigError, match="leave out its unit"):
-        fit("tank", tmp_path / "a.npz", body_units="cm", picture=False)
-
-
-def test_no_iterations_are_those_of_a_network_alone():
-    from eslr_jax.cli.method import choose_method
-    from eslr_jax.cli.options import Options
-    from eslr_jax.cli.simulate import simulate
-
-    usual = {name: option.default for name, option in inspect.signature(simulate).parameters.items()}
-    options = Options(**{field.name: usual[field.name] for field in dataclasses.fields(Options)})
-    for given, expected in (
-        ({"iterations": 0}, ("network", 0)),
-        ({"iterations": 7}, ("physics", 7)),
-    ):
-        method = choose_method(dataclasses.replace(options, **given), (None, None), 1000, None)
-        assert (method.simulator, method.config.iterations) == expected
-    with pytest.raises(ConfigError, match="--iterations 0 needs a network; name --model, or give 1 or more"):
-        choose_method(
-            dataclasses.replace(options, iterations=0, simulator="physics"), (None, None), 1000, None
-        )
 
 
 def test_a_home_folder_is_expanded_before_anything_is_read(tmp_path, monkeypatch):
-    from eslr_jax.cli.simulate import simulate
-
     monkeypatch.setenv("HOME", str(tmp_path))
-    with pytest.raises(AssetError, match=f"{tmp_path}/run holds no interrupted simulation"):
-        simulate(out=Path("~/run"), resume=True)
+    refused(eslr_here("simulate", "--resume", "--out", "~/run"), f"{tmp_path}/run holds no interrupted")
 
 
-def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path, capsys):
-    from eslr_jax.cli.bodies import joints
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, (None, 500, 0.01)),
+        ({"simulator": "physics"}, (None, 500, 0.01)),
+        ({"tolerance": "0.1%"}, (None, 500, 0.001)),
+        ({"iterations": 7}, (None, 7, None)),
+        ({"model": "smooth-small"}, ("smooth-small, then 10 iterations of the solver", 10, None)),
+        (
+            {"model": "smooth-small", "iterations": 3},
+            ("smooth-small, then 3 iterations of the solver", 3, None),
+        ),
+        ({"model": "smooth-small", "tolerance": "5%"}, ("smooth-small, then the solver", 500, 0.05)),
+        ({"model": "smooth-small", "iterations": 0}, ("smooth-small", 0, None)),
+        ({"simulator": "network"}, ("eslr-small, then 10 iterations of the solver", 10, None)),
+        ({"iterations": 0}, ("eslr-small", 0, None)),
+    ],
+)
+def test_the_options_say_what_solves_a_frame(options, expected):
+    method = choose_method(Options(**options))
+    assert (method.model, method.config.iterations, method.tolerance) == expected
 
+
+def test_options_survive_the_record_that_a_run_goes_on_from():
+    options = Options(
+        garment=("pants", "tshirt"),
+        betas=(1.0, -2.0),
+        wind=(3.0, 0.0, 0.0),
+        joint_map=Path("map.json"),
+        iterations=30,
+        no_self_contact=True,
+    )
+    assert from_dict(Options, json.loads(json.dumps(options.record()))) == options
+
+
+def test_a_budget_buys_iterations_of_the_solver_and_of_a_network():
+    alone, behind = (
+        choose_method(Options(budget="12ms", model=model)).within_budget(1000, 1)
+        for model in (None, "smooth-small")
+    )
+    assert alone.config.iterations > behind.config.iterations > 1
+    assert behind.model == "smooth-small, then the solver"
+    assert (alone.tolerance, alone.budget_ms) == (None, 12.0)
+    assert alone.pace(alone.config.iterations, 1e3) == 5
+
+
+@pytest.mark.slow
+def test_iterations_that_are_added_to_a_network_are_announced(tmp_path):
+    words = ("--frames", 3, "--settle", 0, "--no-pictures", "--json", "--out", tmp_path)
+    done = eslr("simulate", "--model", "smooth-small", *words)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["model"] == "smooth-small, then 10 iterations of the solver"
+    assert report["iterations_mean"] == 10
+    line = f"a frame is solved by {report['model']}; --iterations 0 is the network alone"
+    assert done.stderr.splitlines().count(line) == 1
+
+
+def test_a_map_is_written_for_joints_that_nobody_knows(tmp_path):
     walk = skeleton_motion(load_motion("cmu_016_32"), load_body())
     bones = [f"Bone.{number:03}" for number in range(len(walk.skeleton.joint_names))]
     write_bvh(tmp_path / "a.bvh", walk, names=bones)
-    joints(str(tmp_path / "a.bvh"), out=tmp_path / "map.json")
-    values = json.loads((tmp_path / "map.json").read_text())
-    assert values["LeftArm"] == ""
-    assert "LeftArm" in capsys.readouterr().out
-    joints("cmu_016_32", json_=True)
-    values = json.loads(capsys.readouterr().out)
-    assert values["LeftArm"] == "LeftArm"
-    with pytest.raises(MotionError, match="needs no joint map"):
-        joints("turn")
+    done = eslr_here("joints", "--motion", tmp_path / "a.bvh", "--out", tmp_path / "map.json")
+    assert "LeftArm" in done.stdout
+    assert json.loads((tmp_path / "map.json").read_text())["LeftArm"] == ""
+    done = eslr_here("joints", "--motion", "cmu_016_32", "--json")
+    assert json.loads(done.stdout)["LeftArm"] == "LeftArm"
 
 
-def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body, capsys):
+def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body):
     """SMPL parameters move a body of SMPL's family by name: its fingers rest."""
-    from eslr_jax.cli.bodies import joints
-
     rng = np.random.default_rng(0)
     np.savez(tmp_path / "body.npz", **smpl_model(body, rng))
     write_amass(tmp_path / "walk.npz", rng.normal(0.0, 0.3, (4, 24, 3)), np.zeros((4, 3)), 30.0)
-    joints(str(tmp_path / "walk.npz"), str(tmp_path / "body.npz"), json_=True)
-    shown = json.loads(capsys.readouterr().out)
+    files = ("--motion", tmp_path / "walk.npz", "--body", tmp_path / "body.npz")
+    shown = json.loads(eslr_here("joints", *files, "--json").stdout)
     target = load_body(str(tmp_path / "body.npz"))
     motion = load_motion(tmp_path / "walk.npz", body=target)
     moves = np.abs(motion.rotations).max(axis=(0, 2)) > 1e-6
@@ -376,26 +281,6 @@ def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body, capsys):
         name for name, is_moving in zip(target.joint_names, moves, strict=True) if is_moving
     }
     assert shown["left_hand"] == ""
-
-
-def test_broken_motion_is_refused(tmp_path):
-    path = tmp_path / "walk.npz"
-    np.savez(path, something=np.zeros(3))
-    refused(
-        eslr("simulate", "--motion", path, "--simulator", "physics", "--out", tmp_path / "out"), "no motion"
-    )
-
-
-def test_a_resumed_training_takes_no_other_configuration(tmp_path):
-    result = eslr("train", "--out", tmp_path / "run", "--resume", "--set", "iterations=3")
-    refused(result, "--resume", "--set")
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(("option", "value"), [("gap-frames", 2), ("every", 0), ("rollout-frames", 0)])
-def test_an_evaluation_of_nothing_is_refused(option, value):
-    result = eslr("evaluate", "--model", "eslr-small", f"--{option}", value)
-    refused(result, option.replace("-", "_"), "or more")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes differ")

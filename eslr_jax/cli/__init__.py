@@ -1,7 +1,8 @@
 """The command line: `eslr simulate`, `eslr export`, `eslr joints`, `eslr assets`, ...
 
 Results go to stdout (as JSON with `--json`), progress and messages to stderr. Exit codes: 0 done, 1 a bug, 2
-something that the user can put right.
+something that the user can put right. A command is a frozen dataclass: the comments above its fields are the help
+of its options, and calling it does what it says.
 """
 
 from __future__ import annotations
@@ -11,36 +12,11 @@ import os
 import sys
 import warnings
 
-from eslr_jax.cli import (
-    assets,
-    bodies,
-    budget,
-    convert,
-    evaluate,
-    garments,
-    play,
-    runs,
-    score,
-    simulate,
-    train,
-)
-from eslr_jax.cli.console import app, say
-from eslr_jax.cli.interrupt import EXIT_CODE, leave_at_once
+from eslr_jax.cli import assets, foreign, measure, runs, simulate, train
+from eslr_jax.cli.console import EXIT_CODE, app, leave_at_once, say
 from eslr_jax.errors import ConfigError, EslrError
 
-COMMANDS = (
-    simulate,
-    garments,
-    bodies,
-    runs,
-    play,
-    assets,
-    train,
-    evaluate,
-    score,
-    budget,
-    convert,
-)  # each has registered its own
+COMMANDS = (simulate, foreign, runs, assets, train, measure)  # each has registered its own
 
 _BROKEN_PIPE = 128 + 13  # as a shell reports the signal SIGPIPE
 _REPEATABLE = {  # and the commands that collect its values
@@ -62,7 +38,7 @@ def main() -> None:
         _refuse_repetition(sys.argv[1:])
         try:
             with leave_at_once():
-                app.cli(prog="eslr")
+                app.cli(prog="eslr")()
         finally:
             sys.stdout.flush()  # here, where a broken pipe is still caught
     except BrokenPipeError:

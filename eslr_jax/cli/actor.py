@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from eslr_jax.cli.options import Options, refuse_given
+from eslr_jax.cli.options import Options, parse_seconds, refuse_given
 from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ def load_actor(options: Options) -> Actor:
     from eslr_jax.body.motion import pose_body
     from eslr_jax.body.sequence import pose_sequence
     from eslr_jax.body.timing import cut_start, loop_motion
-    from eslr_jax.cli.moment import parse_seconds
     from eslr_jax.io.mesh_sequence import read_mesh_sequence
 
     body = options.body

@@ -5,74 +5,83 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
-from eslr_jax.cli.actor import FPS
+from eslr_jax.cli.actor import FPS, load_wearer
 from eslr_jax.cli.console import app, use_compile_cache, waiting
-from eslr_jax.cli.options import refuse_given
+from eslr_jax.cli.method import choose_method
+from eslr_jax.cli.options import Options, refuse_given
 from eslr_jax.errors import AssetError, ConfigError
 
 _ARCHITECTURE = "eslr-15"  # the paper's
 
 
-@app.command
-def assets(
-    kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all",
-    verify: bool = False,
-    export: Path | None = None,
-    body: str | None = None,
-    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
-) -> None:
-    """List the bundled bodies, garments, motions, networks and fabrics.
+@app.command(name="assets")
+@dataclasses.dataclass(frozen=True)
+class Assets:
+    """List the bundled bodies, garments, motions, networks and fabrics."""
 
-    Args:
-        kind: List only this kind.
-        verify: Compare every file with its checksum.
-        export: Write the rest body to this OBJ file instead, to model a garment on: in metres, the feet at height
-            0. The bundled body has Y up and faces Z; another stands as its file has it.
-        body: Body to export, anny by default: name of a bundled one, a body file, or a moving mesh, whose first
-            frame is taken.
-        json_: Print as JSON.
-    """
-    from eslr_jax.assets.catalog import is_intact, list_assets
+    # List only this kind.
+    kind: Literal["all", "body", "garment", "motion", "model", "fabric"] = "all"
+    # Compare every file with its checksum.
+    verify: bool = False
+    # Write the rest body to this OBJ file instead, to model a garment on: in metres, the feet at height 0.
+    # The bundled body has Y up and faces Z; another stands as its file has it.
+    export: Path | None = None
+    # Body to export, anny by default: name of a bundled one, a body file, or a moving mesh, whose first frame
+    # is taken.
+    body: str | None = None
+    # Print as JSON.
+    json: bool = False
 
-    if export is not None:
-        refuse_given("--export writes a body and lists nothing", {
-            "--kind": kind != "all", "--verify": verify, "--json": json_,
-        })  # fmt: skip
-        _export_body(export, body or "anny")
-        return
-    refuse_given("only --export takes a body", {"--body": body is not None})
-    if kind == "fabric":
-        refuse_given("fabrics have no files", {"--verify": verify})
-        _list_fabrics(json_)
-        return
-    chosen = [asset for asset in list_assets() if kind in ("all", asset.kind)]
-    if verify:
-        damaged = [asset.file for asset in chosen if not is_intact(asset)]
+    def __call__(self) -> None:
+        """List what is asked for, or export a body."""
+        if self.export is not None:
+            refuse_given("--export writes a body and lists nothing", {
+                "--kind": self.kind != "all", "--verify": self.verify, "--json": self.json,
+            })  # fmt: skip
+            _export_body(self.export, self.body or "anny")
+            return
+        refuse_given("only --export takes a body", {"--body": self.body is not None})
+        if self.kind == "fabric":
+            refuse_given("fabrics have no files", {"--verify": self.verify})
+            if self.json:
+                print(json.dumps(_fabrics(), indent=2))
+            else:
+                _print_fabrics()
+            return
+        self._list_files()
+
+    def _list_files(self) -> None:
+        """List the files of a kind, and with all kinds the fabrics too."""
+        from eslr_jax.assets import load_motion
+        from eslr_jax.assets.catalog import is_intact, list_assets
+        from eslr_jax.body.retarget import count_resampled
+
+        chosen = [asset for asset in list_assets() if self.kind in ("all", asset.kind)]
+        damaged = {asset.file for asset in chosen if self.verify and not is_intact(asset)}
         if damaged:
-            raise AssetError(
-                f"damaged or missing: {', '.join(sorted(set(damaged)))}; install the package again"
-            )
-    frames = _simulated_frames([asset.name for asset in chosen if asset.kind == "motion"])
-    if json_:
-        rows = [{**dataclasses.asdict(asset), "frames": frames.get(asset.name)} for asset in chosen]
-        if kind == "all":
-            rows += [{"kind": "fabric", "name": name, **fabric} for name, fabric in _fabrics().items()]
-        print(json.dumps(rows, indent=2))
-        return
-    table = Table("kind", "name", "what", "simulated as", "licence", box=None)
-    for asset in chosen:
-        count = frames.get(asset.name)
-        length = "" if count is None else f"{count} frames, {(count - 1) / FPS:.1f} s"
-        table.add_row(asset.kind, asset.name, asset.description, length, asset.licence)
-    Console().print(table, markup=False)
-    if kind == "all":
-        _list_fabrics(as_json=False)
+            raise AssetError(f"damaged or missing: {', '.join(sorted(damaged))}; install the package again")
+        motions = [asset.name for asset in chosen if asset.kind == "motion"]
+        clips = map(load_motion, motions)
+        frames = {clip.name: count_resampled(len(clip.rotations), clip.fps, FPS) for clip in clips}
+        if self.json:
+            rows = [{**dataclasses.asdict(asset), "frames": frames.get(asset.name)} for asset in chosen]
+            if self.kind == "all":
+                rows += [{"kind": "fabric", "name": name, **fabric} for name, fabric in _fabrics().items()]
+            print(json.dumps(rows, indent=2))
+            return
+        table = Table("kind", "name", "what", "simulated as", "licence", box=None)
+        for asset in chosen:
+            count = frames.get(asset.name)
+            length = "" if count is None else f"{count} frames, {(count - 1) / FPS:.1f} s"
+            table.add_row(asset.kind, asset.name, asset.description, length, asset.licence)
+        Console().print(table, markup=False)
+        if self.kind == "all":
+            _print_fabrics()
 
 
 def _fabrics() -> dict[str, dict[str, Any]]:
@@ -83,20 +92,10 @@ def _fabrics() -> dict[str, dict[str, Any]]:
     return {name: dataclasses.asdict(fabric) for name, fabric in everything.items()}
 
 
-def _simulated_frames(names: list[str]) -> dict[str, int]:
-    """Return how many frames bundled motions have as they are simulated."""
-    from eslr_jax.assets import load_motion
-    from eslr_jax.body.retarget import count_resampled
-
-    motions = map(load_motion, names)
-    return {motion.name: count_resampled(len(motion.rotations), motion.fps, FPS) for motion in motions}
-
-
 def _export_body(path: Path, name: str) -> None:
     """Write a body's rest pose as an OBJ file, standing on the origin."""
     import numpy as np
 
-    from eslr_jax.cli.actor import load_wearer
     from eslr_jax.io.atomic import atomic_write
     from eslr_jax.io.obj import obj_text
 
@@ -112,13 +111,10 @@ def _export_body(path: Path, name: str) -> None:
     print(f"{path}: {positions[:, 1].max():.2f} m tall, in metres, its feet at height 0")
 
 
-def _list_fabrics(as_json: bool) -> None:
-    """Print the table of fabrics."""
+def _print_fabrics() -> None:
+    """Print the fabrics as tables: those of one stiffness, and those by threads."""
     from eslr_jax.physics.materials import FABRICS, WOVEN, describe_cotton
 
-    if as_json:
-        print(json.dumps(_fabrics(), indent=2))
-        return
     table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
     for name, fabric in {"cotton": describe_cotton(), **FABRICS}.items():
         numbers = (
@@ -140,102 +136,95 @@ def _list_fabrics(as_json: bool) -> None:
     Console().print(table, markup=False)
 
 
-@app.command
-def info(
-    model: str | None = None,
-    scene: str | None = None,
-    motion: str | None = None,
-    vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k",
-    simulator: Literal["network", "physics"] = "physics",
-    self_contact: bool = False,
-    json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
-) -> None:
-    """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs.
+@app.command(name="info")
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Show an architecture and its number of parameters, or with --scene the parts of a scene and their costs."""
 
-    Args:
-        model: Name of a bundled network, or an exported file, as for `eslr simulate`; or else of an architecture,
-            by default the paper's, eslr-15.
-        scene: A garment, by name or file, on the bundled body.
-        motion: Motion of the scene, by default cmu_016_32.
-        vertices: Resolution of a bundled garment; from 50k on it is made at run time.
-        simulator: Simulator of the scene; the network is the default one.
-        self_contact: Keep all layers of cloth apart, also where they don't seem to meet.
-        json_: Print as JSON.
-    """
-    if scene is not None:
-        if model is not None:
-            raise ConfigError(
-                "--model shows an architecture, --scene a scene with the default network: give one"
-            )
-        _show_scene(scene, motion, vertices, simulator, self_contact, json_)
-        return
-    refuse_given("only a --scene takes these", {
-        "--motion": motion is not None, "--vertices": vertices != "1k", "--simulator": simulator != "physics",
-        "--self-contact": self_contact,
-    })  # fmt: skip
-    from eslr_jax.assets import load_model
-    from eslr_jax.assets.catalog import is_path
-    from eslr_jax.config import to_dict
-    from eslr_jax.models.registry import MODELS, count_parameters, init_model
+    # Name of a bundled network, or an exported file, as for `eslr simulate`; or else of an architecture, by
+    # default the paper's, eslr-15.
+    model: str | None = None
+    # A garment, by name or file, on the bundled body.
+    scene: str | None = None
+    # Motion of the scene, by default cmu_016_32.
+    motion: str | None = None
+    # Resolution of a bundled garment; from 50k on it is made at run time.
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k"
+    # Simulator of the scene; the network is the default one.
+    simulator: Literal["network", "physics"] = "physics"
+    # Keep all layers of cloth apart, also where they don't seem to meet.
+    self_contact: bool = False
+    # Print as JSON.
+    json: bool = False
 
-    model = model or _ARCHITECTURE
-    try:
-        params, config = load_model(model)
-    except AssetError as error:
-        if is_path(model):
-            raise
-        if model not in MODELS:
-            raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
-        config = MODELS[model]
-        params = init_model(config)
-    values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
-    if json_:
-        print(json.dumps(values, indent=2))
-        return
-    print(f"{model}: {values['parameters']:,} parameters")
-    for name, value in values["config"].items():
-        print(f"  {name} = {value}")
+    def __call__(self) -> None:
+        """Print what the options ask for."""
+        if self.scene is not None:
+            if self.model is not None:
+                raise ConfigError(
+                    "--model shows an architecture, --scene a scene with the default network: give one"
+                )
+            self._show_scene(self.scene)
+            return
+        refuse_given("only a --scene takes these", {
+            "--motion": self.motion is not None, "--vertices": self.vertices != "1k",
+            "--simulator": self.simulator != "physics", "--self-contact": self.self_contact,
+        })  # fmt: skip
+        self._show_network(self.model or _ARCHITECTURE)
 
+    def _show_network(self, model: str) -> None:
+        """Print an architecture and its number of parameters."""
+        from eslr_jax.assets import load_model
+        from eslr_jax.assets.catalog import is_path
+        from eslr_jax.config import to_dict
+        from eslr_jax.models.registry import MODELS, count_parameters, init_model
 
-def _show_scene(
-    garment: str,
-    motion: str | None,
-    vertices: Literal["1k", "4k", "10k", "50k", "200k"],
-    simulator: Literal["network", "physics"],
-    self_contact: bool,
-    as_json: bool,
-) -> None:
-    """Print the parts that a scene models, those it leaves out, and their costs."""
-    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-    from eslr_jax.assets.garments import check_resolution
-    from eslr_jax.assets.models import DEFAULT_MODEL
-    from eslr_jax.assets.motions import DEFAULT_MOTION
-    from eslr_jax.body.motion import pose_body
-    from eslr_jax.cli.method import BEHIND_NETWORK, ITERATIONS
-    from eslr_jax.config import SimConfig
-    from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
-    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+        try:
+            params, config = load_model(model)
+        except AssetError as error:
+            if is_path(model):
+                raise
+            if model not in MODELS:
+                raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
+            config = MODELS[model]
+            params = init_model(config)
+        values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
+        if self.json:
+            print(json.dumps(values, indent=2))
+            return
+        print(f"{model}: {values['parameters']:,} parameters")
+        for name, value in values["config"].items():
+            print(f"  {name} = {value}")
 
-    use_compile_cache()
-    params, architecture = load_model(DEFAULT_MODEL) if simulator == "network" else (None, None)
-    check_resolution([garment], vertices)
-    config = SimConfig(model=architecture, iterations=ITERATIONS if architecture is None else BEHIND_NETWORK)
-    options = SceneOptions(  # those of `eslr simulate`
-        self_contact=self_contact or None, has_folds=True, has_skin=True, integrator="bdf2"
-    )
-    with waiting("measuring"):
-        rig = load_body()
-        poses = pose_body(rig, load_motion(motion or DEFAULT_MOTION))
-        scene = prepare_scene(load_garment(garment, vertices=vertices, body=rig), poses, options=options)
-        parts = describe_scene(scene, poses, config)
-        costs = time_parts(params, scene, config)
-    if as_json:
-        print(json.dumps({**dataclasses.asdict(parts), "cost_ms": costs}, indent=2))
-        return
-    for title, entries in (("modelled", parts.modelled), ("left out", parts.left_out)):
-        print(title)
-        for name, size in entries.items():
-            print(f"  {name}: {size}")
-    print("cost on this device")
-    for name, cost in costs.items():
-        print(f"  {name}: {cost:.2f} ms")
+    def _show_scene(self, garment: str) -> None:
+        """Print the parts that a scene models, those it leaves out, and their costs."""
+        from eslr_jax.assets import load_body, load_garment, load_motion
+        from eslr_jax.assets.garments import check_resolution
+        from eslr_jax.assets.motions import DEFAULT_MOTION
+        from eslr_jax.body.motion import pose_body
+        from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
+        from eslr_jax.scene.plan import SceneOptions, prepare_scene
+
+        use_compile_cache()
+        check_resolution([garment], self.vertices)
+        method = choose_method(Options(simulator=self.simulator))
+        options = SceneOptions(  # those of `eslr simulate`
+            self_contact=self.self_contact or None, has_folds=True, has_skin=True, integrator="bdf2"
+        )
+        with waiting("measuring"):
+            rig = load_body()
+            poses = pose_body(rig, load_motion(self.motion or DEFAULT_MOTION))
+            cloth = load_garment(garment, vertices=self.vertices, body=rig)
+            scene = prepare_scene(cloth, poses, options=options)
+            parts = describe_scene(scene, poses, method.config)
+            costs = time_parts(method.params, scene, method.config)
+        if self.json:
+            print(json.dumps({**dataclasses.asdict(parts), "cost_ms": costs}, indent=2))
+            return
+        for title, entries in (("modelled", parts.modelled), ("left out", parts.left_out)):
+            print(title)
+            for name, size in entries.items():
+                print(f"  {name}: {size}")
+        print("cost on this device")
+        for name, cost in costs.items():
+            print(f"  {name}: {cost:.2f} ms")

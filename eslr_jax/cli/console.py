@@ -1,10 +1,13 @@
-"""What all commands share: the application, progress on stderr, the compile cache."""
+"""What all commands share: the application, progress on stderr, the compile cache, Ctrl-C."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
+import socket
 import sys
+import threading
 import webbrowser
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -24,6 +27,8 @@ from rich.text import Text
 
 app = tyro.extras.SubcommandApp()
 stderr = Console(stderr=True)
+EXIT_CODE = 130  # of a program that Ctrl-C ended
+_PATIENCE = 1.0  # [s] in which Python may end by itself
 
 
 def say(text: str) -> None:
@@ -78,6 +83,47 @@ def use_compile_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
         # The sixty small programs of a start take a second together.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+@contextlib.contextmanager
+def leave_at_once() -> Iterator[None]:
+    """Let Ctrl-C end the program also while it compiles.
+
+    Python handles a signal between two of its own instructions, and a compilation is a single instruction. So a
+    thread waits for the signal, and ends the process if Python has not ended it within a second. While another
+    handler than Python's own is set for Ctrl-C, the thread does nothing. If Ctrl-C comes while Python deletes an
+    object, Python drops the interrupt with a message; the message is suppressed, because the thread acts on it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    is_over = threading.Event()
+
+    def watch() -> None:
+        with receiver:
+            while (number := receiver.recv(1)) and not is_over.is_set():
+                handler = signal.getsignal(signal.SIGINT)
+                if number[0] != signal.SIGINT or handler != signal.default_int_handler:
+                    continue
+                if not is_over.wait(_PATIENCE):
+                    say("eslr: interrupted")
+                    os._exit(EXIT_CODE)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    report = sys.unraisablehook
+    sys.unraisablehook = lambda lost: None if lost.exc_type is KeyboardInterrupt else report(lost)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+        is_over.set()
+        signal.set_wakeup_fd(before)
+        sender.close()
+        watcher.join()
 
 
 def print_report(report: dict[str, Any], more: dict[str, str]) -> None:

@@ -1,53 +1,122 @@
-"""The options of `eslr simulate` that define a simulation, and how `--resume` restores them."""
+"""The options of `eslr simulate` that decide what is simulated, and how texts on a command line are read."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal
 
-from eslr_jax.errors import AssetError, ConfigError
+import tyro
 
-if TYPE_CHECKING:
-    from eslr_jax.simulation.budget import Choice
-    from eslr_jax.types import PairCapacity, Scene, Trajectory
+from eslr_jax.errors import ConfigError
 
 DEFAULT_GARMENT = "tshirt"
-_SAME = 1e-4  # [m] by which the beginning of the same scene may differ between machines
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The options that decide what is simulated; see `eslr simulate --help`."""
+    """What is simulated: `eslr simulate` takes these options, and keeps them for --resume."""
 
-    garment: tuple[str, ...]  # of an outfit the innermost first; empty for the default
-    motion: str | None
-    body: str
-    simulator: Literal["network", "physics"] | None
-    model: str | None
-    vertices: Literal["1k", "4k", "10k", "50k", "200k"]
-    fabric: tuple[str, ...]
-    frames: int | None
-    iterations: int | None
-    budget: str | None
-    tolerance: str | None
-    joint_map: Path | None
-    motion_up: Literal["auto", "y", "z"]
-    arm_abduction: float | None
-    body_fps: float | None
-    body_units: str | None
-    betas: tuple[float, ...]
-    start: str | None
-    loop: str | None
-    settle: int | None
-    self_contact: bool
-    no_self_contact: bool = False
-    ground: Literal["auto", "on", "off"] = "auto"
-    integrator: Literal["euler", "bdf2"] | None = "euler"  # of runs that an older version began
+    # Name of a bundled garment (see `eslr assets`), which is transferred to the body, or a mesh file, which
+    # is fitted to the body; see `eslr fit` if the fit goes wrong. Repeat the option for an outfit, the
+    # innermost garment first, as in --garment pants --garment tshirt. By default a T-shirt.
+    garment: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    # Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl),
+    # glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else cmu_016_32.
+    motion: str | None = None
+    # Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned character
+    # (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files). FILE#MESH,MESH picks the meshes of a
+    # character that are its body, without its clothes.
+    body: str = "anny"
+    # physics is the solver alone; network is a trained network, from whose prediction the solver starts.
+    simulator: Literal["network", "physics"] | None = None
+    # Name of a bundled network or an exported file; the default network if a network is asked for and none is
+    # named.
+    model: str | None = None
+    # Resolution of bundled garments; from 50k on it is made at run time.
+    vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k"
+    # Name of a fabric (see `eslr assets --kind fabric`), or numbers as in density=0.2,bending_stiffness=1e-5
+    # or flexural_rigidity=5e-6. PART:FABRIC is the fabric of one part or of one garment of an outfit; the
+    # rest keeps its own. By default that of the fitted file, or cotton.
+    fabric: tuple[str, ...] = ()
+    # Simulate this many frames, the start included; all if not given.
+    frames: int | None = None
+    # Solver iterations per frame, which replace the tolerance: by default 10 after a network, and else as many
+    # as the tolerance takes, at most 500. With 0 the network simulates without the solver.
+    iterations: int | None = None
+    # Time per frame, such as 20ms: adapt the iterations during the run so that frames keep the budget. See
+    # `eslr calibrate`.
+    budget: str | None = None
+    # Share of the initial optimality gap that a frame may leave, such as 0.1%: the solver ends the frame there.
+    # By default 1%.
+    tolerance: str | None = None
+    # JSON file of changes to the map of joints that `eslr joints` shows.
+    joint_map: Path | None = None
+    # Axis that points up in a BVH motion.
+    motion_up: Literal["auto", "y", "z"] = "auto"
+    # Degrees by which both arms are lifted; by default 12 for the motion of another body, and 0 for the
+    # body's own motion.
+    arm_abduction: float | None = None
+    # Frames per second of a body that is a moving mesh.
+    body_fps: float | None = None
+    # Unit of the body's file: m, dm, cm, mm, in, ft, or metres per unit; recognised if not given.
+    body_units: str | None = None
+    # Shape of the bundled body or of a SMPL body, in standard deviations.
+    betas: tuple[float, ...] = ()
+    # Where to begin in the motion: a frame, such as 375, or a time, such as 12.5s.
+    start: str | None = None
+    # How long to repeat the motion: frames or a time, such as 30s.
+    loop: str | None = None
+    # Frames before frame 0 in which the garment settles: the limbs move from the body's rest pose to the
+    # first pose, which the last 10 frames hold. These frames are not kept. By default 35, or 0 for a network
+    # alone.
+    settle: int | None = None
+    # How time is stepped. bdf2 keeps swinging cloth in motion. With euler, the paper's integrator, swinging
+    # cloth loses two thirds of its energy in a second. The default is bdf2, or euler for a network alone,
+    # which was trained with it.
+    integrator: Literal["euler", "bdf2"] | None = None
+    # Number of shorter steps per frame; 2 keeps layers apart that swing fast against each other. The
+    # iterations are those of each substep.
     substeps: int = 1
+    # Keep all layers of cloth apart, also within each garment of an outfit. By default layers of a garment of
+    # one piece are kept apart where they can meet, and pieces and garments from each other.
+    self_contact: tyro.conf.FlagCreatePairsOff[bool] = False
+    # Let layers of cloth pass through each other.
+    no_self_contact: tyro.conf.FlagCreatePairsOff[bool] = False
+    # Model a level ground under the body's lowest point; auto does where cloth could reach it.
+    ground: Literal["auto", "on", "off"] = "auto"
+    # Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
     wind: tuple[float, float, float] | None = None
+    # Strength of gusts, as a share of the wind's speed.
     gust: float = 0.0
+    # Internal damping of the fabric in seconds, such as 0.005; it calms fast ripples first.
     damping: float | None = None
+
+    @property
+    def garments(self) -> tuple[str, ...]:
+        """The garments, the innermost first."""
+        return self.garment or (DEFAULT_GARMENT,)
+
+    def check(self) -> None:
+        """Check what needs no file.
+
+        Raises:
+            ConfigError: A count is impossible, or two options exclude each other.
+        """
+        if self.frames is not None and self.frames < 2:
+            raise ConfigError(f"--frames {self.frames}: a simulation needs two frames or more")
+        for name in ("settle", "iterations"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise ConfigError(f"--{name} {value}: give a number, 0 or more")
+        if self.self_contact and self.no_self_contact:
+            raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
+
+    def record(self) -> dict[str, Any]:
+        """Return the options as values of JSON."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
+        return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
 
 def refuse_given(reason: str, options: dict[str, bool]) -> None:
@@ -61,121 +130,52 @@ def refuse_given(reason: str, options: dict[str, bool]) -> None:
         raise ConfigError(f"{reason}; leave out {', '.join(given)}")
 
 
-def wanted_self_contact(options: Options) -> bool | None:
-    """Return whether self-contact is asked for, or None where the scene decides.
-
-    Raises:
-        ConfigError: It is asked for both ways.
-    """
-    if options.self_contact and options.no_self_contact:
-        raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
-    if options.no_self_contact:
-        return False
-    return True if options.self_contact else None
-
-
-def interrupted_record(
-    options: Options, choice: Choice | None, capacity: PairCapacity | None
-) -> dict[str, Any]:
-    """Return what an interrupted simulation goes on with, as values of JSON.
+def parse_seconds(text: str, fps: float, *, option: str) -> float:
+    """Return a moment's time [s].
 
     Args:
-        options: Its options.
-        choice: The simulator that was chosen, if a budget or a tolerance did.
-        capacity: Buffers of self-contact that sufficed.
-    """
-    values = {name: _plain(value) for name, value in vars(options).items()}
-    return {
-        "options": values,
-        "choice": None if choice is None else dataclasses.asdict(choice),
-        "capacity": None if capacity is None else dataclasses.asdict(capacity),
-    }
-
-
-class Interrupted(NamedTuple):
-    """What an interrupted simulation goes on with."""
-
-    done: Trajectory  # the first frames
-    options: Options
-    choice: Choice | None  # what a budget or a tolerance led to
-    capacity: PairCapacity | None  # buffers of self-contact that sufficed
-
-
-def read_interrupted(out: Path, given: Options) -> Interrupted:
-    """Read an interrupted simulation with its own options; a given option must agree with them.
-
-    Args:
-        out: Its folder.
-        given: The options of this command.
+        text: A frame, such as 375, or a time with its unit, such as 12.5s.
+        fps: Frames per second that frames are counted at.
+        option: What messages call the option.
 
     Raises:
-        AssetError: The folder holds no interrupted simulation.
-        ConfigError: An option is given that is not the simulation's own.
+        ConfigError: The text is neither.
     """
-    import inspect
-
-    from eslr_jax.cli.simulate import simulate
-    from eslr_jax.io.unfinished import read_unfinished
-    from eslr_jax.simulation.budget import Choice
-    from eslr_jax.types import PairCapacity
-
-    done, record = read_unfinished(out)
     try:
-        values, choice, capacity = record["options"], record["choice"], record["capacity"]
-        typed = {name: tuple(values[name]) for name in ("garment", "fabric", "betas")}
-        typed["joint_map"] = None if values["joint_map"] is None else Path(values["joint_map"])
-        options = Options(**values | typed)
-        choice = None if choice is None else Choice(**choice)
-        capacity = None if capacity is None else PairCapacity(**capacity)
-    except (KeyError, TypeError) as error:
-        raise AssetError(
-            f"{out} was simulated by another version; start without --resume in another folder"
-        ) from error
-    usual = inspect.signature(simulate).parameters
-    for name, value in vars(given).items():
-        if value != usual[name].default and _plain(value) != values.get(name):
-            own = values.get(name)
-            raise ConfigError(
-                f"{out} was simulated with {name.replace('_', '-')} = {_text(own)}, not {_text(_plain(value))}; "
-                "leave out all options but --out to go on, or start in another folder without --resume"
-            )
-    return Interrupted(done, options, choice, capacity)
+        seconds = float(text[:-1]) if text.endswith("s") else int(text) / fps
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds >= 0):
+        raise ConfigError(f"{option} {text}: give a frame, such as 375, or a time, such as 12.5s")
+    return seconds
 
 
-def check_same_scene(done: Trajectory, scene: Scene, out: Path) -> None:
-    """Check that the frames that are done begin as the scene does.
-
-    Args:
-        done: Frames of an interrupted simulation.
-        scene: The scene of the same options.
-        out: Folder of the simulation.
+def parse_budget(text: str) -> float:
+    """Return a time per frame in milliseconds.
 
     Raises:
-        ConfigError: A file has changed since.
+        ConfigError: It is not a positive time.
     """
-    import numpy as np
-
-    first, again = np.asarray(done.positions[0]), np.asarray(scene.initial_state.position)
-    if (
-        first.shape != again.shape
-        or np.abs(first - again).max() > _SAME
-        or done.num_frames >= scene.num_frames
-    ):
-        raise ConfigError(
-            f"{out} was simulated with another garment, body or motion: their files have changed since; "
-            "start in another folder without --resume"
-        )
+    unit, scale = ("ms", 1.0) if text.endswith("ms") else ("s", 1e3)
+    try:
+        value = float(text.removesuffix(unit)) * scale if text.endswith(unit) else math.nan
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise ConfigError(f"--budget {text}: write a time per frame, such as 20ms or 0.1s")
+    return value
 
 
-def _plain(value: Any) -> Any:
-    """Return an option's value as one of JSON."""
-    if isinstance(value, tuple):
-        return list(value)
-    return str(value) if isinstance(value, Path) else value
+def parse_share(text: str) -> float:
+    """Return a share, written as 1% or 0.01.
 
-
-def _text(value: Any) -> str:
-    """Return an option's value as it is typed."""
-    if value is None or value == []:
-        return "none"
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    Raises:
+        ConfigError: It is not between 0 and 1.
+    """
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 1:
+        raise ConfigError(f"--tolerance {text}: write a share of the initial gap, such as 1% or 0.01")
+    return value

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NoReturn
 
 import tyro
 from rich.progress import (
@@ -19,113 +20,140 @@ from rich.progress import (
 )
 
 from eslr_jax.cli.console import app, say, stderr, use_compile_cache
-from eslr_jax.config import ModelConfig, TrainConfig, describe_keys
+from eslr_jax.config import TrainConfig, from_dict, parse_override, to_dict
 from eslr_jax.errors import ConfigError
 from eslr_jax.extras import require
 from eslr_jax.io.parsing import one_line
 
-_KEYS = "\n".join([*describe_keys(TrainConfig), *describe_keys(ModelConfig, "model.")])
-_CHANGES = (
-    "Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4. "
-    f"The keys of a configuration and their defaults:\n{_KEYS}\n"
-)
 
-
-@app.command
-def train(
-    out: Path,
-    config: Path | None = None,
-    set_: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", help=_CHANGES)
-    ] = (),
-    resume: bool = False,
-    start_from: str | None = None,
-    tensorboard: bool = False,
-    coordinator: str | None = None,
-    num_processes: int | None = None,
-    process_id: int | None = None,
-) -> None:
+@app.command(name="train")
+@dataclasses.dataclass(frozen=True)
+class Train:
     """Train a network on the physics loss; Ctrl-C or SIGTERM writes a checkpoint first.
 
     A batch (`--set batch_size=8`) is spread over all devices of this machine, and with --coordinator over
     those of several machines: start the same command once on each.
-
-    Args:
-        out: Folder of metrics, checkpoints and the exported model; with `--set seeds=3` of folders for each seed.
-        config: TOML file of a training configuration; not needed with --resume.
-        set_: Changes to the configuration, as key=value.
-        resume: Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
-        start_from: Name of a bundled network or an exported file whose weights to start from.
-        tensorboard: Write event files for TensorBoard too.
-        coordinator: Address of the first process as HOST:PORT, or "auto" under Slurm.
-        num_processes: Number of processes; not needed with "auto".
-        process_id: Number of this process, from 0; not needed with "auto".
     """
-    from eslr_jax.assets.models import load_model, model_record
-    from eslr_jax.config import from_dict, parse_override, to_dict
-    from eslr_jax.models.registry import check_params
-    from eslr_jax.training.checkpoint import read_run_config
-    from eslr_jax.training.loop import is_first_process
-    from eslr_jax.training.loop import train as run
-    from eslr_jax.training.memory import keep_memory
-    from eslr_jax.training.plot import plot_curves
-    from eslr_jax.training.recipe import load_recipe
-    from eslr_jax.training.seeds import seed_folders
 
-    if coordinator is None and (num_processes is not None or process_id is not None):
-        raise ConfigError("--num-processes and --process-id need --coordinator, which joins the processes")
-    if resume:
-        changes = dict(parse_override(text) for text in set_)
-        if config is not None or changes.keys() - {"steps"} or start_from is not None:
-            raise ConfigError(
-                "--resume goes on with the run's own configuration; leave out --config, --start-from, and every "
-                "--set but steps=N, which extends the run, or start a new one in another folder"
+    # Folder of metrics, checkpoints and the exported model; with `--set seeds=3` of folders for each seed.
+    out: Path | None = None
+    # TOML file of a training configuration; not needed with --resume.
+    config: Path | None = None
+    # Changes to the configuration, as key=value with dots for tables, e.g. model.refinement_steps=4. See --keys.
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    # Show all keys of a configuration with their defaults, and end.
+    keys: bool = False
+    # Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
+    resume: bool = False
+    # Name of a bundled network or an exported file whose weights to start from.
+    start_from: str | None = None
+    # Write event files for TensorBoard too.
+    tensorboard: bool = False
+    # Address of the first process as HOST:PORT, or "auto" under Slurm.
+    coordinator: str | None = None
+    # Number of processes; not needed with "auto".
+    num_processes: int | None = None
+    # Number of this process, from 0; not needed with "auto".
+    process_id: int | None = None
+
+    def __call__(self) -> None:
+        """Train, draw the curves, and print where the networks are."""
+        from eslr_jax.assets.models import load_model, model_record
+        from eslr_jax.models.registry import check_params
+        from eslr_jax.training.loop import is_first_process, train
+        from eslr_jax.training.memory import keep_memory
+        from eslr_jax.training.plot import plot_curves
+        from eslr_jax.training.seeds import seed_folders
+
+        if self.keys:
+            _show_keys()
+        out = self.out
+        if out is None:
+            raise ConfigError("no --out; name a folder for metrics, checkpoints and the network")
+        chosen = self._configuration(out)
+        keep_memory()
+        use_compile_cache()
+        if self.coordinator is not None:  # before anything is computed, as jax.distributed demands
+            self._join_processes(self.coordinator)
+        initial, earlier = None, {}
+        if self.start_from is not None:
+            initial, _ = load_model(self.start_from)
+            earlier = model_record(self.start_from)
+            check_params(chosen.model, initial)
+        with _training_progress(
+            chosen.steps, out if self.tensorboard and is_first_process() else None
+        ) as show:
+            state = train(
+                chosen, out, resume=self.resume, initial_params=initial, earlier=earlier, on_progress=show
             )
-        chosen = from_dict(TrainConfig, to_dict(read_run_config(out)) | changes)
-    elif config is None:
-        raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
-    else:
-        chosen = load_recipe(config, dict(parse_override(text) for text in set_))
-    keep_memory()
-    use_compile_cache()
-    if coordinator is not None:  # before anything is computed, as jax.distributed demands
-        _join_processes(coordinator, num_processes, process_id)
-    initial, earlier = None, {}
-    if start_from is not None:
-        initial, _ = load_model(start_from)
-        earlier = model_record(start_from)
-        check_params(chosen.model, initial)
-    with _training_progress(chosen.steps, out if tensorboard and is_first_process() else None) as show:
-        state = run(chosen, out, resume=resume, initial_params=initial, earlier=earlier, on_progress=show)
-    if not is_first_process():
-        return
-    folders = seed_folders(chosen, out)
-    for folder in folders:
-        plot_curves(folder, chosen)
-    done = int(state.step)
-    if done < chosen.steps:
-        say(f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume")
-    else:
+        if not is_first_process():
+            return
+        folders = seed_folders(chosen, out)
         for folder in folders:
-            print(folder / "model.npz")
+            plot_curves(folder, chosen)
+        done = int(state.step)
+        if done < chosen.steps:
+            say(f"stopped at step {done} of {chosen.steps}; go on with: eslr train --out {out} --resume")
+        else:
+            for folder in folders:
+                print(folder / "model.npz")
+
+    def _configuration(self, out: Path) -> TrainConfig:
+        """Return the configuration of the recipe, or that of the run which goes on.
+
+        Raises:
+            ConfigError: There is none, or options contradict each other.
+        """
+        from eslr_jax.training.checkpoint import read_run_config
+        from eslr_jax.training.recipe import load_recipe
+
+        is_alone = self.coordinator is None
+        if is_alone and (self.num_processes is not None or self.process_id is not None):
+            raise ConfigError(
+                "--num-processes and --process-id need --coordinator, which joins the processes"
+            )
+        changes = dict(parse_override(text) for text in self.set)
+        if self.resume:
+            if self.config is not None or changes.keys() - {"steps"} or self.start_from is not None:
+                raise ConfigError(
+                    "--resume goes on with the run's own configuration; leave out --config, --start-from, and "
+                    "every --set but steps=N, which extends the run, or start a new one in another folder"
+                )
+            return from_dict(TrainConfig, to_dict(read_run_config(out)) | changes)
+        if self.config is None:
+            raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
+        return load_recipe(self.config, changes)
+
+    def _join_processes(self, coordinator: str) -> None:
+        """Connect with the other processes of a training run.
+
+        Raises:
+            ConfigError: The processes are not all told, or do not answer.
+        """
+        import jax
+
+        is_automatic = coordinator == "auto"
+        if not is_automatic and (self.num_processes is None or self.process_id is None):
+            raise ConfigError("--coordinator HOST:PORT needs --num-processes and --process-id too")
+        address = None if is_automatic else coordinator
+        try:
+            jax.distributed.initialize(address, self.num_processes, self.process_id)
+        except (RuntimeError, ValueError) as error:
+            text = one_line(error)
+            raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
 
 
-def _join_processes(coordinator: str, num_processes: int | None, process_id: int | None) -> None:
-    """Connect with the other processes of a training run.
-
-    Raises:
-        ConfigError: The processes are not all told, or do not answer.
-    """
-    import jax
-
-    is_automatic = coordinator == "auto"
-    if not is_automatic and (num_processes is None or process_id is None):
-        raise ConfigError("--coordinator HOST:PORT needs --num-processes and --process-id too")
-    try:
-        jax.distributed.initialize(None if is_automatic else coordinator, num_processes, process_id)
-    except (RuntimeError, ValueError) as error:
-        text = one_line(error)
-        raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
+def _show_keys() -> NoReturn:
+    """Print the keys of a configuration with their defaults and what their comments say, and end."""
+    tyro.cli(
+        TrainConfig,
+        prog="eslr train --keys",
+        description="Keys of a recipe in TOML, and of --set: write --steps below as steps=20000.",
+        args=["--help"],
+        use_underscores=True,
+        config=(tyro.conf.FlagConversionOff,),
+    )
+    raise SystemExit
 
 
 @contextlib.contextmanager

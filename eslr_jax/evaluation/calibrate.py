@@ -1,4 +1,4 @@
-"""Measure what a device can do in how much time, for the choice by budget or tolerance (host)."""
+"""Measure what a frame costs on a device, for budgets and expected times (host)."""
 
 from __future__ import annotations
 
@@ -6,46 +6,41 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
 from eslr_jax.body.motion import pose_body
 from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.evaluation.gap import GapOptions, OptimalityGap, measure_gap
 from eslr_jax.evaluation.scene_parts import Name, time_in_turns
 from eslr_jax.scene.plan import first_frames, prepare_scene
-from eslr_jax.simulation.budget import ITERATIONS, SOLVER, Calibration, Method, device_name
+from eslr_jax.simulation.budget import SOLVER, Calibration, Cost, device_name
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 
-_CLIP = "cmu_016_22"  # of the training split, so that the choice has not seen the test clips
-_GARMENTS = ("tshirt", "dress")
-_FRAMES = 60
-_EVERY = 3  # frames between those whose gap is measured
-_TRUTH_ITERATIONS = 100  # of the rollouts that supply the states
+_TIMED = ("tshirt", "cmu_016_22")  # a garment, and a clip of the training split
 _TIMED_FRAMES = 20
 _TIMED_ITERATIONS = (10, 60)
 _TURNS = 9  # timings of each, in turns; medians count
 
 
 def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) -> Calibration:
-    """Measure the solver, and the solver behind each network, on this device.
+    """Time the solver, and the solver behind each network, on this device.
 
     Args:
         models: Names of bundled networks.
-        sizes: Resolutions of the garments.
+        sizes: Resolutions of the garment.
     """
-    methods: list[Method] = []
     has_coarse_edges = read_coarse_edges(models)
+    garment, clip = _TIMED
+    costs: list[Cost] = []
     for size in sizes:
-        scenes = [example_scene(name, size, _CLIP, has_coarse_edges=has_coarse_edges) for name in _GARMENTS]
-        methods += measure_methods((SOLVER, *models), scenes)
-    return Calibration(device_name(), tuple(methods))
+        scene = example_scene(garment, size, clip, _TIMED_FRAMES, has_coarse_edges=has_coarse_edges)
+        costs += measure_costs((SOLVER, *models), scene)
+    return Calibration(device_name(), tuple(costs))
 
 
 def example_scene(
-    garment: str, size: str, clip: str, num_frames: int = _FRAMES, *, has_coarse_edges: bool = False
+    garment: str, size: str, clip: str, num_frames: int = 60, *, has_coarse_edges: bool = False
 ) -> Scene:
     """Prepare a bundled garment on a bundled clip, with the coarse edges that a hierarchical network reads."""
     poses = pose_body(load_body(), load_motion(clip), num_frames=num_frames)
@@ -54,37 +49,22 @@ def example_scene(
 
 
 def read_coarse_edges(names: tuple[str, ...]) -> bool:
-    """Return whether any of some methods reads coarse edges; the argument is that of `measure_methods`."""
+    """Return whether any of some methods reads coarse edges, which its garment then needs."""
     architectures = [simulator_of(name)[1].model for name in names]
     return any(isinstance(model, ModelConfig) and model.hierarchical for model in architectures)
 
 
-def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]:
-    """Measure error and cost of methods, on states of the optimum's own rollouts.
-
-    The optimum of a frame is the lowest potential that any method finds, since a network may lead to a deeper
-    minimum. The methods are timed alternately, since a machine's speed changes within minutes.
+def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
+    """Time methods in turns, since a machine's speed changes within minutes.
 
     Args:
         names: Of networks; SOLVER is the solver alone.
-        scenes: Of one size; the first is timed.
+        scene: Its first frames are simulated.
     """
-    _, solver = simulator_of(SOLVER)
-    truths = [rollout_scene(None, scene, solver, _TRUTH_ITERATIONS) for scene in scenes]
-    measured = {
-        name: [_measure_gap(name, scene, truth) for scene, truth in zip(scenes, truths, strict=True)]
-        for name in names
-    }
-    optima = [
-        np.min([ends.optimum for ends in same], axis=0) for same in zip(*measured.values(), strict=True)
-    ]
     runs = {(name, count): (*simulator_of(name), count) for name in names for count in _TIMED_ITERATIONS}
-    fixed_ms, iteration_ms = fit_costs(time_frames(runs, scenes[0]))
-    num_vertices = int(np.sum(scenes[0].garment.vertex_mask))
-    return [
-        Method(name, num_vertices, fixed_ms[name], iteration_ms, *_quantiles(name, gaps, optima))
-        for name, gaps in measured.items()
-    ]
+    fixed_ms, iteration_ms = fit_costs(time_frames(runs, scene))
+    num_vertices = int(np.sum(scene.garment.vertex_mask))
+    return [Cost(name, num_vertices, fixed_ms[name], iteration_ms) for name in names]
 
 
 def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
@@ -111,29 +91,6 @@ def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, f
     }, iteration_ms
 
 
-def _measure_gap(name: str, scene: Scene, truth: Trajectory) -> OptimalityGap:
-    """Return the potentials that a method leaves after every count of `ITERATIONS`, as NumPy arrays."""
-    params, config = simulator_of(name)
-    options = GapOptions(_EVERY, ITERATIONS[1:] if config.model is None else (), ITERATIONS)
-    return jax.device_get(measure_gap(params, truth, scene, config.model, options))
-
-
-def _quantiles(
-    name: str, gaps: list[OptimalityGap], optima: list[np.ndarray]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the median and the 99 % quantile of a method's relative gap over all scenes, by iterations."""
-    relative: dict[int, list[np.ndarray]] = {}
-    for ends, optimum in zip(gaps, optima, strict=True):
-        best = ends._replace(optimum=optimum)
-        for count, energy in (ends.solver if name == SOLVER else ends.refined).items():
-            relative.setdefault(count, []).append(np.asarray(best.share(energy)))
-    joined = {count: np.concatenate(parts) for count, parts in relative.items()}
-    return (
-        {str(count): float(np.median(values)) for count, values in joined.items()},
-        {str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
-    )
-
-
 def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tuple[Any, SimConfig]:
     """Return weights and configuration of a method: the solver, or a network with the solver behind it.
 
@@ -142,9 +99,7 @@ def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tupl
         iterations: Of the solver, per frame.
         tolerance: See `SimConfig`.
     """
-    if name == SOLVER:
-        return None, SimConfig(iterations=iterations, tolerance=tolerance)
-    params, model = load_model(name)
+    params, model = (None, None) if name == SOLVER else load_model(name)
     return params, SimConfig(model=model, iterations=iterations, tolerance=tolerance)
 
 

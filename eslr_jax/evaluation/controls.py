@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from eslr_jax.config import ModelConfig
+from eslr_jax.config import Control, ModelConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import init_model
 from eslr_jax.types import Garment
 
-Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
 EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 
 

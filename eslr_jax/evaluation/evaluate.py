@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
 from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import EvaluationOptions, ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.evaluation.controls import Control, control_garment, control_params
+from eslr_jax.evaluation.controls import control_garment, control_params
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import mean_energies
@@ -29,32 +28,6 @@ _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initia
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
 _STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
 _REACH = 0.06  # [m] of cloth, within which a body vertex counts as covered
-
-
-@dataclasses.dataclass(frozen=True)
-class EvaluationOptions:
-    """What to evaluate, and how densely."""
-
-    split: str = "test"
-    garments: tuple[str, ...] = ()  # empty: the training garments
-    clips: tuple[str, ...] = ()  # empty: all of the split
-    vertices: str = "1k"
-    gap_frames: int = 40  # frames of each clip for the gap; 0: it is not measured
-    every: int = 4  # of those, measure one in so many
-    rollout_frames: int = 300  # of the free rollout; clips are played back and forth
-    control: Control | None = None  # what the network is deprived of; see `controls`
-
-    def __post_init__(self) -> None:
-        """Reject lengths that leave nothing to measure.
-
-        Raises:
-            ConfigError: Names the field and the least value.
-        """
-        for name, least in (("gap_frames", 3), ("every", 1), ("rollout_frames", 4)):
-            if getattr(self, name) < least and (name, getattr(self, name)) != ("gap_frames", 0):
-                raise ConfigError(
-                    f"{name} = {getattr(self, name)} leaves nothing to measure; give {least} or more"
-                )
 
 
 def evaluate(
@@ -85,7 +58,7 @@ def evaluate(
         raise ConfigError(f"iterations = {iterations}; give 0 or more")
     garments = options.garments or tuple(load_splits()["garments"]["train"])
     clips = options.clips or split_clips(options.split)
-    config = SimConfig(model=model, iterations=iterations)
+    config = SimConfig(model=model, iterations=iterations, tolerance=0.0)
     body = load_body()
     scenes, forced, policy = [], [], []
     drifts: dict[str, float | None] = {}
@@ -111,7 +84,7 @@ def evaluate(
                 policy.append(on_policy)
             scene = scene_of(options.rollout_frames)
             free = _roll(params, scene, config)
-            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS))
+            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
             apart = distance_mm(free, optimum, scene)
             row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
             scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
@@ -136,7 +109,7 @@ def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[Opt
     """Return the gaps from the optimum's states and from those of the network's own rollout."""
     options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
-    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS)), (params, config)):
+    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)), (params, config)):
         trajectory = _roll(weights, scene, steps)
         measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
     return measured[0], measured[1]

@@ -9,10 +9,10 @@ import numpy as np
 import pygltflib as gltf
 import pytest
 import trimesh
+from commands import eslr
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body
-from eslr_jax.cli.runs import export
 from eslr_jax.errors import AssetError
 from eslr_jax.io.animated import Skin
 from eslr_jax.io.export import export_trajectory
@@ -376,12 +376,10 @@ def test_another_garment_is_refused(tmp_path, run, garment):
         export_trajectory(run, tmp_path / "a.glb", garment=replace(garment, faces=garment.faces[::-1]))
 
 
-@pytest.mark.parametrize("name", ["garment.npz", "trajectory.npz", "report.json"])
-def test_a_run_is_not_overwritten_by_its_export(tmp_path, monkeypatch, run, name):
+@pytest.mark.slow
+def test_the_command_exports_a_run(tmp_path, run):
     write_trajectory(tmp_path / "trajectory.npz", run)
-    before = (tmp_path / "trajectory.npz").read_bytes()
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(AssetError, match="a file of the run itself"):
-        export(tmp_path, Path(name), format_="npz", content="garment")
-    assert os.listdir(tmp_path) == ["trajectory.npz"]
-    assert (tmp_path / "trajectory.npz").read_bytes() == before
+    result = eslr("export", tmp_path, "--out", tmp_path / "a.mdd")
+    assert result.returncode == 0, result.stderr
+    assert Path(result.stdout.strip()) == tmp_path / "a.mdd"
+    assert (tmp_path / "a.mdd").stat().st_size == 8 + 4 * FRAMES + run.positions.nbytes

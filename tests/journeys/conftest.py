@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -23,11 +22,7 @@ def pytest_collection_modifyitems(items):
 def eslr():
     """A function that runs `eslr` with words and returns the finished process."""
 
-    def run(*words, cwd=None):
-        command = [sys.executable, "-m", "eslr_jax.cli", *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=600)
-
-    return run
+    return commands.eslr
 
 
 @pytest.fixture(scope="session")

@@ -113,27 +113,6 @@ def test_ctrl_c_while_a_run_is_measured_loses_no_frame(tmp_path):
     assert not (tmp_path / "run" / "sheet.png").exists(), "pictures are not waited for"
 
 
-@pytest.mark.parametrize("words", [
-    ("simulate", "--body", "nobody"),
-    ("simulate", "--resume"),
-    ("train", "--config", "missing.toml"),
-    ("train", "--resume"),
-])  # fmt: skip
-def test_refused_commands_leave_no_folder(tmp_path, eslr, words):
-    result = eslr(*words, "--out", tmp_path / "out")
-    assert result.returncode == 2
-    assert "Traceback" not in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_training_with_a_typo_leaves_no_folder(tmp_path, eslr):
-    (tmp_path / "recipe.toml").write_text(RECIPE)
-    words = ("train", "--config", tmp_path / "recipe.toml", "--out", tmp_path / "out")
-    result = eslr(*words, "--set", 'garments=["tshrit"]')
-    assert result.returncode == 2
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_training_stops_at_once_while_it_compiles_and_resumes(tmp_path, eslr, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # nothing is compiled yet
     (tmp_path / "recipe.toml").write_text(RECIPE)

@@ -1,19 +1,14 @@
-"""Bad input at the command line: exit code 2, one line that names the cause, and nothing left behind.
-
-The commands run in this process, through the program's own entry, so that a hundred of them stay cheap.
-"""
+"""Bad input at the command line: exit code 2, one line that names the cause, and nothing left behind."""
 
 import json
 import pickle
-import sys
-import warnings
+import shlex
 
 import numpy as np
 import pytest
+from commands import eslr_here, refused
 from example_runs import write_run
 from garment_shapes import skirt, write_obj
-
-from eslr_jax.cli import main
 
 NAN = float("nan")
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -61,6 +56,12 @@ end
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 PLY_FACES = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
 
+POSES = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": np.array(30.0)}
+BODY = {"positions": np.zeros((4, 4, 3)), "faces": np.array([[0, 1, 2], [0, 2, 3]]), "fps": np.array(30.0)}
+POSITIONS, FACES = skirt()
+SKIRT = {"rest_positions": POSITIONS, "faces": FACES}
+RECIPE = 'garments = ["tshirt"]\nsteps = 2\n[model]\nbase = "mgn-small"\n'
+
 
 class Danger:
     """A pickle that would run a command."""
@@ -71,296 +72,220 @@ class Danger:
         return os.system, ("touch danger",)
 
 
-def text(name, content):
-    """A file of text."""
-    return {name: content.encode()}
-
-
-def arrays(name, **values):
-    """An npz file."""
-    return {name: values}
-
-
-def skirt_file(**changes):
-    """A fitted garment's arrays, some of them changed."""
-    positions, faces = skirt()
-    return arrays("shirt.npz", **{"rest_positions": positions, "faces": faces} | changes)
-
-
-POSES = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": np.array(30.0)}
-BODY = {"positions": np.zeros((4, 4, 3)), "faces": np.array([[0, 1, 2], [0, 2, 3]]), "fps": np.array(30.0)}
-GARMENTS = {
-    "empty obj": (text("a.obj", ""), "empty"),
-    "obj without faces": (text("a.obj", TRIANGLE), "face"),
-    "obj face beyond the vertices": (text("a.obj", TRIANGLE + "f 1 2 9\n"), "outside 0..2"),
-    "obj face zero": (text("a.obj", TRIANGLE + "f 0 1 2\n"), "0"),
-    "obj with nan": (text("a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "finite"),
-    "obj with a huge number": (text("a.obj", "v 1e300 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
-    "obj with words for numbers": (text("a.obj", "v a b c\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
-    "obj vertex of two numbers": (text("a.obj", "v 1 2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), ""),
-    "obj of noise": ({"a.obj": bytes(range(256)) * 9}, ""),
-    "obj of one point": (text("a.obj", "v 0 1 0\n" * 3 + "f 1 2 3\n"), ""),
-    "obj face of two corners": (text("a.obj", TRIANGLE + "f 1 2\n"), "face"),
-    "three faces at an edge": (
-        text("a.obj", TRIANGLE + "v 0 0 1\nv 0 -1 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n"), "edge",
-    ),
-    "ply without an end": (text("a.ply", PLY), ""),
-    "ply of fewer vertices": (text("a.ply", PLY + PLY_FACES + "0 0 0\n1 0 0\n"), ""),
-    "ply without faces": (text("a.ply", PLY + "end_header\n0 0 0\n1 0 0\n0 1 0\n"), ""),
-    "ply face beyond": (text("a.ply", PLY + PLY_FACES + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"), ""),
-    "cut stl": ({"a.stl": b"\0" * 80 + (9).to_bytes(4, "little") + b"\0" * 50}, ""),
-    "glb of another magic": ({"a.glb": b"glXX" + b"\0" * 60}, ""),
-    "cut glb": ({"a.glb": b"glTF" + (2).to_bytes(4, "little") + (999).to_bytes(4, "little")}, ""),
-    "glb without a mesh": (
-        {"a.glb": b"glTF\2\0\0\0\x20\0\0\0\x0c\0\0\0JSON{}          "},
-        "",
-    ),
-    "npz without faces": (arrays("a.npz", rest_positions=np.zeros((3, 3))), ""),
-    "npz of wrong shapes": (skirt_file(rest_positions=np.zeros((9, 2))), ""),
-    "npz with nan": (skirt_file(rest_positions=np.full((1920, 3), NAN)), ""),
-    "npz with faces beyond": (skirt_file(faces=np.full((9, 3), 99999)), ""),
-    "npz of text": (text("a.npz", "hello"), ""),
-    "npz of objects": (arrays("a.npz", rest_positions=np.array([{}, None], dtype=object)), ""),
-    "a folder for a garment": ({"a.obj": None}, ""),
-    "an unknown suffix": (text("a.fbx", "hello"), "obj"),
-    "no suffix": (text("garment", "hello"), ""),
-    "pkl of noise": ({"a.pkl": b"\x80\x04noise"}, ""),
-    "pkl that would run a command": ({"a.pkl": pickle.dumps({"shirt": Danger()})}, ""),
-    "pkl without that garment": ({"a.pkl#skirt": pickle.dumps({"shirt": 1})}, ""),
+# Text, bytes, arrays of an npz, or None for a folder.
+FILES = {
+    "empty.obj": "",
+    "no-faces.obj": TRIANGLE,
+    "beyond.obj": TRIANGLE + "f 1 2 9\n",
+    "zero.obj": TRIANGLE + "f 0 1 2\n",
+    "nan.obj": "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "huge.obj": "v 1e300 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "large.obj": "v 2e4 0 0\nv -2e4 0 0\nv 0 2e4 0\nv 0 0 2e4\nf 1 2 3\nf 1 4 2\nf 2 4 3\n",
+    "words.obj": "v a b c\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "short.obj": "v 1 2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "noise.obj": bytes(range(256)) * 9,
+    "point.obj": "v 0 1 0\n" * 3 + "f 1 2 3\n",
+    "fan.obj": TRIANGLE + "v 0 0 1\nv 0 -1 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n",
+    "folder.obj": None,
+    "endless.ply": PLY,
+    "few.ply": PLY + PLY_FACES + "0 0 0\n1 0 0\n",
+    "beyond.ply": PLY + PLY_FACES + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
+    "cut.stl": b"\0" * 80 + (9).to_bytes(4, "little") + b"\0" * 50,
+    "magic.glb": b"glXX" + b"\0" * 60,
+    "cut.glb": b"glTF" + (2).to_bytes(4, "little") + (999).to_bytes(4, "little"),
+    "bare.glb": b"glTF\2\0\0\0\x20\0\0\0\x0c\0\0\0JSON{}          ",
+    "image.glb": b"\x89PNG\r\n\x1a\n" + b"\0" * 40,
+    "no-faces.npz": {"rest_positions": np.zeros((3, 3))},
+    "flat.npz": SKIRT | {"rest_positions": np.zeros((9, 2))},
+    "nan.npz": SKIRT | {"rest_positions": np.full((1920, 3), NAN)},
+    "beyond.npz": SKIRT | {"faces": np.full((9, 3), 99999)},
+    "objects.npz": {"rest_positions": np.array([{}, None], dtype=object)},
+    "noise.npz": "noise",
+    "garment.fbx": "hello",
+    "garment": "hello",
+    "noise.pkl": b"\x80\x04noise",
+    "danger.pkl": pickle.dumps({"shirt": Danger()}),
+    "shirt.pkl": pickle.dumps({"shirt": 1}),
+    "good.bvh": BVH,
+    "motion.abc": "hello",
+    "empty.bvh": "",
+    "still.bvh": BVH.partition("MOTION")[0],
+    "short.bvh": BVH.replace("0 90 0 0 0 0 0 0 0\n", "0 90 0\n"),
+    "nan.bvh": BVH.replace("90", "nan"),
+    "words.bvh": BVH.replace("90", "ninety"),
+    "frozen.bvh": BVH.replace("0.0333", "0"),
+    "minus.bvh": BVH.replace("Frames: 2", "Frames: -5"),
+    "cut.bvh": BVH[:120],
+    "channel.bvh": BVH.replace("Xposition", "Wposition"),
+    "million.bvh": BVH.replace("CHANNELS 6", "CHANNELS 1000000"),
+    "lone.amc": ":DEGREES\n1\nroot 0 1 0 0 20 0\n",
+    "wing.asf": ASF,
+    "wing.amc": ":DEGREES\n1\nroot 0 1 0 0 20 0\nwing 1 2\n",
+    "none.asf": ASF,
+    "none.amc": ":DEGREES\n",
+    "no-poses.npz": {"trans": np.zeros((4, 3))},
+    "one-pose.npz": POSES | {key: POSES[key][:1] for key in ("poses", "trans")},
+    "odd-poses.npz": POSES | {"poses": np.zeros((4, 17))},
+    "nan-poses.npz": POSES | {"poses": np.full((4, 156), NAN)},
+    "no-rate.npz": POSES | {"mocap_framerate": np.array(0.0)},
+    "two-lengths.npz": POSES | {"trans": np.zeros((3, 3))},
+    "clip.glb": b"glTF" + b"\0" * 20,
+    "one-frame.npz": BODY | {"positions": np.zeros((1, 4, 3))},
+    "nan-body.npz": BODY | {"positions": np.full((4, 4, 3), NAN)},
+    "beyond-body.npz": BODY | {"faces": np.array([[0, 1, 9]])},
+    "flat-body.npz": BODY,
+    "nothing": None,
+    "topologies/0.obj": TRIANGLE + "f 1 2 3\n",
+    "topologies/1.obj": TRIANGLE + "v 0 0 1\nf 1 2 4\n",
+    "words.toml": "these are words",
+    "key.toml": RECIPE.replace("steps", "stepz"),
+    "type.toml": RECIPE.replace("2", '"two"'),
+    "good.toml": RECIPE,
+    "list.json": "[1, 2]",
+    "wing.json": json.dumps({"Wing": "Hips"}),
+    "list/config.json": '{"format": 1, "train": []}',
+    "damaged/trajectory.npz": "noise",
+    "damaged/unfinished.npz": "noise",
+}
+# Each row: the rest of the command line, and what the line must name.
+FIT = {
+    "empty.obj": "empty", "no-faces.obj": "face", "beyond.obj": "outside 0..2", "zero.obj": "0",
+    "nan.obj": "finite", "huge.obj": "", "large.obj": "m, cm, mm, in", "words.obj": "", "short.obj": "",
+    "noise.obj": "", "point.obj": "", "fan.obj": "edge", "folder.obj": "", "endless.ply": "", "few.ply": "",
+    "beyond.ply": "", "cut.stl": "", "magic.glb": "", "cut.glb": "", "bare.glb": "", "no-faces.npz": "",
+    "flat.npz": "", "nan.npz": "", "beyond.npz": "", "objects.npz": "", "noise.npz": "", "garment.fbx": "obj",
+    "garment": "", "noise.pkl": "", "danger.pkl": "", "shirt.pkl#skirt": "",
+    "skirt.obj --units -1": "positive", "skirt.obj --edge-length 0": "edge", "skirt.obj --weld nan": "weld",
+    "skirt.obj --pin vertices:99999": "99999", "skirt.obj --pin region:y>1.2.3": "y>1.2.3",
+    "skirt.obj --pin part:collar": "no such part", "skirt.obj --fabric denin": "did you mean denim",
+    "skirt.obj --scale girth --no-picture": "--made-for", "tank --made-for anny": "made for the bundled body",
+    "skirt.obj --out a.obj": "npz", "skirt.obj --out key.toml/a.npz": "key.toml",
+    "run/garment.npz --out b.npz": "fitted already",
+    "mesh.npz --out ./mesh.npz": "a file that is read", "tank --body-units cm": "leave out its unit",
+    "pants --pin none --edge-length 0.01": "leave out --edge-length, --pin",
 }  # fmt: skip
-MOTIONS = {
-    "empty bvh": (text("a.bvh", ""), ""),
-    "bvh without motion": (text("a.bvh", BVH.partition("MOTION")[0]), ""),
-    "bvh row too short": (text("a.bvh", BVH.replace("0 90 0 0 0 0 0 0 0\n", "0 90 0\n")), ""),
-    "bvh with nan": (text("a.bvh", BVH.replace("90", "nan")), "finite"),
-    "bvh of words": (text("a.bvh", BVH.replace("90", "ninety")), ""),
-    "bvh frame time zero": (text("a.bvh", BVH.replace("0.0333", "0")), ""),
-    "bvh of minus five frames": (text("a.bvh", BVH.replace("Frames: 2", "Frames: -5")), ""),
-    "bvh cut in its hierarchy": (text("a.bvh", BVH[:120]), ""),
-    "bvh of an unknown channel": (text("a.bvh", BVH.replace("Xposition", "Wposition")), ""),
-    "bvh of a million channels": (text("a.bvh", BVH.replace("CHANNELS 6", "CHANNELS 1000000")), ""),
-    "bvh of one joint": (
-        text("a.bvh", "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n}\nMOTION\n"
-             "Frames: 2\nFrame Time: 0.03\n0 0 0\n0 0 0\n"), "",
-    ),
-    "amc without its asf": (text("a.amc", ":DEGREES\n1\nroot 0 1 0 0 20 0\n"), "asf"),
-    "amc of an unknown bone": (
-        text("a.asf", ASF) | text("a.amc", ":DEGREES\n1\nroot 0 1 0 0 20 0\nwing 1 2\n"), "wing",
-    ),
-    "amc without frames": (text("a.asf", ASF) | text("a.amc", ":DEGREES\n"), "frame"),
-    "asf for a motion": (text("a.asf", ASF), ""),
-    "npz without poses": (arrays("a.npz", trans=np.zeros((4, 3))), "no motion"),
-    "amass of one frame": (arrays("a.npz", **POSES | {key: POSES[key][:1] for key in ("poses", "trans")}), ""),
-    "amass of odd width": (arrays("a.npz", **POSES | {"poses": np.zeros((4, 17))}), ""),
-    "amass with nan": (arrays("a.npz", **POSES | {"poses": np.full((4, 156), NAN)}), "finite"),
-    "amass at no rate": (arrays("a.npz", **POSES | {"mocap_framerate": np.array(0.0)}), ""),
-    "amass of two lengths": (arrays("a.npz", **POSES | {"trans": np.zeros((3, 3))}), ""),
-    "motion pkl of noise": ({"a.pkl": b"noise"}, ""),
-    "a folder for a motion": ({"a.bvh": None}, ""),
-    "a motion of an unknown suffix": (text("a.abc", "hello"), ".bvh"),
-    "glb without a clip of that name": ({"a.glb#run": b"glTF" + b"\0" * 20}, ""),
+SIMULATE = {
+    **{f"--motion {file}": cause for file, cause in {
+        "empty.bvh": "", "still.bvh": "", "short.bvh": "", "nan.bvh": "finite", "words.bvh": "",
+        "frozen.bvh": "", "minus.bvh": "", "cut.bvh": "", "channel.bvh": "", "million.bvh": "",
+        "lone.amc": "asf", "wing.amc": "wing", "none.amc": "frame", "wing.asf": "", "no-poses.npz": "no motion",
+        "one-pose.npz": "", "odd-poses.npz": "", "nan-poses.npz": "finite", "no-rate.npz": "",
+        "two-lengths.npz": "", "noise.pkl": "", "folder.obj": "", "garment.fbx": "glTF", "motion.abc": ".bvh",
+        "clip.glb#run": "",
+        "moonwalk": "cmu_016_32", "turn --motion jump": "--motion is given twice",
+    }.items()},
+    **{f"--body {file}": cause for file, cause in {
+        "no-faces.npz": "", "one-frame.npz": "", "nan-body.npz": "finite", "beyond-body.npz": "",
+        "flat-body.npz": "", "garment.fbx": "", "nothing": "", "topologies": "", "noise.pkl": "",
+        "image.glb": "", "robot": "anny",
+    }.items()},
+    "--garment tshrit": "tshirt", "--garment missing.obj": "missing.obj", "--garment empty.obj": "empty",
+    "--garment tshirt --garment tshirt": "worn once only",
+    "--gust 0.3": "wind", "--wind 3 0 0 --gust -1": "gusts", "--wind nan 0 0": "wind",
+    "--wind 0 0 500": "wind", "--damping 2": "damping", "--damping -0.1": "damping",
+    "--frames -3": "two frames", "--frames 1": "two frames", "--frames 100000": "fewer than",
+    "--start 99s": "start", "--start -1": "", "--start later": "--start", "--start nans": "--start",
+    "--loop 0s": "", "--loop ever": "--loop", "--settle -1": "--settle",
+    "--self-contact --no-self-contact": "exclude each other",
+    "--budget 20": "--budget", "--budget -5ms": "--budget", "--budget fast": "20ms", "--budget nanms": "20ms",
+    "--budget 0.001ms": "the fastest frame here takes",
+    "--tolerance 150%": "--tolerance", "--tolerance small": "1%", "--tolerance 0": "1%",
+    "--budget 20ms --tolerance 1%": "either", "--tolerance 1% --iterations 5": "leave out --iterations",
+    "--iterations -1": "iterations", "--simulator physics --iterations 0": "needs a network",
+    "--simulator physics --model eslr-small": "leave out --model", "--model missing.npz": "missing.npz",
+    "--model eslr-huge": "eslr-huge", "--model noise.npz": "noise.npz",
+    "--fabric kevlra": "kevlra", "--fabric density=-1": "density", "--fabric density=nan": "density",
+    "--fabric colour=3": "colour", "--garment tank --fabric front:denim": "front",
+    "--joint-map map.json": "map.json", "--joint-map list.json --motion good.bvh": "list.json",
+    "--joint-map wing.json --motion good.bvh": "Wing", "--arm-abduction nan": "", "--arm-abduction 1e9": "",
+    "--body-fps 30": "--body-fps", "--betas " + "1 " * 99: "betas", "--body-units cm": "metres",
+    "--resume": "no interrupted simulation", "--resume --out damaged": "unfinished.npz",
+    "--out key.toml": "is a file", "--frames 2 --out key.toml/out": "key.toml",
 }  # fmt: skip
-BODIES = {
-    "npz that is no body": (arrays("a.npz", something=np.zeros(3)), ""),
-    "a body of one frame": (arrays("a.npz", **BODY | {"positions": np.zeros((1, 4, 3))}), ""),
-    "a body with nan": (arrays("a.npz", **BODY | {"positions": np.full((4, 4, 3), NAN)}), "finite"),
-    "a body with faces beyond": (arrays("a.npz", **BODY | {"faces": np.array([[0, 1, 9]])}), ""),
-    "a flat body": (arrays("a.npz", **BODY), ""),
-    "a body of an unknown suffix": (text("a.fbx", "hello"), ""),
-    "an empty folder": ({"bodies": None}, ""),
-    "a folder of two topologies": (
-        text("bodies/0.obj", TRIANGLE + "f 1 2 3\n") | text("bodies/1.obj", TRIANGLE + "v 0 0 1\nf 1 2 4\n"), "",
-    ),
-    "smpl of noise": ({"a.pkl": b"\x80\x04noise"}, ""),
-    "a body that is an image": ({"a.glb": b"\x89PNG\r\n\x1a\n" + b"\0" * 40}, ""),
-}  # fmt: skip
-OPTIONS = {
-    "gusts without wind": (("--gust", "0.3"), "wind"),
-    "gusts that are negative": (("--wind", "3", "0", "0", "--gust", "-1"), "gusts"),
-    "a wind of nan": (("--wind", "nan", "0", "0"), "wind"),
-    "a hurricane": (("--wind", "0", "0", "500"), "wind"),
-    "damping of two seconds": (("--damping", "2"), "damping"),
-    "negative damping": (("--damping", "-0.1"), "damping"),
-    "minus three frames": (("--frames", "-3"), "two frames"),
-    "no frame": (("--frames", "0"), "two frames"),
-    "a start behind the end": (("--start", "99s"), "start"),
-    "a start before the beginning": (("--start", "-1"), ""),
-    "a start of words": (("--start", "later"), "--start"),
-    "a start at no number": (("--start", "nans"), "--start"),
-    "a loop of nothing": (("--loop", "0s"), ""),
-    "a loop of words": (("--loop", "ever"), "--loop"),
-    "minus one frame of settling": (("--settle", "-1"), "--settle"),
-    "a budget without unit": (("--budget", "20"), "--budget"),
-    "a negative budget": (("--budget", "-5ms"), "--budget"),
-    "a tolerance above one": (("--tolerance", "150%"), "--tolerance"),
-    "a tolerance of words": (("--tolerance", "small"), "--tolerance"),
-    "an unknown fabric": (("--fabric", "kevlra"), "kevlra"),
-    "a fabric of negative density": (("--fabric", "density=-1"), "density"),
-    "a fabric that is no number": (("--fabric", "density=nan"), "density"),
-    "a fabric of an unknown value": (("--fabric", "colour=3"), "colour"),
-    "a missing joint map": (("--joint-map", "map.json"), "map.json"),
-    "arms at no angle": (("--arm-abduction", "nan"), ""),
-    "arms around the clock": (("--arm-abduction", "1e9"), ""),
-    "a rate for a rigged body": (("--body-fps", "30"), "--body-fps"),
-    "betas for another body": (("--betas", *["1"] * 99), "betas"),
-    "a unit for the bundled body": (("--body-units", "cm"), "metres"),
-    "minus one iteration": (("--iterations", "-1"), "iterations"),
-    "a missing model": (("--model", "missing.npz"), "missing.npz"),
-    "an unknown model": (("--model", "eslr-huge"), "eslr-huge"),
-    "a fabric for a part that the garment lacks": (("--garment", "tank", "--fabric", "front:denim"), "front"),
+TRAIN = {
+    "": "--out", "--out t": "--config", "--config missing.toml --out t": "missing.toml",
+    "--config words.toml --out t": "words.toml", "--config key.toml --out t": "stepz",
+    "--config type.toml --out t": "steps", "--config run --out t": "run",
+    "--config good.toml --set steps=-1 --out t": "steps", "--config good.toml --set steps --out t": "key=value",
+    "--config good.toml --set 'garments=[\"tshrit\"]' --tensorboard --out t": "tshrit",
+    "--config good.toml --num-processes 2 --process-id 1 --out t": "--coordinator",
+    "--resume --out list": "config.json", "--resume --out t": "t", "--resume --set iterations=3 --out t": "--set",
 }  # fmt: skip
 OTHERS = {
-    "render of nothing": (("render", "missing", "--out", "a.png"), "missing"),
-    "render of no picture": (("render", "run", "--out", "a.png", "--frames", "0"), "--frames"),
-    "render into a gif": (("render", "run", "--out", "a.gif"), ".mp4"),
-    "render without zoom": (("render", "run", "--out", "a.png", "--zoom", "0"), "zoom"),
-    "render with a zoom of nan": (("render", "run", "--out", "a.png", "--zoom", "nan"), "zoom"),
-    "render from nowhere": (("render", "run", "--out", "a.png", "--camera", "above"), "camera"),
-    "render behind the end": (("render", "run", "--out", "a.png", "--at", "99s"), "--at"),
-    "render at a word": (("render", "run", "--out", "a.png", "--at", "noon"), "--at"),
-    "render of no width": (("render", "run", "--out", "a.png", "--width", "0"), "width"),
-    "render of no ray": (("render", "run", "--out", "a.png", "--samples", "0"), "samples"),
-    "export of nothing": (("export", "missing", "--out", "a.glb"), "missing"),
-    "export to an unknown suffix": (("export", "run", "--out", "a.xyz"), "xyz"),
-    "export of a damaged run": (("export", "damaged", "--out", "a.glb"), "damaged"),
-    "training on words": (("train", "--config", "words.toml", "--out", "t"), "words.toml"),
-    "training of an unknown key": (("train", "--config", "key.toml", "--out", "t"), "stepz"),
-    "training of the wrong type": (("train", "--config", "type.toml", "--out", "t"), "steps"),
-    "training of minus one step": (
-        ("train", "--config", "good.toml", "--set", "steps=-1", "--out", "t"), "steps",
-    ),
-    "a change without a value": (("train", "--config", "good.toml", "--set", "steps", "--out", "t"), "key=value"),
-    "a folder for a configuration": (("train", "--config", "run", "--out", "t"), "run"),
-    "evaluation of an unknown network": (("evaluate", "--model", "eslr-huge"), "eslr-huge"),
-    "evaluation on an unknown split": (("evaluate", "--model", "eslr-small", "--split", "tset"), "tset"),
-    "evaluation of an unknown clip": (("evaluate", "--model", "eslr-small", "--clips", "x"), "x"),
-    "evaluation with minus one iteration": (
-        ("evaluate", "--model", "eslr-small", "--iterations", "-1"), "iterations",
-    ),
-    "a calibration into a file": (("calibrate", "--out", "key.toml/a.json"), "key.toml"),
-    "a run whose configuration is a list": (("train", "--resume", "--out", "list"), "config.json"),
-    "training with events of an unknown garment": (
-        ("train", "--config", "good.toml", "--set", 'garments=["tshrit"]', "--tensorboard", "--out", "t"),
-        "tshrit",
-    ),
-    "info of an unknown network": (("info", "--model", "eslr-huge"), "eslr-huge"),
-    "info of a network and a scene": (("info", "--scene", "tshirt", "--model", "eslr-small"), "--model"),
-    "processes that nothing joins": (
-        ("train", "--config", "good.toml", "--num-processes", "2", "--process-id", "1", "--out", "t"),
-        "--coordinator",
-    ),
-    "coordinates taken from a network without attention": (
-        ("evaluate", "--model", "mgn-5-correction", "--control", "no_embedding"), "attention",
-    ),
-    "info of a missing scene": (("info", "--scene", "missing.obj"), "missing.obj"),
-    "a body exported to stl": (("assets", "--export", "body.stl"), "obj"),
-    "joints of nothing": (("joints", "--motion", "missing.bvh"), "missing.bvh"),
-    "joints of an unknown suffix": (("joints", "--motion", "key.toml"), ""),
-    "a fit without npz": (("fit", "skirt.obj", "--out", "a.obj"), "npz"),
-    "a fit in minus units": (("fit", "skirt.obj", "--out", "a.npz", "--units", "-1"), "positive"),
-    "a fit with an edge of nothing": (("fit", "skirt.obj", "--out", "a.npz", "--edge-length", "0"), "edge"),
-    "a fit with a weld of nan": (("fit", "skirt.obj", "--out", "a.npz", "--weld", "nan"), "weld"),
-    "a fit with a pin of no vertex": (("fit", "skirt.obj", "--out", "a.npz", "--pin", "vertices:99999"), "99999"),
-    "a pin at no number": (("fit", "skirt.obj", "--out", "a.npz", "--pin", "region:y>1.2.3"), "y>1.2.3"),
-    "a text format in a binary file": (
-        ("export", "run", "--format", "usda", "--out", "a.usdc"), ".usda",
-    ),
-    "a size of a garment of no other body": (
-        ("fit", "skirt.obj", "--out", "a.npz", "--scale", "girth", "--no-picture"), "--made-for",
-    ),
-    "a bundled garment of another body": (
-        ("fit", "tank", "--out", "a.npz", "--made-for", "anny"), "made for the bundled body",
-    ),
-    "a fit into a folder that is a file": (("fit", "skirt.obj", "--out", "key.toml/a.npz"), "key.toml"),
-    "a map that is no table": (
-        ("simulate", "--joint-map", "list.json", "--motion", "good.bvh", "--out", "t"), "list.json",
-    ),
-    "a map of an unknown joint": (
-        ("simulate", "--joint-map", "wing.json", "--motion", "good.bvh", "--out", "t"), "Wing",
-    ),
-    "a network of noise": (("simulate", "--model", "noise.npz", "--out", "t"), "noise.npz"),
-    "a run to resume that is damaged": (("simulate", "--resume", "--out", "damaged"), "unfinished.npz"),
-    "an output inside a file": (("simulate", "--frames", "2", "--out", "key.toml/out"), "key.toml"),
+    "render missing --out a.png": "missing", "render nothing --out a.png": "is no run",
+    "render run --out a.gif": ".mp4",
+    **{f"render run --out a.png {options}": cause for options, cause in {
+        "--frames 0": "--frames 0", "--zoom 0": "zoom", "--zoom nan": "zoom", "--camera above": "camera",
+        "--at 9s": "ends at frame 5, 0.17 s", "--at noon": "a frame, such as 375", "--at 1.5": "--at",
+        "--at 1 --frames 2": "no --frames", "--width 0": "width", "--samples 0": "samples",
+    }.items()},
+    "view nothing": "is no run",
+    "export missing --out a.glb": "missing", "export run --out a.xyz": "xyz",
+    "export damaged --out a.glb": "damaged", "export run --format usda --out a.usdc": ".usda",
+    "export run --out run/garment.npz": "a file of the run itself",
+    "evaluate --model eslr-huge": "eslr-huge", "evaluate --model eslr-small --split tset": "tset",
+    "evaluate --model eslr-small --clips x": "x", "evaluate --model eslr-small --iterations -1": "iterations",
+    "evaluate --model eslr-small --gap-frames 2": "gap_frames", "evaluate --model eslr-small --every 0": "every",
+    "evaluate --model eslr-small --rollout-frames 0": "rollout_frames",
+    "evaluate --model mgn-5-correction --control no_embedding": "attention",
+    "calibrate --out key.toml/a.json": "key.toml",
+    "info --model eslr-huge": "eslr-huge", "info --model eslr-smal": "did you mean eslr-small",
+    "info --scene tshirt --model eslr-small": "--model", "info --scene missing.obj": "missing.obj",
+    "info --motion turn --self-contact": "leave out --motion, --self-contact",
+    "assets --export body.stl": "obj", "assets --body anny": "leave out --body",
+    "assets --kind fabric --verify": "leave out --verify",
+    "assets --export a.obj --kind body --json": "lists nothing; leave out --kind, --json",
+    "joints --motion missing.bvh": "missing.bvh", "joints --motion key.toml": "",
+    "joints --motion turn": "needs no",
+    "score missing.npz": "doesn't exist", "score flat-body.npz --run run --garment tank": "leave out --garment",
+    "score run --run run": "leave out --run",
+    "convert noise.npz --out hood.pth": "npz file",
 }  # fmt: skip
 
 
-def write(folder, files):
-    """Write files: bytes, arrays of an npz, or None for a folder; return the path of the last."""
-    path = folder
-    for name, content in files.items():
-        path = folder / name.partition("#")[0]
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, body):
+    """A folder with bad files, and a run that is good."""
+    folder = tmp_path_factory.mktemp("bad")
+    write_run(folder, body, "run")
+    write_obj(folder / "skirt.obj", skirt())
+    np.savez(folder / "mesh.npz", positions=np.eye(3), faces=np.arange(3)[None])
+    for name, content in FILES.items():
+        path = folder / name
         path.parent.mkdir(exist_ok=True)
         if content is None:
             path.mkdir()
         elif isinstance(content, dict):
             np.savez(path, **content)
         else:
-            path.write_bytes(content)
-    *_, last = files
-    first = folder / last.partition("/")[0] if "/" in last else folder / last
-    return str(first)
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return folder
 
 
-@pytest.fixture
-def refused(monkeypatch, capsys, tmp_path):
-    """A function that runs a command, and checks that it is refused in one line and leaves nothing."""
-
-    def run(words, cause):
-        monkeypatch.chdir(tmp_path)
-        before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
-        monkeypatch.setattr(sys, "argv", ["eslr", *words])
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as end:
-            main()
-        shown = capsys.readouterr().err
-        lines = [line for line in shown.splitlines() if line.startswith("eslr: ")]
-        assert end.value.code == 2, shown
-        assert len(lines) == 1, shown
-        assert "Traceback" not in shown
-        assert cause in lines[0]
-        assert len(lines[0]) > 25  # more than a name: what to do
-        assert sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*")) == before
-
-    return run
+def check(folder, monkeypatch, words, cause):
+    monkeypatch.chdir(folder)
+    before = sorted(path.relative_to(folder) for path in folder.rglob("*"))
+    refused(eslr_here(*shlex.split(words)), cause)
+    assert sorted(path.relative_to(folder) for path in folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("kind", GARMENTS)
-def test_bad_garments(tmp_path, refused, kind):
-    files, cause = GARMENTS[kind]
-    refused(("fit", write(tmp_path, files), "--out", "fitted.npz", "--no-picture"), cause)
+@pytest.mark.parametrize("words", FIT)
+def test_fit(folder, monkeypatch, words):
+    out = "" if "--out" in words else " --out fitted.npz"
+    check(folder, monkeypatch, f"fit {words}{out}", FIT[words])
 
 
-@pytest.mark.parametrize("kind", MOTIONS)
-def test_bad_motions(tmp_path, refused, kind):
-    files, cause = MOTIONS[kind]
-    refused(("simulate", "--motion", write(tmp_path, files), "--out", "out"), cause)
+@pytest.mark.parametrize("words", SIMULATE)
+def test_simulate(folder, monkeypatch, words):
+    out = "" if "--out" in words else " --out out"
+    check(folder, monkeypatch, f"simulate {words}{out}", SIMULATE[words])
 
 
-@pytest.mark.parametrize("kind", BODIES)
-def test_bad_bodies(tmp_path, refused, kind):
-    files, cause = BODIES[kind]
-    refused(("simulate", "--body", write(tmp_path, files), "--out", "out"), cause)
+@pytest.mark.parametrize("words", TRAIN)
+def test_train(folder, monkeypatch, words):
+    check(folder, monkeypatch, f"train {words}", TRAIN[words])
 
 
-@pytest.mark.parametrize("kind", OPTIONS)
-def test_bad_options(refused, kind):
-    words, cause = OPTIONS[kind]
-    refused(("simulate", *words, "--out", "out"), cause)
-
-
-@pytest.mark.parametrize("kind", OTHERS)
-def test_bad_commands(tmp_path, body, refused, kind):
-    words, cause = OTHERS[kind]
-    if "run" in words:
-        write_run(tmp_path, body, "run")
-    if "skirt.obj" in words:
-        write_obj(tmp_path / "skirt.obj", skirt())
-    good = 'garments = ["tshirt"]\nsteps = 2\n[model]\nbase = "mgn-small"\n'
-    named = {
-        "words.toml": "these are words", "key.toml": good.replace("steps", "stepz"), "good.toml": good,
-        "type.toml": good.replace("2", '"two"'), "list.json": "[1, 2]", "wing.json": json.dumps({"Wing": "Hips"}),
-        "good.bvh": BVH, "noise.npz": "noise",
-        "list/config.json": '{"format": 1, "train": []}',
-        "damaged/trajectory.npz": "noise", "damaged/unfinished.npz": "noise",
-    }  # fmt: skip
-    write(tmp_path, {name: content.encode() for name, content in named.items()})
-    refused(words, cause)
+@pytest.mark.parametrize("words", OTHERS)
+def test_others(folder, monkeypatch, words):
+    check(folder, monkeypatch, words, OTHERS[words])

@@ -1,0 +1,43 @@
+"""Commands of `eslr`, as a user types them: in a process of their own, or cheaply in this one."""
+
+import contextlib
+import io
+import subprocess
+import sys
+import warnings
+from unittest import mock
+
+from eslr_jax.cli import main
+
+
+def eslr(*words, cwd=None):
+    """Run a command in a process of its own."""
+    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=600)
+
+
+def eslr_here(*words):
+    """Run a command in this process, through the program's own entry."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch.object(sys, "argv", ["eslr", *map(str, words)]),
+        warnings.catch_warnings(),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def refused(done, *causes):
+    """Check that a command ended with exit code 2 and one line that names the cause and what to do."""
+    lines = [line for line in done.stderr.splitlines() if line.startswith("eslr: ")]
+    assert done.returncode == 2, done.stderr
+    assert len(lines) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(lines[0]) > 25  # more than a name
+    for cause in causes:
+        assert cause in lines[0]
