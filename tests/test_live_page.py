@@ -127,7 +127,7 @@ def test_a_fabric_and_each_of_its_sliders_change_the_cloth(player):
     player.wait(2)
 
 
-def test_pause_one_frame_andrestart(player):
+def test_pause_one_frame_and_restart(player):
     controls = player.live.controls
     controls["playing"].value = False
     time.sleep(0.5)
@@ -142,7 +142,7 @@ def test_pause_one_frame_andrestart(player):
     player.wait(2)
 
 
-def test_a_vertex_is_dragged_andlet_go(player):
+def test_a_vertex_is_dragged_and_let_go(player):
     take_hold(player.live, (0.0, 1.1, 3.0), (0.0, 0.0, -1.0))
     vertex, handle = player.live.held, player.live.controls["hand"]
     before = player.positions()[vertex]

@@ -189,13 +189,13 @@ def _one_frame(live: Live, choice: Choice) -> bool:
     """
     if choice != live.refused:
         live.refused = None  # chosen once more, it is tried and told once more
-    is_due = _is_due(live, choice)
+    is_due, is_anew = _is_due(live, choice), live.anew.is_set()
     setting = fabric, wind = read_fabric(live.controls), read_wind(live.controls)
     if live.recorded:
         is_over = not live.controls["record"].value or len(live.recorded) >= MOST_RECORDED
         # A run has one garment, body, motion, fabric and wind, and puts the garment on once.
         is_another = is_due or jax.tree.leaves(setting) != jax.tree.leaves(live.setting)
-        if is_over or is_another or live.anew.is_set():
+        if is_over or is_another or is_anew:
             live.controls["record"].value = False
             _save(live)
     if is_due:
@@ -204,7 +204,7 @@ def _one_frame(live: Live, choice: Choice) -> bool:
     if cast is None or choice == live.refused or not is_asked:
         return False
     live.asked.clear()
-    if live.state is None or live.anew.is_set():
+    if live.state is None or is_anew:
         live.anew.clear()
         live.state, live.step = cast.stage.scene.initial_state, 0
         live.times, live.iterations = [], MOST_ITERATIONS
