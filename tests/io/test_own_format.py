@@ -7,7 +7,7 @@ import pytest
 
 from eslr_jax.assets import load_body, load_motion
 from eslr_jax.cli import app
-from eslr_jax.cli.runs import export
+from eslr_jax.cli.runs import Export
 from eslr_jax.errors import AssetError
 from eslr_jax.io.garment import read_garment_source
 from eslr_jax.io.mesh import MeshFile, read_mesh_file
@@ -48,12 +48,12 @@ def run(tmp_path):
 
 
 def test_a_run_is_exported_and_read_in_a_format_of_one_file(run, capsys):
-    export(run, run / "run.rows")
+    Export(run, run / "run.rows")()
     assert capsys.readouterr().out == f"{run / 'run.rows'}\n"
     sequence = read_mesh_sequence(run / "run.rows")
     np.testing.assert_array_equal(sequence.positions.astype(np.float32), POSITIONS)
     assert sequence.fps == pytest.approx(25.0)
-    export(run, run / "other", format_="rows", content="garment")
+    Export(run, run / "other", format="rows", content="garment")()
     assert (run / "other").read_bytes() == (run / "run.rows").read_bytes()
     for mesh in (read_mesh_file(run / "run.rows"), read_garment_source(run / "run.rows").mesh):
         np.testing.assert_array_equal(mesh.positions.astype(np.float32), POSITIONS[0])
@@ -66,11 +66,11 @@ def test_it_is_named_in_help_and_in_errors(run, monkeypatch, capsys):
         app.cli(prog="eslr")
     assert ", rows" in capsys.readouterr().out
     with pytest.raises(AssetError, match=r"name one with --format: glb, .*rows"):
-        export(run, run / "run.xyz")
+        Export(run, run / "run.xyz")()
     with pytest.raises(AssetError, match=r"'\.xyz'; give one of .*\.rows"):
         read_mesh_file(run / "run.xyz")
     with pytest.raises(AssetError, match="suffix of another format than glb"):
-        export(run, run / "run.rows", format_="glb")
+        Export(run, run / "run.rows", format="glb")()
 
 
 def test_whatever_its_reader_raises_is_one_named_line(tmp_path):
