@@ -215,11 +215,14 @@ def _counted(items: Iterator[Any], total: int, advance: Callable[[int, int], Any
         advance(done, total)
 
 
-def _formats() -> str:
+def _formats(_: object) -> str:
     """Return the names of all formats that are written; only `--help` asks, since it imports them all."""
     from eslr_jax.io.registry import WRITERS, names_of
 
-    return names_of(*WRITERS)
+    return f"(one of {names_of(*WRITERS)})"
+
+
+_FORMAT = tyro.conf.arg(metavar="FORMAT", help_behavior_hint=_formats)
 
 
 @app.command(name="export")
@@ -235,10 +238,7 @@ class Export:
     # File to write; with --format obj or ply a new folder, one file a frame.
     out: Path
     # Format of the file; by default what the suffix says.
-    format: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="FORMAT", help_behavior_hint=lambda _: f"(one of {_formats()})"),
-    ] = None
+    format: Annotated[str | None, _FORMAT] = None
     # garment, body, or both; by default both to glb and usd, and the garment to all others.
     content: Literal["garment", "body", "both"] | None = None
 

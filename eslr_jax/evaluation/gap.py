@@ -23,7 +23,7 @@ from eslr_jax.types import ClothState, PastState, Scene, Trajectory
 
 ITERATIONS = (0, 5, 10, 20, 50, 100)  # of L-BFGS, for comparison
 _LEAST_INITIAL_GAP = 1e-9  # [J]
-_OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the initial gap; see experiments/solver_convergence.py
+_OPTIMUM_ITERATIONS = 500  # leaves less than 1e-5 of the initial gap; see experiments/tried.md
 
 
 class OptimalityGap(NamedTuple):

@@ -1,5 +1,4 @@
-"""Energies of cloth, one a file; their sum, its minimisers, and how far an answer is from the minimum.
+"""The minimum of a frame's potential: guesses, solver, derivatives; and what fabrics are made of.
 
-Two sets of energies: `potential` (set `consistent`, the default) and `hood` (HOOD's published losses, for
-tables); the table in `potential` shows them side by side. `newton`, `hessian` and `validate` run on the host.
+`validate` runs on the host.
 """
