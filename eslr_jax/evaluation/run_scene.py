@@ -77,6 +77,13 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         run.report.get("damping_s"),
     )
     asked = ([] if air is None else [air]) + ([] if damping is None else [Damping(damping)])
+    terms = (*scene_terms(body, has_ground=ground is not None, has_layers=has_layers), *asked)
+    own = set(run.report.get("terms", ())) - {term.name for term in terms}
+    if has_contact and own:
+        raise ConfigError(
+            f"{run.name} was simulated with energies of its own ({', '.join(sorted(own))}), which its files don't "
+            "hold; score its positions in the scene that was simulated: evaluation.score.score_trajectory"
+        )
     return Scene(
         garment=garment,
         material=material,
@@ -89,7 +96,7 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
         self_contact=capacity if has_layers else None,
         pieces=jnp.asarray(piece_of_vertices(garment)) if has_layers and has_pieces else None,
         ground=ground,
-        terms=(*scene_terms(body, has_ground=ground is not None, has_layers=has_layers), *asked),
+        terms=terms,
         substeps=run.report.get("substeps", 1),
     )
 

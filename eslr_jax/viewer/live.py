@@ -403,7 +403,7 @@ def _save(live: Live) -> None:
     )
     scene = cast.stage.scene.replace(material=fabric, constants=constants_for(fabric))
     if not any(one.is_held for one in recorded):
-        scene = scene.replace(energies=())  # the hand's
+        scene = scene.replace(terms=scene.terms[:-1])  # without the hand
     report = {
         "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,

@@ -10,7 +10,7 @@ from draped_ball import drifting_ball, square
 from example_runs import write_run
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import AssetError
+from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.evaluation import fields
 from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
@@ -104,6 +104,9 @@ def test_a_run_keeps_the_constants_of_its_scene(runs):
     assert scene.constants == constants_for(scene.material).replace(gravity=1.62)
     assert scene.body.has_tips
     assert scene_record(scene)["constants"]["gravity"] == 1.62
+    own = dataclasses.replace(run, report=run.report | {"terms": ["stretch", "hand"]})
+    with pytest.raises(ConfigError, match=r"energies of its own \(hand\)"):
+        run_scene(own, *run_garment(run))
 
 
 @pytest.mark.parametrize("name", ["friction-energy", "distance"])
