@@ -7,6 +7,7 @@ import numpy as np
 
 from eslr_jax.assets import prepare_stored
 from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.fabric import garment_material
 from eslr_jax.geometry.surface import prepare_surface
@@ -81,8 +82,8 @@ def run_scene(run: Run, garment: Garment, material: Material, *, has_contact: bo
     own = set(run.report.get("terms", ())) - {term.name for term in terms}
     if has_contact and own:
         raise ConfigError(
-            f"{run.name} was simulated with energies of its own ({', '.join(sorted(own))}), which its files don't "
-            "hold; score its positions in the scene that was simulated: evaluation.score.score_trajectory"
+            f"{run.name} was simulated with energies of its own ({', '.join(sorted(own))}), which its files "
+            "don't hold; score its positions in the scene that was simulated: evaluation.score.score_trajectory"
         )
     return Scene(
         garment=garment,

@@ -119,7 +119,7 @@ def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, A
     minimum = _minimum(problem, start, stop, memory)
     is_refused = safe_norm(minimum.gradient.reshape(-1)) > _REFUSED * stop.force
     position = checkpoint_name(minimum.position, SOLUTION)
-    status = jnp.where(is_refused, int(Status.DERIVATIVE_REFUSED), int(Status.OK))
+    status = jnp.where(is_refused, jnp.int32(Status.DERIVATIVE_REFUSED), jnp.int32(Status.OK))
     minimum = minimum._replace(position=position, status=status)
 
     def at_minimum(problem: FrameProblem) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.physics.minres import solve_symmetric
 from eslr_jax.physics.potential import potential
+from eslr_jax.physics.preconditioner import sum_diagonals
 from eslr_jax.physics.tangent import apply, inverse_diagonal, precondition, tangent
 from eslr_jax.scene.plan import SceneOptions, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
@@ -46,7 +47,10 @@ def crumpled():
         _, forces = jax.jvp(lambda x: jax.grad(potential)(x, problem), (position,), (free,))
         matrix = tangent(problem, position)
         inverse = inverse_diagonal(matrix, problem, position)
-        return Crumpled(move, is_free, forces, apply(matrix, move.T).T, matrix.blocks[0], inverse)
+        # What no block holds is estimated: damping, and layers where they meet.
+        beyond = sum_diagonals(problem, position, lambda term: term.name in ("damping", "repulsion", "air"))
+        diagonal = matrix.blocks[0] + jnp.eye(3)[:, :, None] * beyond[None, None]
+        return Crumpled(move, is_free, forces, apply(matrix, move.T).T, diagonal, inverse)
 
     return everything(scene.initial_state.position + 3e-3 * jnp.asarray(noise), jnp.asarray(move))
 
