@@ -17,6 +17,7 @@ class Interruption:
         """Remember what to call when the first signal comes."""
         self._on_wanted = on_wanted
         self._before: dict[signal.Signals, Callable | int | None] = {}
+        self._wakeup = -1
         self.is_wanted = False
 
     def __enter__(self) -> Interruption:
@@ -32,11 +33,16 @@ class Interruption:
         if not self.is_wanted and not self._before and threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._before[number] = signal.signal(number, self._remember)
+            # Nobody else is told of the first signal: a thread that looked after it had been handled would find
+            # the handler of before, and act.
+            self._wakeup = signal.set_wakeup_fd(-1)
 
     def end(self) -> None:
         """Give the signals back."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        if self._before:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+            signal.set_wakeup_fd(self._wakeup, warn_on_full_buffer=False)
         self._before = {}
 
     def _remember(self, number: int, frame: object) -> None:
