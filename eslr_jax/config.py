@@ -151,7 +151,7 @@ class SimConfig:
 
     By default a frame ends at a tolerance of 1 %, after 500 iterations at most. With `iterations` alone it takes
     exactly so many. Two programs that round differently, such as a rollout inside and outside of `jax.jit`, may
-    end up to this tolerance apart.
+    end up to this tolerance apart: vertices of a T-shirt by 1.6 mm in their first frame.
     """
 
     model: ModelConfig | Predictor | None = None  # architecture, or a network of one's own; None: no network
