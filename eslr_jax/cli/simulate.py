@@ -299,7 +299,7 @@ def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simu
 def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict[str, Any]:
     """Write the good frames of a simulation, and what --resume needs if some are missing; return the report."""
     import jax
-    import jax.numpy as jnp
+    import numpy as np
 
     from eslr_jax.body.motion import first_poses
     from eslr_jax.evaluation.report import environment, trajectory_report
@@ -334,7 +334,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
     with waiting("measuring"):
         parts = stored.face_parts, stored.part_names
         skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
-        bounds, residuals = jnp.asarray(trajectory.gap_bounds)[1:], jnp.asarray(trajectory.residuals)[1:]
+        bounds, residuals = (np.asarray(track)[1:] for track in (trajectory.gap_bounds, trajectory.residuals))
         is_kept = keeps_tolerance(bounds, residuals, method.config.tolerance)
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
@@ -355,7 +355,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
             **wear_report(trajectory.positions, scene.garment, skinned, poses, parts=parts),
             "budget_ms": method.budget_ms,
             "tolerance": method.tolerance,
-            "within_tolerance": None if method.tolerance is None else float(jnp.mean(is_kept)),
+            "within_tolerance": None if method.tolerance is None else float(np.mean(is_kept)),
             "frame_ms": simulation.timing.frame_ms,
             "compile_s": simulation.timing.compile_s,
             **environment(),
