@@ -119,7 +119,7 @@ def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, A
     stop = Stop(jnp.maximum(iterations, _MOST_ITERATIONS), 0.0, start.inertial_energy, rounding)
     minimum = _minimum(problem, start, stop, memory)
     is_refused = safe_norm(minimum.gradient.reshape(-1)) > _REFUSED * weight_norm(problem)
-    position = checkpoint_name(minimum.position, SOLUTION)
+    position, is_refused = checkpoint_name((minimum.position, is_refused), SOLUTION)
     status = jnp.where(is_refused, jnp.int32(Status.DERIVATIVE_REFUSED), jnp.int32(Status.OK))
     minimum = minimum._replace(position=position, status=status)
 
