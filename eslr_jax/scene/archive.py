@@ -50,9 +50,9 @@ def load_scene(path: str | Path) -> Scene:
     try:
         scene = _build(json.loads(str(arrays[_TREE])), arrays)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise AssetError(f"{path} holds no scene of this version; simulate it again") from error
+        raise AssetError(f"{path} holds no scene of this version; write it again with save_scene") from error
     if not isinstance(scene, Scene):
-        raise AssetError(f"{path} holds no scene; give the scene.npz of a run")
+        raise AssetError(f"{path} holds no scene; give a file that save_scene wrote")
     return scene
 
 
