@@ -23,7 +23,7 @@ _PUBLIC = {
     "load_garment": "eslr_jax.assets",
     "load_model": "eslr_jax.assets",
     "load_motion": "eslr_jax.assets",
-    "load_trajectory": "eslr_jax.io.run",
+    "load_trajectory": "eslr_jax.evaluation.run",
     "pose_body": "eslr_jax.body.motion",
     "prepare_garment": "eslr_jax.geometry.prepare",
     "plan_scene": "eslr_jax.scene.plan",
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from eslr_jax.body.motion import pose_body
     from eslr_jax.config import ModelConfig, SimConfig, TrainConfig
     from eslr_jax.errors import EslrError
+    from eslr_jax.evaluation.run import load_trajectory
     from eslr_jax.evaluation.score import score_trajectory
     from eslr_jax.geometry.prepare import prepare_garment
-    from eslr_jax.io.run import load_trajectory
     from eslr_jax.scene.archive import load_scene, save_scene
     from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch

@@ -31,6 +31,7 @@ from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.evaluation.fields import Field, run_field
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
+from eslr_jax.evaluation.run import ClothTrack, read_run, write_run
 from eslr_jax.evaluation.score import EVERY
 from eslr_jax.fabric import garment_material
 from eslr_jax.fit.fit import fit_garment
@@ -40,7 +41,6 @@ from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.garment import read_garment_source
 from eslr_jax.io.obj import obj_text
 from eslr_jax.io.palette import outfit_colors
-from eslr_jax.io.run import ClothTrack, read_run, write_run
 from eslr_jax.physics.materials import WOVEN, fabric_names
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.scene.build import skin_garment
@@ -252,9 +252,8 @@ def score(frames: int) -> np.ndarray:
 def field_of(shot: Shot, name: str) -> Field:
     """Return a field of a scene, as `eslr render --color` shows it."""
     track = ClothTrack(shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads)
-    said = {"integrator": "bdf2", "skin_contacts": True}
     with tempfile.TemporaryDirectory() as folder:
-        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report=said)
+        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
         return run_field(read_run(Path(folder)), name)
 
 

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from chromium import CHROMIUM, launch
 
-from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
-from eslr_jax.io.run import read_run
+from eslr_jax.errors import AssetError
+from eslr_jax.evaluation.run import read_run, run_trajectory
 from eslr_jax.physics.materials import constants_for, fabric_material
 from eslr_jax.viewer.live import let_go, open_live, restart, run_live, take_hold
 from eslr_jax.viewer.live_controls import Choice
@@ -169,11 +169,26 @@ def test_a_recording_is_a_run(player):
     run = newest_run(player.live)
     assert 6 <= run.trajectory.num_frames <= 8
     assert run.report["motion"] == "turn"
-    scene = run_scene(run, *run_garment(run))
+    assert [term.name for term in run.scene.terms][-1] == "air", "no hand"
     stiffness = constants_for(fabric_material("denim")).collision_stiffness
-    assert float(scene.constants.collision_stiffness) == pytest.approx(float(stiffness), rel=1e-5)
-    assert run_trajectory(run, scene).residuals[-1] > 0, "a score steps each frame as the page did"
+    assert float(run.scene.constants.collision_stiffness) == pytest.approx(float(stiffness), rel=1e-5)
+    assert run_trajectory(run).residuals[-1] > 0, "a score steps each frame as the page did"
     assert trimesh.load(player.live.out / "1" / "animation.glb").geometry
+
+
+def test_a_recording_that_a_hand_pulled_at_is_not_scored(player):
+    controls = player.live.controls
+    controls["record"].value = True
+    player.wait(2)
+    take_hold(player.live, (0.0, 1.1, 3.0), (0.0, 0.0, -1.0))
+    player.wait(3)
+    controls["record"].value = False
+    player.wait(2)
+    let_go(player.live)
+    run = newest_run(player.live)
+    assert run.trajectory.num_frames > 3
+    with pytest.raises(AssetError, match="a hand held the cloth"):
+        run_trajectory(run)
 
 
 def test_a_minute_is_recorded_at_most(player, monkeypatch):
@@ -200,7 +215,8 @@ def test_a_recording_ends_with_the_fabric_wind_and_garment_that_it_shows(player)
     player.wait(1)
     run = newest_run(live)
     assert run.report["wind_m_s"] == [0.0, 0.0, 5.0]
-    np.testing.assert_allclose(run.trajectory.material.density, fabric_material("cotton").density, rtol=1e-6)
+    np.testing.assert_allclose(run.scene.material.density, fabric_material("cotton").density, rtol=1e-6)
+    np.testing.assert_allclose(run.scene.terms[-1].wind, [0.0, 0.0, 5.0])
     change(controls["garments"][1], "tshirt")  # which does not load, over itself
     controls["garments"][1].value = "nothing"
     player.wait(1)

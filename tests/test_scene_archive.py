@@ -8,25 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
-from flax import struct
+from own_term import Push
 
 from eslr_jax import SceneOptions, load_scene, prepare_scene, save_scene, simulate
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.terms.air import Air, blowing
-from eslr_jax.terms.term import Term
-
-
-@struct.dataclass
-class Push(Term):
-    """A steady push along x."""
-
-    name = "push"
-    on = "vertices"
-
-    pressure: float
-
-    def corner_energies(self, corners, problem, data):
-        return -self.pressure * problem.garment.vertex_areas * corners[0][0]
 
 
 def all_of_a_scene(**options):
@@ -50,7 +36,7 @@ def test_a_term_is_found_where_its_module_is_imported(tmp_path):
     code = "import sys, eslr_jax\ntry: eslr_jax.load_scene(sys.argv[1])\nexcept eslr_jax.EslrError as e: print(e)"
     command = [sys.executable, "-c", code, str(tmp_path / "scene.npz")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert result.stdout.strip().endswith(f"which is not known; import {__name__} first")
+    assert result.stdout.strip().endswith("which is not known; import own_term first")
 
 
 def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path):

@@ -11,8 +11,8 @@ from example_runs import write_run
 from eslr_jax.assets import load_garment_file
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.fields import FIELDS
+from eslr_jax.evaluation.run import read_run
 from eslr_jax.io.garment import write_garment_npz
-from eslr_jax.io.run import read_run
 from eslr_jax.viewer import go_to_worst, open_view, play, show
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -106,11 +106,17 @@ def test_a_field_is_plotted_over_time_and_leads_to_its_worst_frame(view):
     assert curves[1][1] > curves[0][1] > 1.05
     go_to_worst(view)
     assert view.controls["frame"].value == 1
-    view.runs[0].report["self_contact"] = False
-    view.controls["color"].value = "repulsion-energy"
-    show(view)
-    view.runs[0].report["self_contact"] = True
-    assert "without self-contact" in view.controls["legend"].content
+
+
+def test_a_field_that_a_run_lacks_is_told(tmp_path, body):
+    pytest.importorskip("viser")
+    view = open_view([read_run(write_run(tmp_path, body, "run", self_contact=False))], port=8792)
+    try:
+        view.controls["color"].value = "repulsion-energy"
+        show(view)
+        assert "without self-contact" in view.controls["legend"].content
+    finally:
+        view.server.stop()
 
 
 @pytest.mark.slow

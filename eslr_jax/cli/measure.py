@@ -19,9 +19,9 @@ from eslr_jax.config import EvaluationOptions
 from eslr_jax.errors import ConfigError, MeshError, MotionError
 
 if TYPE_CHECKING:
+    from eslr_jax.evaluation.run import Run
     from eslr_jax.io.garment import GarmentFile
     from eslr_jax.io.mesh_sequence import MeshSequence
-    from eslr_jax.io.run import Run
     from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 # [m] on average from where the garment is worn, from which a first frame is in other units or axes
@@ -89,8 +89,8 @@ class Score:
 
     def _read_task(self) -> _Task:
         """Read the trajectory, and its scene from itself, a run, or the names that are given."""
+        from eslr_jax.evaluation.run import is_run, read_run
         from eslr_jax.io.mesh_sequence import read_mesh_sequences
-        from eslr_jax.io.run import is_run, read_run
 
         named = ("garment", "motion", "body", "vertices", "fabric")
         given = {name: value for name in named if (value := getattr(self, name))}
@@ -119,10 +119,9 @@ class _Task(NamedTuple):
 
 def _own_task(run: Run) -> _Task:
     """Return a run as the trajectory of its own scene."""
-    from eslr_jax.evaluation.run_scene import run_garment, run_poses, run_scene, run_trajectory
+    from eslr_jax.evaluation.run import run_poses, run_trajectory
 
-    scene = run_scene(run, *run_garment(run))
-    return _Task(run_trajectory(run, scene), scene, run_poses(run, scene), run.garment, {"run": run.name})
+    return _Task(run_trajectory(run), run.scene, run_poses(run), run.garment, {"run": run.name})
 
 
 def _run_task(sequences: list[MeshSequence], run: Run) -> _Task:

@@ -77,7 +77,7 @@ class View:
 
     def __call__(self) -> None:
         """Serve the page until Ctrl-C."""
-        from eslr_jax.io.run import read_run
+        from eslr_jax.evaluation.run import read_run
         from eslr_jax.viewer import open_view, play
 
         page = open_view([read_run(run) for run in self.runs], host=self.host, port=self.port)
@@ -126,8 +126,8 @@ class Render:
     def __call__(self) -> None:
         """Render, and print the file's name."""
         from eslr_jax.evaluation.fields import run_field
+        from eslr_jax.evaluation.run import read_run
         from eslr_jax.io.palette import outfit_colors
-        from eslr_jax.io.run import read_run
         from eslr_jax.render import (
             add_color_bar,
             color_scale,
@@ -244,21 +244,19 @@ class Export:
 
     def __call__(self) -> None:
         """Write the file, print its name, and say where in the motion it begins."""
+        from eslr_jax.cli.simulate import UNFINISHED
+        from eslr_jax.evaluation.run import FILES, read_run
         from eslr_jax.io.export import export_trajectory
-        from eslr_jax.io.garment import read_garment_npz
-        from eslr_jax.io.trajectory import read_trajectory
-        from eslr_jax.io.unfinished import NAME
 
         out = self.out.expanduser()
         file = self.run / "trajectory.npz" if self.run.is_dir() else self.run
-        own = (file, *map(file.with_name, ("garment.npz", "report.json", NAME)))
+        own = (file, *map(file.with_name, (*FILES, UNFINISHED)))
         if out.resolve() in [path.resolve() for path in own]:
             raise AssetError(f"--out {out} is a file of the run itself, which would be lost; name another")
-        trajectory = read_trajectory(file)
-        beside = file.with_name("garment.npz")
-        garment = read_garment_npz(beside) if beside.is_file() else None
-        print(export_trajectory(trajectory, out, garment=garment, format=self.format, content=self.content))
-        start = trajectory.metadata.get("motion_start_s")
+        run = read_run(self.run)
+        options = {"garment": run.garment, "format": self.format, "content": self.content}
+        print(export_trajectory(run.trajectory, out, **options))
+        start = run.trajectory.metadata.get("motion_start_s")
         if isinstance(start, float) and start > 0:
             say(
                 f"frame 0 of {out} is {start:.3f} s after the first frame of the animation in the motion's file"

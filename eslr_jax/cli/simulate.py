@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from eslr_jax.io.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.types import Material, PairCapacity, Scene, Trajectory
+    from eslr_jax.types import Material, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
 _KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
-_SAME = 1e-4  # [m] by which the beginning of the same scene may differ between machines
+UNFINISHED = "unfinished.npz"
+_WORDS = {"content": "interrupted simulation", "remedy": "start without --resume in another folder"}
 
 
 @app.command(name="simulate")
@@ -77,7 +78,7 @@ class _Setting(NamedTuple):
     """What is simulated, and how."""
 
     names: tuple[str, ...]  # of the garments
-    garments: list[GarmentFile]  # each of them as the body wears it
+    garments: list[GarmentFile]  # each of them as the body wears it; none where a simulation goes on
     stored: GarmentFile  # all of them together
     actor: Actor
     material: Material
@@ -86,21 +87,29 @@ class _Setting(NamedTuple):
     scene: Scene  # with these frames
 
 
+class Unfinished(NamedTuple):
+    """A simulation that was interrupted: all that it needs to go on."""
+
+    options: dict[str, Any]  # values of JSON
+    actor: Actor  # over all frames
+    settle: int
+    scene: Scene  # over all frames, with the buffers that sufficed
+    done: Trajectory  # its first frames, without an error
+
+
 def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
     """Simulate, write the run's folder, and return the report."""
     from eslr_jax.io.atomic import ensure_output_dir
 
-    done, capacity = None, None
+    done = None
     if options.resume:
-        options, done, capacity = _read_interrupted(options)
-    options.check()
-    with waiting("preparing garment, body and motion"):
-        setting = _prepare(options)
-    if done is not None:
-        _check_same_scene(done, setting.scene, options.out)
-        setting = setting._replace(scene=setting.scene.replace(self_contact=capacity))
-    ensure_output_dir(options.out)
-    _announce(options, setting)
+        options, setting, done = _read_interrupted(options)
+    else:
+        options.check()
+        with waiting("preparing garment, body and motion"):
+            setting = _prepare(options)
+        ensure_output_dir(options.out)
+        _announce(options, setting)
     simulation = _run(setting, done, stop)
     timing, budget_ms = simulation.timing, setting.method.budget_ms
     if timing.compile_s > _LONG:
@@ -117,25 +126,21 @@ def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
     return report
 
 
-def _read_interrupted(given: Simulate) -> tuple[Simulate, Trajectory, PairCapacity | None]:
-    """Return the options of an interrupted simulation, its frames, and buffers of self-contact that sufficed.
+def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
+    """Return the options of an interrupted simulation, what is simulated, and the frames that are done.
 
     Raises:
         AssetError: The folder holds no interrupted simulation.
         ConfigError: An option is given that is not the simulation's own.
     """
     from eslr_jax.config import from_dict
-    from eslr_jax.io.unfinished import read_unfinished
-    from eslr_jax.types import PairCapacity
+    from eslr_jax.io.garment import read_garment_npz
+    from eslr_jax.scene.archive import read_tree
 
-    done, record = read_unfinished(given.out)
-    try:
-        own, capacity = from_dict(Options, record["options"]), record["capacity"]
-        capacity = None if capacity is None else PairCapacity(**capacity)
-    except (KeyError, TypeError, ConfigError) as error:
-        raise AssetError(
-            f"{given.out} was simulated by another version; start without --resume in another folder"
-        ) from error
+    if not (given.out / UNFINISHED).is_file():
+        raise AssetError(f"{given.out} holds no interrupted simulation; leave out --resume")
+    record, actor, settle, scene, done = read_tree(given.out / UNFINISHED, Unfinished, **_WORDS)
+    own = from_dict(Options, record)
     for field in dataclasses.fields(Options):
         value, known = getattr(given, field.name), getattr(own, field.name)
         if value not in (field.default, known):
@@ -144,7 +149,10 @@ def _read_interrupted(given: Simulate) -> tuple[Simulate, Trajectory, PairCapaci
                 f"{_typed(value)}; leave out all options but --out to go on, or start in another folder without "
                 "--resume"
             )
-    return dataclasses.replace(given, **vars(own)), done, capacity
+    stored, garments = read_garment_npz(given.out / "garment.npz"), own.garments
+    method = choose_method(own).within_budget(len(stored.rest_positions), own.substeps)
+    setting = _Setting(garments, [], stored, actor, scene.material, method, settle, scene)
+    return dataclasses.replace(given, **vars(own)), setting, done
 
 
 def _typed(value: Any) -> str:
@@ -152,22 +160,6 @@ def _typed(value: Any) -> str:
     if value is None or value == ():
         return "none"
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _check_same_scene(done: Trajectory, scene: Scene, out: Path) -> None:
-    """Raise a ConfigError unless the frames that are done begin as the scene does."""
-    import numpy as np
-
-    first, again = np.asarray(done.positions[0]), np.asarray(scene.initial_state.position)
-    if (
-        first.shape != again.shape
-        or np.abs(first - again).max() > _SAME
-        or done.num_frames >= scene.num_frames
-    ):
-        raise ConfigError(
-            f"{out} was simulated with another garment, body or motion: their files have changed since; "
-            "start in another folder without --resume"
-        )
 
 
 def _prepare(options: Options) -> _Setting:
@@ -302,11 +294,11 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
     import numpy as np
 
     from eslr_jax.body.motion import first_poses
-    from eslr_jax.evaluation.report import environment, trajectory_report
+    from eslr_jax.evaluation.report import describe_model, environment, trajectory_report
+    from eslr_jax.evaluation.run import ClothTrack, write_run
     from eslr_jax.evaluation.wear import wear_report
     from eslr_jax.fabric import worn_fabrics
-    from eslr_jax.io.run import ClothTrack, scene_record, write_run
-    from eslr_jax.io.unfinished import NAME, write_unfinished
+    from eslr_jax.scene.archive import write_tree
     from eslr_jax.scene.build import skin_garment
     from eslr_jax.scene.plan import first_frames
     from eslr_jax.simulation.simulate import good_frames, last_frames, raise_for_status
@@ -326,8 +318,8 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
     if is_unfinished:
         if count < 2:
             raise KeyboardInterrupt
-        capacity = None if scene.self_contact is None else dataclasses.asdict(scene.self_contact)
-        write_unfinished(out, kept, {"options": options.record(), "capacity": capacity})
+        unfinished = Unfinished(options.record(), setting.actor, setting.settle, scene, kept)
+        write_tree(out / UNFINISHED, unfinished, content=_WORDS["content"])
         poses = first_poses(poses, count)
         scene = first_frames(scene, kept.num_frames)
     trajectory, scene = last_frames(kept, scene, count)
@@ -342,7 +334,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
             "fabric": list(worn_fabrics(options.fabric, stored)) or ["cotton"],
             "motion": motion,
             "motion_start_s": motion_start,
-            **scene_record(scene),
+            **describe_model(scene),
             "settle": setting.settle,
             "wind_m_s": options.wind,
             "gust": options.gust,
@@ -367,7 +359,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
         write_run(out, track, scene, (rig, poses, stored), report=report)
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
-            (out / NAME).unlink(missing_ok=True)
+            (out / UNFINISHED).unlink(missing_ok=True)
     return report
 
 

@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.gap import map_frames, trajectory_states
-from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
+from eslr_jax.evaluation.run import Run, run_trajectory
 from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.io.run import Run
 from eslr_jax.numerics import components, product, scatter_corners
 from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential
@@ -24,12 +23,7 @@ from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.terms.term import vertex_shares
-from eslr_jax.types import (
-    ClothState,
-    Garment,
-    Material,
-    Scene,
-)
+from eslr_jax.types import ClothState, Garment, Scene
 
 # Energy lost to air and damping belongs to a frame, not to a shape.
 _TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction", "repulsion")
@@ -67,15 +61,15 @@ def run_field(run: Run, name: str) -> Field:
         raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
     if name in _BODY_FIELDS and run.trajectory.body is None:
         raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
-    if name == "repulsion-energy" and not run.report.get("self_contact"):
+    if name == "repulsion-energy" and run.scene.self_contact is None:
         raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
         return _distances(run)
-    garment, material = run_garment(run)
+    garment = run.scene.garment
     if name == "stretch":
         values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    values = _problem_values(run, name, garment, material)
+    values = _problem_values(run, name)
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
     # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
     low, high = (
@@ -99,14 +93,11 @@ def _stretches(
     return jax.lax.map(frame, positions)
 
 
-def _problem_values(
-    run: Run, name: str, garment: Garment, material: Material
-) -> Float[np.ndarray, "frames vertices"]:
+def _problem_values(run: Run, name: str) -> Float[np.ndarray, "frames vertices"]:
     """Return a value [J] of the frames' minimisation problems; the first frame has none."""
-    scene = run_scene(run, garment, material, has_contact=name in _CONTACT_FIELDS)
-    trajectory = run_trajectory(run, scene)
-    states, _ = trajectory_states(trajectory, scene)
-    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, scene))
+    trajectory = run_trajectory(run)
+    states, _ = trajectory_states(trajectory, run.scene)
+    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
     return np.concatenate([np.zeros_like(values[:1]), values])
 
 

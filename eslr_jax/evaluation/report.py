@@ -91,6 +91,24 @@ def trajectory_report(
     }
 
 
+def describe_terms(scene: Scene) -> dict[str, str]:
+    """Return a few words on the terms that a scene models, by name."""
+    words: dict[str, str] = {}
+    for term in scene.terms:
+        words[term.name] = ", ".join(filter(None, (words.get(term.name), term.describe(scene.garment))))
+    return words
+
+
+def describe_model(scene: Scene) -> dict[str, Any]:
+    """Return what a scene models, in words for a report; a scene is read from its own file."""
+    return {
+        "modelled": describe_terms(scene),
+        "integrator": "euler" if scene.initial_state.past is None else "bdf2",
+        "substeps": scene.substeps,
+        "ground_m": None if scene.ground is None else float(scene.ground),
+    }
+
+
 def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
     """Return the largest of depths in a body [m], and the share that is inside; None without a body."""
     return {

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from eslr_jax.config import SimConfig
+from eslr_jax.evaluation.report import describe_terms
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.physics.preconditioner import solve_stiffness, stretched_stiffness
@@ -49,9 +50,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         poses: The motion it was made from.
         config: Says whether there is a network.
     """
-    modelled: dict[str, str] = {}
-    for term in scene.terms:
-        modelled[term.name] = ", ".join(filter(None, (modelled.get(term.name), term.describe(scene.garment))))
+    modelled = describe_terms(scene)
     left_out = {name: why for name, why in _UNLESS_NEEDED.items() if name not in modelled}
 
     def sort(name: str, is_modelled: bool, size: str, why: str) -> None:

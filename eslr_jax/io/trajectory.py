@@ -4,10 +4,7 @@ Layout, in SI units, Y up, float32: `format`, `metadata` (JSON text), `timestep`
 [frames, vertices, 3] and `faces` [faces, 3]. Optional parts, whole or absent:
 
 - `friction_loads` [frames, vertices], and `residuals` [frames];
-- `ground`, the height of a level ground;
-- the fabric: `material_density`, `material_lame_mu`, ..., each a scalar or one value per element;
-- the body: `body_positions` [frames, body_vertices, 3], `body_faces`, `body_rest_positions`, `contact_faces` and
-  `contact_boundary`;
+- the body: `body_positions` [frames, body_vertices, 3], `body_faces` and `body_rest_positions`;
 - the body's skin: `body_skin_weights`, `body_skin_indices`, `body_joint_transforms`, ...
 """
 
@@ -24,26 +21,15 @@ import numpy as np
 from eslr_jax.errors import AssetError
 from eslr_jax.io.animated import Skin
 from eslr_jax.io.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.types import Material, Plate, Threads
 
-FORMAT = "eslr-trajectory-2"
+FORMAT = "eslr-trajectory-3"
 _REQUIRED = ("format", "positions", "velocities", "faces", "timestep", "metadata")
 _BODY = {  # field of BodyTrack -> array
     "positions": "body_positions",
     "faces": "body_faces",
     "rest_positions": "body_rest_positions",
-    "contact_faces": "contact_faces",
-    "contact_boundary": "contact_boundary",
 }
 _SKIN = {field.name: f"body_{field.name}" for field in dataclasses.fields(Skin)}
-_PARTS: dict[str, Any] = {"plate": Plate, "threads": Threads}  # of a material, each whole or absent
-_MATERIAL = {
-    field.name: f"material_{field.name}" for field in dataclasses.fields(Material) if field.name not in _PARTS
-}
-_PART = {
-    part: {field.name: f"material_{part}_{field.name}" for field in dataclasses.fields(kind)}
-    for part, kind in _PARTS.items()
-}
 _LAYOUT = {
     "timestep": ("f", ""),
     "positions": ("f", "frames vertices 3"),
@@ -51,37 +37,26 @@ _LAYOUT = {
     "faces": ("iu", "faces 3", "vertices"),
     "friction_loads": ("f", "frames vertices"),
     "residuals": ("f", "frames"),
-    "ground": ("f", ""),
     "body_positions": ("f", "frames body_vertices 3"),
     "body_faces": ("iu", "body_faces 3", "body_vertices"),
     "body_rest_positions": ("f", "body_vertices 3"),
-    "contact_faces": ("iu", "contact_faces 3", "body_vertices"),
-    "contact_boundary": ("iu", "boundary_vertices", "body_vertices"),
     "body_joint_transforms": ("f", "frames joints 3 4"),
     "body_joint_rest_positions": ("f", "joints 3"),
     "body_parents": ("iu", "joints"),
     "body_joint_names": ("U", "joints"),
     "body_skin_weights": ("f", "body_vertices influences"),
     "body_skin_indices": ("iu", "body_vertices influences", "joints"),
-    "material_plate_hinges": ("iu", "faces 9"),
-    "material_plate_incidence": ("iu", "hinges 6"),
-    "material_plate_rows": ("f", "3 9 faces"),
-    "material_threads_warp": ("f", "faces 2"),
-    "material_threads_stiffness": ("f", "4 faces"),
-    "material_threads_limits": ("f", "2 faces"),
 }
 _REMEDY = "write it again"
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyTrack:
-    """A body in motion, and the part of it that cloth could reach."""
+    """A body in motion."""
 
     positions: np.ndarray  # [frames, body_vertices, 3] [m]
     faces: np.ndarray  # [body_faces, 3]
     rest_positions: np.ndarray  # [body_vertices, 3] [m]
-    contact_faces: np.ndarray  # [contact_faces, 3], the faces that were searched for contacts; may be empty
-    contact_boundary: np.ndarray  # [boundary_vertices], where they adjoin faces that were not searched
     skin: Skin | None = None  # the joints that moved it
 
 
@@ -96,8 +71,6 @@ class TrajectoryFile:
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # garment, motion, ...: values of JSON
     body: BodyTrack | None = None
     friction_loads: np.ndarray | None = None  # [frames, vertices], normal force that friction acts with [N]
-    material: Material | None = None  # NumPy leaves
-    ground: float | None = None  # height of a level ground [m]
     residuals: np.ndarray | None = None  # [frames], force norm over weight that each frame ended with
 
     @property
@@ -133,20 +106,10 @@ def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
     for name in ("friction_loads", "residuals"):
         if (values := getattr(trajectory, name)) is not None:
             arrays[name] = values
-    if trajectory.ground is not None:
-        arrays["ground"] = np.float64(trajectory.ground)
     body = trajectory.body
-    for part, names in (
-        (trajectory.material, _MATERIAL),
-        (body, _BODY),
-        (None if body is None else body.skin, _SKIN),
-    ):
+    for part, names in ((body, _BODY), (None if body is None else body.skin, _SKIN)):
         if part is not None:
             arrays |= {name: getattr(part, field) for field, name in names.items()}
-    for label, names in _PART.items():
-        part = getattr(trajectory.material, label, None)
-        values = {} if part is None else vars(part)
-        arrays |= {names[field]: value for field, value in values.items() if value is not None}
     result = {name: _stored(name, np.asarray(value)) for name, value in arrays.items()}
     _check(result, path)
     write_arrays(path, result)
@@ -179,7 +142,7 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         raise AssetError(f"trajectory {path} has damaged metadata ({error}); {_REMEDY}") from error
     if not isinstance(metadata, dict):
         raise AssetError(f"trajectory {path} has metadata that is no table; {_REMEDY}")
-    body = skin = material = None
+    body = skin = None
     if "body_skin_weights" in arrays:
         values: dict[str, Any] = {field: arrays[name] for field, name in _SKIN.items()}
         values["parents"] = tuple(int(parent) for parent in values["parents"])
@@ -187,12 +150,6 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         skin = Skin(**values)
     if "body_positions" in arrays:
         body = BodyTrack(**{field: arrays[name] for field, name in _BODY.items()}, skin=skin)
-    if "material_density" in arrays:
-        fabric: dict[str, Any] = {field: arrays[name] for field, name in _MATERIAL.items()}
-        for part, names in _PART.items():
-            found = {field: arrays[name] for field, name in names.items() if name in arrays}
-            fabric[part] = _PARTS[part](**found) if found else None
-        material = Material(**fabric)
     return TrajectoryFile(
         arrays["positions"],
         arrays["velocities"],
@@ -201,8 +158,6 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         metadata,
         body,
         arrays.get("friction_loads"),
-        material,
-        float(arrays["ground"]) if "ground" in arrays else None,
         arrays.get("residuals"),
     )
 
@@ -216,7 +171,7 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
         )
     if str(arrays["format"]) != FORMAT:
         raise AssetError(f"{path} has format {str(arrays['format'])[:40]!r}, not {FORMAT!r}; {_REMEDY}")
-    for names in (_BODY, _SKIN, _MATERIAL):
+    for names in (_BODY, _SKIN):
         lost = [name for name in names.values() if name not in arrays]
         if 0 < len(lost) < len(names):
             raise AssetError(f"trajectory {path} lacks {', '.join(lost)} beside the rest; {_REMEDY}")
@@ -228,7 +183,3 @@ def _check(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
             f"trajectory {path} has {len(arrays['positions'])} frames at a timestep of {arrays['timestep']} s; "
             "it needs one or more, and a positive timestep"
         )
-    for name in _MATERIAL.values():
-        array = arrays.get(name)
-        if array is not None and (array.dtype.kind != "f" or array.ndim > 1 or not (array > 0).all()):
-            raise AssetError(f"trajectory {path}: {name} must hold positive numbers; {_REMEDY}")

@@ -7,7 +7,7 @@ import importlib
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from eslr_jax.types import Scene
 
 _OWN = "eslr_jax."  # package whose types and functions a file may name
 _TREE = "tree"  # the archive's entry that holds the JSON
+Kind = TypeVar("Kind")
 
 
 def save_scene(path: str | Path, scene: Scene) -> None:
@@ -33,9 +34,7 @@ def save_scene(path: str | Path, scene: Scene) -> None:
         ConfigError: The scene holds a function that no file can name, such as a wind of one's own.
         AssetError: The file can't be written.
     """
-    arrays: dict[str, np.ndarray] = {}
-    tree = _describe(jax.device_get(scene), "scene", arrays)
-    write_arrays(path, {_TREE: np.array(json.dumps(tree)), **arrays})
+    write_tree(path, scene, content="scene")
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -46,21 +45,43 @@ def load_scene(path: str | Path) -> Scene:
     Raises:
         AssetError: The file is missing, damaged, or of another version, or a term's module is not imported.
     """
-    arrays = read_arrays(path, content="scene")
+    return read_tree(path, Scene, content="scene", remedy="write it again with save_scene")
+
+
+def write_tree(path: str | Path, value: Any, *, content: str) -> None:
+    """Write a scene, or a tuple with one; `content` is what messages call it. Raises as `save_scene` does."""
+    arrays: dict[str, np.ndarray] = {}
+    tree = _describe(value, content, arrays)
+    write_arrays(path, {_TREE: np.array(json.dumps(tree)), **arrays})
+
+
+def read_tree(path: str | Path, kind: type[Kind], *, content: str, remedy: str) -> Kind:
+    """Read what `write_tree` wrote, with NumPy arrays.
+
+    Args:
+        path: Path of the npz archive.
+        kind: Its type.
+        content: What messages call it.
+        remedy: What the user should do where the file holds nothing of this version.
+
+    Raises:
+        AssetError: As of `load_scene`.
+    """
+    arrays = read_arrays(path, content=content)
     try:
-        scene = _build(json.loads(str(arrays[_TREE])), arrays)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise AssetError(f"{path} holds no scene of this version; write it again with save_scene") from error
-    if not isinstance(scene, Scene):
-        raise AssetError(f"{path} holds no scene; give a file that save_scene wrote")
-    return scene
+        value = _build(json.loads(str(arrays[_TREE])), arrays)
+    except (KeyError, TypeError, ValueError, AttributeError, ImportError) as error:
+        raise AssetError(f"{path} holds no {content} of this version; {remedy}") from error
+    if not isinstance(value, kind):
+        raise AssetError(f"{path} holds no {content}; {remedy}")
+    return value
 
 
 def _describe(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
     """Return a part of a scene as values of JSON; its arrays go to `arrays`, by their place in the scene."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
         arrays[place] = np.asarray(value)
         return {"array": place}
     if isinstance(value, Partial):
@@ -75,10 +96,12 @@ def _describe(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     elif isinstance(value, tuple):
         parts = getattr(value, "_asdict", lambda: dict(enumerate(value)))()  # type: ignore[attr-defined]
+    elif isinstance(value, dict):
+        parts = value
     else:
         raise ConfigError(f"{place} is a {type(value).__name__}, which no file of a scene can hold")
     kind = type(value)
-    name = "tuple" if kind is tuple else f"{kind.__module__}:{kind.__qualname__}"
+    name = kind.__name__ if kind in (tuple, dict) else f"{kind.__module__}:{kind.__qualname__}"
     return {"type": name, "parts": {k: _describe(v, f"{place}.{k}", arrays) for k, v in parts.items()}}
 
 
@@ -91,6 +114,8 @@ def _build(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
     if "partial" in tree:
         return Partial(_find(tree["partial"]), *(_build(part, arrays) for part in tree["arguments"]))
     parts = {name: _build(part, arrays) for name, part in tree["parts"].items()}
+    if tree["type"] == "dict":
+        return parts
     return tuple(parts.values()) if tree["type"] == "tuple" else _find(tree["type"])(**parts)
 
 

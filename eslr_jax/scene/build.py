@@ -127,7 +127,7 @@ def worn_material(garment: Garment, material: Material | None) -> Material:
     return COTTON if garment.material is None else garment.material
 
 
-def slice_tracks(scene: Scene, frames: slice) -> Scene:
+def slice_tracks(scene: Scene, frames: slice | Int[Array, " frames"]) -> Scene:
     """Return a scene with some frames of what moves: body and pins; the number of frames is left as it is."""
     body, pins = scene.body, scene.pin_targets
     return scene.replace(

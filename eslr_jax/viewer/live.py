@@ -20,12 +20,13 @@ from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.body.motion import pose_body, there_and_back
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.errors import EslrError, Status
+from eslr_jax.evaluation.report import describe_model
+from eslr_jax.evaluation.run import ClothTrack, write_run
 from eslr_jax.extras import require
 from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.palette import byte_color
-from eslr_jax.io.run import ClothTrack, scene_record, write_run
-from eslr_jax.physics.materials import constants_for
+from eslr_jax.scene.build import slice_tracks
 from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
@@ -401,17 +402,25 @@ def _save(live: Live) -> None:
         ),
         residuals=np.stack([one.residual for one in recorded]),
     )
-    scene = cast.stage.scene.replace(material=fabric, constants=constants_for(fabric))
-    if not any(one.is_held for one in recorded):
-        scene = scene.replace(terms=scene.terms[:-1])  # without the hand
+    constant = changed(cast.stage, fabric, wind, no_hand()).constant
+    tracks = slice_tracks(cast.stage.scene, frames)
+    scene = constant.replace(
+        body=tracks.body,
+        pin_targets=tracks.pin_targets,
+        initial_state=recorded[0].state,
+        num_frames=len(frames),
+        terms=constant.terms[:-1],  # without the hand
+    )
+    is_held = any(one.is_held for one in recorded)
     report = {
         "garment": "+".join(cast.choice.garments),
         "motion": cast.choice.motion,
-        **scene_record(scene),
+        **describe_model(scene),
         "wind_m_s": wind,
     }
     try:
-        write_run(folder, track, scene, (cast.rig, poses, cast.stored), report=report)
+        # No scene has a hand that moves.
+        write_run(folder, track, None if is_held else scene, (cast.rig, poses, cast.stored), report=report)
     except EslrError as error:  # the cloth goes on
         for client in live.server.get_clients().values():
             client.add_notification("The recording was not written", str(error))

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from eslr_jax.body.clothing import Piece, body_pieces, garment_pieces
 from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.evaluation.fields import FIELDS, Field, run_field
+from eslr_jax.evaluation.run import Run
 from eslr_jax.extras import require
 from eslr_jax.io.palette import byte_color
-from eslr_jax.io.run import Run
 from eslr_jax.render import color_scale
 
 PLAIN = "fabric"  # colour by nothing

@@ -6,32 +6,36 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloth import make_limb
 from draped_ball import drifting_ball, square
-from example_runs import write_run
+from example_runs import write_run as write_run_by_hand
+from own_term import Push
 
 from eslr_jax.config import SimConfig
-from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.evaluation import fields
+from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.fields import energy_shares, gap_shares, run_field
 from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.evaluation.run_scene import run_garment, run_scene
+from eslr_jax.evaluation.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
+from eslr_jax.evaluation.score import score_trajectory
 from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.io.run import read_run, scene_record
+from eslr_jax.io.garment import GarmentFile
 from eslr_jax.physics.guess import pushed_out_guess
-from eslr_jax.physics.materials import constants_for
 from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.solve import Start, solve
+from eslr_jax.scene.archive import save_scene
 from eslr_jax.scene.build import initial_state
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.types import PhysicsConstants
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, body):
     folder = tmp_path_factory.mktemp("runs")
     return [
-        read_run(write_run(folder, body, name, scale)) for name, scale in (("loose", 1.0), ("tight", 1.2))
+        read_run(write_run_by_hand(folder, body, name, scale))
+        for name, scale in (("loose", 1.0), ("tight", 1.2))
     ]
 
 
@@ -98,15 +102,48 @@ def test_repulsion_counts_where_layers_meet():
     assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole > 0
 
 
-def test_a_run_keeps_the_constants_of_its_scene(runs):
-    run = dataclasses.replace(runs[0], report=runs[0].report | {"constants": {"gravity": 1.62}, "tips": True})
-    scene = run_scene(run, *run_garment(run))
-    assert scene.constants == constants_for(scene.material).replace(gravity=1.62)
-    assert scene.body.has_tips
-    assert scene_record(scene)["constants"]["gravity"] == 1.62
-    own = dataclasses.replace(run, report=run.report | {"terms": ["stretch", "hand"]})
-    with pytest.raises(ConfigError, match=r"energies of its own \(hand\)"):
-        run_scene(own, *run_garment(run))
+def test_a_run_with_an_energy_of_ones_own_is_scored_from_its_files(tmp_path, small_garment, small_poses):
+    """Its term is found where its module is imported."""
+    options = SceneOptions(terms=(Push(2.0),), integrator="bdf2")
+    scene = prepare_scene(
+        small_garment, small_poses, constants=PhysicsConstants(gravity=1.62), options=options
+    )
+    whole = rollout_scene(None, scene, SimConfig(iterations=60))
+    weights = np.ones((scene.garment.vertex_mask.size, 1))
+    stored = GarmentFile(
+        *map(np.asarray, (scene.garment.rest_positions, scene.garment.faces)),
+        weights,
+        np.zeros_like(weights, int),
+        np.asarray(scene.garment.is_pinned),
+    )
+    track = ClothTrack(whole.positions, whole.velocities, whole.friction_loads, whole.residuals)
+    write_run(tmp_path, track, scene, (make_limb(), small_poses, stored), report={})
+    run = read_run(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, run.scene, scene)
+    scores = [
+        score_trajectory(trajectory, each, poses=run_poses(run), every=1)
+        for trajectory, each in ((run_trajectory(run), run.scene), (whole, scene))
+    ]
+    assert scores[0]["terms"]["push"] == pytest.approx(scores[1]["terms"]["push"], rel=1e-4)
+    assert scores[0]["gap_median_j"] == pytest.approx(scores[1]["gap_median_j"], rel=1e-2, abs=1e-7)
+    assert scores[0]["gap_relative_max"] < 0.5
+
+
+@pytest.mark.parametrize("spoil", ["missing", "damaged", "another"])
+def test_a_run_without_its_scene_is_shown_and_not_scored(tmp_path, body, spoil):
+    folder = write_run_by_hand(tmp_path, body, "run")
+    if spoil == "missing":
+        (folder / "scene.npz").unlink()
+    elif spoil == "damaged":
+        (folder / "scene.npz").write_bytes(b"PK")
+    else:
+        scene = read_run(folder).scene
+        save_scene(folder / "scene.npz", first_frames(scene, 3))
+    run = read_run(folder)
+    assert run_field(run, "distance").values.shape == (6, len(run.garment.rest_positions))
+    with pytest.raises(AssetError, match=r"scene\.npz") as caught:
+        run_trajectory(run)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["friction-energy", "distance"])
@@ -117,24 +154,10 @@ def test_a_run_without_a_body_has_no_field_of_it(runs, name):
     assert "\n" not in str(caught.value)
 
 
-def test_fields_of_contact_are_of_scenes_with_contact(runs, monkeypatch):
-    seen = []
-
-    def run_scene(*words, has_contact):
-        seen.append(has_contact)
-        raise AssetError("seen")
-
-    monkeypatch.setattr(fields, "run_scene", run_scene)
-    run = dataclasses.replace(runs[0], report={"self_contact": "all"})
-    for name in ("repulsion-energy", "collision-energy", "gap", "bending-energy"):
-        with pytest.raises(AssetError, match="seen"):
-            run_field(run, name)
-    assert seen == [True, True, True, False]
-
-
-def test_a_run_without_self_contact_has_no_repulsion(runs):
+def test_a_run_without_self_contact_has_no_repulsion(tmp_path, body):
+    run = read_run(write_run_by_hand(tmp_path, body, "run", self_contact=False))
     with pytest.raises(AssetError, match="without self-contact"):
-        run_field(dataclasses.replace(runs[0], report={}), "repulsion-energy")
+        run_field(run, "repulsion-energy")
 
 
 def test_distance_grows_by_what_the_cloth_is_moved(runs):

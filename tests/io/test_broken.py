@@ -98,10 +98,10 @@ CHANGED = [
     ("fitted garment", {"face_parts": np.array([0, 1, 2])}, "names 2 of 0 parts"),
     ("fitted garment", {"metadata": np.array("{")}, "damaged metadata"),
     ("trajectory", {"positions": None}, "is no trajectory"),
-    ("trajectory", {"format": np.array("eslr-trajectory-1")}, "has format"),
+    ("trajectory", {"format": np.array("eslr-trajectory-2")}, "has format"),
     ("trajectory", {"velocities": np.zeros((3, 4, 3), np.float32)}, "velocities"),
     ("trajectory", {"body_rest_positions": None}, "lacks body_rest_positions"),
-    ("trajectory", {"contact_boundary": np.array([99])}, "contact_boundary names 99"),
+    ("trajectory", {"body_faces": np.array([[0, 1, 99]])}, "body_faces names 99"),
     ("trajectory", {"timestep": np.array(0.0)}, "timestep"),
     ("trajectory", {"metadata": np.array([object()], object)}, "can't be read as an npz archive"),
 ]

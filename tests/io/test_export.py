@@ -37,8 +37,6 @@ def run():
             positions=positions[:, ::-1] + np.float32(2),
             faces=VERTICES - 1 - np.asarray(SPHERE.faces),
             rest_positions=positions[0],
-            contact_faces=np.empty((0, 3), int),
-            contact_boundary=np.empty(0, int),
         ),
         timestep=float(np.float32(STEP)),
         metadata={"garment": "/home/me/My shirt.obj"},
@@ -247,8 +245,6 @@ def skinned(run, body):
         positions=np.asarray(poses.positions),
         faces=np.asarray(poses.faces),
         rest_positions=np.asarray(poses.rest_positions),
-        contact_faces=np.empty((0, 3), int),
-        contact_boundary=np.empty(0, int),
         skin=Skin(
             np.asarray(body.skin_weights), np.asarray(body.skin_indices), np.asarray(poses.joint_transforms),
             np.asarray(body.joint_rest_positions), body.parents, body.joint_names,

@@ -9,12 +9,10 @@ import pytest
 from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.run_scene import run_garment, run_scene, run_trajectory
+from eslr_jax.evaluation.run import ClothTrack, load_trajectory, read_run, run_trajectory, write_run
 from eslr_jax.io.animated import Skin
-from eslr_jax.io.run import ClothTrack, load_trajectory, read_run, write_run
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.types import Material, Plate, Threads
 
 RNG = np.random.default_rng(0)
 FRAMES = 3
@@ -28,8 +26,6 @@ BODY = BodyTrack(
     positions=floats(FRAMES, 4, 3),
     faces=np.array([[0, 1, 2], [0, 2, 3]]),
     rest_positions=floats(4, 3),
-    contact_faces=np.array([[0, 1, 2]]),
-    contact_boundary=np.array([0, 2]),
     skin=Skin(
         np.full((4, 2), np.float32(0.5)), np.tile([0, 1], (4, 1)), floats(FRAMES, 2, 3, 4), floats(2, 3),
         (-1, 0), ("hips", "spine"),
@@ -43,15 +39,6 @@ WHOLE = TrajectoryFile(
     metadata={"garment": "tshirt", "versions": {"jax": "0.10"}, "pins": [1, 2]},
     body=BODY,
     friction_loads=np.abs(floats(FRAMES, 5)),
-    material=Material(
-        np.abs(floats(5)),
-        np.float32(23600),
-        np.abs(floats(2)),
-        np.float32(1e-5),
-        np.float32(1e-3),
-        Plate(np.tile(np.int32(0), (2, 9)), np.tile(np.int32(18), (1, 6)), floats(3, 9, 2)),
-        Threads(floats(2, 2), np.abs(floats(4, 2))),
-    ),
 )
 
 
@@ -70,10 +57,9 @@ def assert_equal(found, expected):
     "trajectory",
     [
         WHOLE,
-        dataclasses.replace(WHOLE, body=None, friction_loads=None, material=None, metadata={}),
-        dataclasses.replace(WHOLE, body=dataclasses.replace(BODY, contact_faces=np.empty((0, 3), int))),
+        dataclasses.replace(WHOLE, body=None, friction_loads=None, metadata={}),
     ],
-    ids=["whole", "bare", "beyond reach"],
+    ids=["whole", "bare"],
 )
 def test_trajectory_round_trip_is_exact(tmp_path, trajectory):
     write_trajectory(tmp_path / "run.npz", trajectory)
@@ -109,7 +95,6 @@ def test_run_has_its_report_from_the_json_alone(tmp_path):
         ({"positions": np.zeros((0, 5, 3)), "velocities": np.zeros((0, 5, 3)), "body": None,
           "friction_loads": None}, "0 frames"),
         ({"body": dataclasses.replace(BODY, positions=np.zeros((2, 4, 3)))}, "body_positions"),
-        ({"material": WHOLE.material.replace(density=np.float32(-1))}, "material_density"),
         ({"timestep": np.nan}, "timestep"),
         ({"metadata": {"a": object()}}, "JSON"),
         ({"metadata": {"a": np.nan}}, "JSON"),
@@ -131,12 +116,12 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
     track = ClothTrack(moved, np.zeros_like(moved), np.zeros(moved.shape[:2]), residuals)
     write_run(tmp_path, track, scene, (rig, poses, garment), report={"total": 1.0})
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["animation.glb", "garment.npz", "report.json", "trajectory.npz"]
+    assert names == ["animation.glb", "garment.npz", "report.json", "scene.npz", "trajectory.npz"]
 
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("eslr_jax.io.run.export_trajectory", stop)
+    monkeypatch.setattr("eslr_jax.evaluation.run.export_trajectory", stop)
     with pytest.raises(KeyboardInterrupt):
         write_run(
             tmp_path,
@@ -149,5 +134,5 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
     kept = read_run(tmp_path)
     assert kept.report == {"total": 1.0}
     np.testing.assert_allclose(kept.trajectory.positions, moved, atol=1e-5)
-    again = run_trajectory(kept, run_scene(kept, *run_garment(kept)))
+    again = run_trajectory(kept)
     np.testing.assert_array_equal(again.residuals, residuals)

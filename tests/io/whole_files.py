@@ -184,7 +184,7 @@ ARRAYS = {
     ),
     "trajectory": (
         lambda: arrays_of(content(write_trajectory, TrajectoryFile(
-            GRID, GRID, GRID_FACES, 0.1, body=BodyTrack(GRID, GRID_FACES, GRID[0], GRID_FACES[:2], np.arange(3)),
+            GRID, GRID, GRID_FACES, 0.1, body=BodyTrack(GRID, GRID_FACES, GRID[0]),
             friction_loads=GRID[..., 0],
         ), suffix=".npz")),
         read_trajectory,

@@ -16,7 +16,7 @@ from eslr_jax.assets import load_motion
 from eslr_jax.body.rig import skeleton_motion
 from eslr_jax.config import TrainConfig
 from eslr_jax.evaluation.fields import run_field
-from eslr_jax.io.run import read_run
+from eslr_jax.evaluation.run import read_run
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
+from eslr_jax.cli.actor import Actor
+from eslr_jax.cli.simulate import Unfinished
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
 from eslr_jax.evaluation.gap import GapOptions, measure_gap
-from eslr_jax.io.unfinished import read_unfinished, write_unfinished
 from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.archive import read_tree, write_tree
 from eslr_jax.scene.build import initial_state
 from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
 from eslr_jax.simulation.program import _compile, find_program
@@ -124,17 +126,29 @@ def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhe
             np.testing.assert_array_equal(ours, theirs, err_msg=str(path))
 
 
+def kept(path, trajectory, scene):
+    """Write what was interrupted, and read it again."""
+    options = {"frames": 30, "garment": ("two", "sheets"), "wind": (0.0, 1.5, 0.0), "motion": None}
+    whole = Unfinished(
+        options, Actor(drifting_ball(2).surface, drifting_ball(2), "turn", 0.5), 5, scene, trajectory
+    )
+    write_tree(path / "unfinished.npz", whole, content="interrupted simulation")
+    again = read_tree(path / "unfinished.npz", Unfinished, content="interrupted simulation", remedy="")
+    assert jax.tree.structure(again) == jax.tree.structure(whole)
+    assert again.options == options
+    return again
+
+
 def test_an_unfinished_simulation_with_self_contact_is_read_as_it_was_written(tmp_path):
-    part = simulated("self-contact").trajectory
+    part, _, scene = simulated("self-contact")
     demand = np.asarray(part.pair_demand)
     assert demand.shape == (14,)
     assert demand[1:].min() > 0
-    options = {"frames": 30, "garment": "two sheets", "wind": [0.0, 1.5, 0.0]}
-    write_unfinished(tmp_path, part, options)
-    kept, read = read_unfinished(tmp_path)
-    assert read == options
+    again = kept(tmp_path, part, scene)
     for (path, ours), theirs in zip(
-        jax.tree_util.tree_leaves_with_path(kept), jax.tree.leaves(part), strict=True
+        jax.tree_util.tree_leaves_with_path((again.scene, again.done)),
+        jax.tree.leaves((scene, part)),
+        strict=True,
     ):
         assert ours.dtype == theirs.dtype, path
         np.testing.assert_array_equal(ours, theirs, err_msg=str(path))
@@ -154,9 +168,8 @@ def test_interrupted_at_any_of_ten_points_it_ends_bit_by_bit_as_the_whole(tmp_pa
             is_stopping=lambda done=done, point=point: len(done) == point,
         ).trajectory
         assert part.num_frames == 10 * point + 1
-        write_unfinished(tmp_path, part, {})
-        kept, _ = read_unfinished(tmp_path)
-        resumed = simulate(None, scene, config=SOLVER, done=kept).trajectory
+        again = kept(tmp_path, part, scene)
+        resumed = simulate(None, again.scene, config=SOLVER, done=again.done).trajectory
         jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 

@@ -1,26 +1,30 @@
-"""The folder that `eslr simulate` writes: trajectory, animation, garment and report."""
+"""The folder that `eslr simulate` writes: trajectory, scene, animation, garment and report."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import AssetError
+from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.io.animated import Skin
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir, move_files
 from eslr_jax.io.export import export_trajectory
 from eslr_jax.io.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.io.npz import read_arrays
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.types import Body, BodyMotion, Scene
+from eslr_jax.scene.archive import read_tree, save_scene
+from eslr_jax.types import Body, BodyMotion, Scene, Trajectory
 
+FILES = ("trajectory.npz", "scene.npz", "garment.npz", "report.json")
 _LABELS = ("garment", "motion", "motion_start_s")  # of the report, which the trajectory has as well
 
 
@@ -29,9 +33,31 @@ class Run:
     """One simulation on disk."""
 
     name: str
+    folder: Path
     trajectory: TrajectoryFile
-    garment: GarmentFile | None  # None without garment.npz: then frame 0 is the rest shape
-    report: dict[str, Any]  # of report.json; empty without it
+    garment: GarmentFile | None  # None without garment.npz
+    report: dict[str, Any]  # of report.json, for people; empty without it
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """What was simulated, over the frames of the trajectory; read when it is first asked for.
+
+        Raises:
+            AssetError: There is no `scene.npz`, it is damaged, or it is not the trajectory's; or it has a term
+                whose module is not imported.
+        """
+        file = self.folder / "scene.npz"
+        if not file.is_file():
+            raise AssetError(
+                f"{self.name} has no scene.npz, which tells what was simulated: another version wrote it, or a "
+                "hand held the cloth; simulate it again"
+            )
+        scene = read_tree(file, Scene, content="scene", remedy="simulate it again")
+        if (scene.num_frames, len(scene.garment.rest_positions)) != self.trajectory.positions.shape[:2]:
+            raise AssetError(
+                f"{file} is the scene of another trajectory than lies beside it; simulate it again"
+            )
+        return scene
 
 
 class ClothTrack(NamedTuple):
@@ -46,7 +72,7 @@ class ClothTrack(NamedTuple):
 def write_run(
     folder: Path,
     track: ClothTrack,
-    scene: Scene,
+    scene: Scene | None,
     actor: tuple[Body, BodyMotion, GarmentFile],
     *,
     report: dict[str, Any],
@@ -56,26 +82,26 @@ def write_run(
     Args:
         folder: It is made if it is not there.
         track: What was simulated.
-        scene: Of `prepare_scene`; its body's faces, its ground and its fabric are kept.
+        scene: What was simulated, over the same frames; None where no scene tells it, as where a hand pulled:
+            then nobody can score the run.
         actor: The body at rest, the body in motion over the same frames, and the garment's file.
         report: What `report.json` says; values of JSON.
 
     Raises:
         AssetError: A file can't be written.
+        ConfigError: The scene holds a function that no file can name; see `save_scene`.
     """
     rig, poses, stored = actor
     folder = ensure_output_dir(folder)
     file = TrajectoryFile(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
-        faces=np.asarray(scene.garment.faces),
+        faces=stored.faces,
         metadata={name: report[name] for name in _LABELS if name in report},
         timestep=float(poses.timestep),
-        body=_body_track(scene, rig, poses),
+        body=_body_track(rig, poses),
         friction_loads=np.asarray(track.friction_loads),
         residuals=None if track.residuals is None else np.asarray(track.residuals),
-        ground=None if scene.ground is None else float(scene.ground),
-        material=jax.tree.map(_stored_number, scene.material),
     )
     with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as name:
         new = Path(name)
@@ -84,38 +110,15 @@ def write_run(
         write_garment_npz(new / "garment.npz", stored)
         write_trajectory(new / "trajectory.npz", file)
         export_trajectory(file, new / "animation.glb", garment=stored)
+        if scene is not None:
+            save_scene(new / "scene.npz", scene)
+        else:  # of an earlier run
+            (folder / "scene.npz").unlink(missing_ok=True)
         move_files(new, folder)
 
 
-def scene_record(scene: Scene) -> dict[str, Any]:
-    """Return the part of a report that describes its scene, from which `evaluation.run_scene` rebuilds it."""
-    return {
-        "self_contact": scene.self_contact is not None and ("all" if scene.pieces is None else "pieces"),
-        "self_contact_pairs": None if scene.self_contact is None else scene.self_contact.pairs,
-        "integrator": "euler" if scene.initial_state.past is None else "bdf2",
-        "substeps": scene.substeps,
-        "skin_contacts": scene.body is not None and scene.body.has_skin,
-        "tips": scene.body is not None and scene.body.has_tips,
-        "constants": {name: float(value) for name, value in vars(scene.constants).items()},
-        "terms": [term.name for term in scene.terms],
-        "ground_m": None if scene.ground is None else float(scene.ground),
-    }
-
-
-def _stored_number(leaf: Any) -> np.ndarray:
-    """Return an array of indices as it is, and one of numbers in float32."""
-    array = np.asarray(leaf)
-    return array if array.dtype.kind in "iu" else array.astype(np.float32)
-
-
-def _body_track(scene: Scene, rig: Body, poses: BodyMotion) -> BodyTrack:
-    """Return a body in motion with its joints, and the faces that its scene searched."""
-    contact_faces, contact_boundary = np.empty((0, 3), np.int32), np.empty(0, np.int32)
-    if scene.body is not None:
-        surface = scene.body.surface
-        vertex_ids = np.asarray(surface.vertex_ids)
-        contact_faces = vertex_ids[np.asarray(surface.faces)]
-        contact_boundary = vertex_ids[np.asarray(surface.is_boundary)]
+def _body_track(rig: Body, poses: BodyMotion) -> BodyTrack:
+    """Return a body in motion with its joints."""
     skin = Skin(
         skin_weights=np.asarray(rig.skin_weights),
         skin_indices=np.asarray(rig.skin_indices),
@@ -124,14 +127,8 @@ def _body_track(scene: Scene, rig: Body, poses: BodyMotion) -> BodyTrack:
         parents=rig.parents,
         joint_names=rig.joint_names,
     )
-    return BodyTrack(
-        positions=np.asarray(poses.positions),
-        faces=np.asarray(poses.faces),
-        rest_positions=np.asarray(poses.rest_positions),
-        contact_faces=contact_faces,
-        contact_boundary=contact_boundary,
-        skin=skin,
-    )
+    positions, faces, rest = map(np.asarray, (poses.positions, poses.faces, poses.rest_positions))
+    return BodyTrack(positions, faces, rest, skin)
 
 
 def is_run(path: str | Path) -> bool:
@@ -145,10 +142,11 @@ def is_run(path: str | Path) -> bool:
 
 
 def load_trajectory(path: str | Path) -> TrajectoryFile:
-    """Load the trajectory of a run: garment and body in motion, and the fabric.
+    """Load the trajectory of a run: garment and body in motion.
 
     Args:
-        path: Folder that `eslr simulate` wrote, or its `trajectory.npz`. Its `garment.npz` is for `load_garment`.
+        path: Folder that `eslr simulate` wrote, or its `trajectory.npz`. The `garment.npz`
+            beside it is for `load_garment`, and `scene.npz` for `load_scene`.
 
     Returns:
         The trajectory, with NumPy arrays in metres and seconds; the floor of the bundled motions is at y = 0.
@@ -193,4 +191,30 @@ def read_run(path: str | Path) -> Run:
                 raise ValueError("no table")
         except (OSError, ValueError) as error:
             raise AssetError(f"{folder / 'report.json'} is damaged; simulate it again") from error
-    return Run(folder.resolve().name if path.is_dir() else path.stem, trajectory, garment, report)
+    return Run(folder.resolve().name if path.is_dir() else path.stem, folder, trajectory, garment, report)
+
+
+def run_trajectory(run: Run) -> Trajectory:
+    """Return the trajectory of a run as its scene's, without energies, which no file holds."""
+    track = run.trajectory
+    # Friction loads and residuals are None in somebody else's run.
+    own = foreign_trajectory(
+        track.positions, run.scene, velocities=track.velocities, friction_loads=track.friction_loads
+    )
+    return own if track.residuals is None else own.replace(residuals=jnp.asarray(track.residuals))
+
+
+def run_poses(run: Run) -> BodyMotion | None:
+    """Return the body of a run in motion, all faces obstacles; None where the file lacks it or its joints."""
+    track, body = run.trajectory.body, run.scene.body
+    if track is None or track.skin is None or body is None:
+        return None
+    return BodyMotion(
+        positions=jnp.asarray(track.positions),
+        joint_transforms=jnp.asarray(track.skin.joint_transforms),
+        faces=jnp.asarray(track.faces),
+        is_obstacle=jnp.ones(len(track.faces), bool),
+        timestep=run.scene.timestep,
+        rest_positions=jnp.asarray(track.rest_positions),
+        surface=body.surface,
+    )
