@@ -16,10 +16,11 @@ def write_run(folder, body, name, scale=1.0, **options):
     folder.mkdir()
     garment = load_garment_file("tank")
     poses = pose_body(body, still_motion(body, 6))
-    rest = garment.rest_positions + np.mean(poses.positions[0] - body.rest_positions, axis=0)
+    moved = np.asarray(poses.positions[0]) - np.asarray(body.rest_positions)
+    rest = garment.rest_positions + moved.mean(axis=0)
     shrunk = rest * [0.9, 1, 0.9]  # into the body
-    moved = [rest + np.array([0, 0.02, 0]), rest, shrunk, shrunk - np.array([0, 1e-3, 0])]
-    frames = np.stack([rest, rest * [1.1 * scale, 1, 1], *moved])
+    others = [rest + np.array([0, 0.02, 0]), rest, shrunk, shrunk - np.array([0, 1e-3, 0])]
+    frames = np.stack([rest, rest * [1.1 * scale, 1, 1], *others])
     track = BodyTrack(*map(np.array, (poses.positions, body.faces, body.rest_positions)))
     velocities = np.gradient(frames, 1 / 30, axis=0)
     write_trajectory(

@@ -114,7 +114,7 @@ class Options:
             raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
 
     def record(self) -> dict[str, Any]:
-        """Return the options as values of JSON."""
+        """Return the options as plain values, by name."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
         return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 

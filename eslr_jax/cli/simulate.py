@@ -90,7 +90,7 @@ class _Setting(NamedTuple):
 class Unfinished(NamedTuple):
     """A simulation that was interrupted: all that it needs to go on."""
 
-    options: dict[str, Any]  # values of JSON
+    options: Options  # with plain values
     actor: Actor  # over all frames
     settle: int
     scene: Scene  # over all frames, with the buffers that sufficed
@@ -133,16 +133,15 @@ def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
         AssetError: The folder holds no interrupted simulation.
         ConfigError: An option is given that is not the simulation's own.
     """
-    from eslr_jax.config import from_dict
     from eslr_jax.io.garment import read_garment_npz
     from eslr_jax.scene.archive import read_tree
 
     if not (given.out / UNFINISHED).is_file():
         raise AssetError(f"{given.out} holds no interrupted simulation; leave out --resume")
-    record, actor, settle, scene, done = read_tree(given.out / UNFINISHED, Unfinished, **_WORDS)
-    own = from_dict(Options, record)
+    own, actor, settle, scene, done = read_tree(given.out / UNFINISHED, Unfinished, **_WORDS)
+    asked = given.record()
     for field in dataclasses.fields(Options):
-        value, known = getattr(given, field.name), getattr(own, field.name)
+        value, known = asked[field.name], getattr(own, field.name)
         if value not in (field.default, known):
             raise ConfigError(
                 f"{given.out} was simulated with {field.name.replace('_', '-')} = {_typed(known)}, not "
@@ -318,7 +317,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
     if is_unfinished:
         if count < 2:
             raise KeyboardInterrupt
-        unfinished = Unfinished(options.record(), setting.actor, setting.settle, scene, kept)
+        unfinished = Unfinished(Options(**options.record()), setting.actor, setting.settle, scene, kept)
         write_tree(out / UNFINISHED, unfinished, content=_WORDS["content"])
         poses = first_poses(poses, count)
         scene = first_frames(scene, kept.num_frames)

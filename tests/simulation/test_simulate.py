@@ -11,6 +11,7 @@ import pytest
 from draped_ball import drifting_ball, square
 
 from eslr_jax.cli.actor import Actor
+from eslr_jax.cli.options import Options
 from eslr_jax.cli.simulate import Unfinished
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
@@ -128,7 +129,7 @@ def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhe
 
 def kept(path, trajectory, scene):
     """Write what was interrupted, and read it again."""
-    options = {"frames": 30, "garment": ("two", "sheets"), "wind": (0.0, 1.5, 0.0), "motion": None}
+    options = Options(frames=30, garment=("two", "sheets"), wind=(0.0, 1.5, 0.0))
     whole = Unfinished(
         options, Actor(drifting_ball(2).surface, drifting_ball(2), "turn", 0.5), 5, scene, trajectory
     )
