@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment_file, load_motion, prepare_stored
@@ -403,7 +404,7 @@ def _save(live: Live) -> None:
         residuals=np.stack([one.residual for one in recorded]),
     )
     constant = changed(cast.stage, fabric, wind, no_hand()).constant
-    tracks = slice_tracks(cast.stage.scene, frames)
+    tracks = slice_tracks(cast.stage.scene, jnp.asarray(frames))
     scene = constant.replace(
         body=tracks.body,
         pin_targets=tracks.pin_targets,
