@@ -15,8 +15,6 @@ _PUBLIC = {
     "SimConfig": "eslr_jax.config",
     "TrainConfig": "eslr_jax.config",
     "EslrError": "eslr_jax.errors",
-    "PhysicsConstants": "eslr_jax.types",
-    "SceneOptions": "eslr_jax.scene.plan",
     "Material": "eslr_jax.types",
     "Trajectory": "eslr_jax.types",
     "load_body": "eslr_jax.assets",
@@ -29,6 +27,7 @@ _PUBLIC = {
     "plan_scene": "eslr_jax.scene.plan",
     "prepare_scene": "eslr_jax.scene.plan",
     "rollout": "eslr_jax.simulation.rollout",
+    "scene_terms": "eslr_jax.terms",
     "score_trajectory": "eslr_jax.evaluation.score",
     "simulate": "eslr_jax.simulation.simulate",
     "step": "eslr_jax.simulation.rollout",
@@ -48,11 +47,12 @@ if TYPE_CHECKING:
     from eslr_jax.evaluation.score import score_trajectory
     from eslr_jax.geometry.prepare import prepare_garment
     from eslr_jax.scene.archive import load_scene, save_scene
-    from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
+    from eslr_jax.scene.plan import plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch
     from eslr_jax.simulation.rollout import rollout, step
     from eslr_jax.simulation.simulate import simulate
-    from eslr_jax.types import Material, PhysicsConstants, Trajectory
+    from eslr_jax.terms import scene_terms
+    from eslr_jax.types import Material, Trajectory
 
 
 def __getattr__(name: str) -> Any:

@@ -226,7 +226,7 @@ class TrainConfig:
     # With energy_set "hood": which of the three variants of HOOD's losses, see terms.hood. "metric" has the
     # constants of HOOD's tables.
     criterion: Criterion = "postcvpr"
-    self_contact: bool = False  # layers of cloth keep apart, as in SceneOptions
+    self_contact: bool = False  # layers of cloth keep apart
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate; "hood" also of the horizon
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine

@@ -16,23 +16,6 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.errors import ConfigError
-
-
-@struct.dataclass
-class PhysicsConstants:
-    """Constants of a scene; traced, so that a change does not compile anew."""
-
-    gravity: Float[Array, ""] | float = 9.81  # [m/s^2], along -y
-    collision_stiffness: Float[Array, ""] | float = 3.5e7
-    """[J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt."""
-    collision_thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD), see `problem.contact_thickness`
-    friction_coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
-    friction_speed: Float[Array, ""] | float = 9e-4
-    """[m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5."""
-    repulsion_stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], between layers of cloth; as for the body
-    repulsion_thickness: Float[Array, ""] | float = 3e-3  # [m] (ContourCraft)
-
 
 @struct.dataclass
 class CoarseEdges:
@@ -224,19 +207,6 @@ class SceneBody:
 
     surface: BodySurface
     positions: Float[Array, "frames surface_vertices 3"]  # [m], in the order of the surface
-    has_skin: bool = struct.field(pytree_node=False, default=False)  # its vertices keep off the cloth's faces
-    has_tips: bool = struct.field(pytree_node=False, default=False)  # it has tips finer than the cloth's mesh
-
-
-@dataclasses.dataclass(frozen=True)
-class PairCapacity:
-    """Size of the buffer of self-contact; static, so a change compiles anew."""
-
-    pairs: int  # rows for pairs of a vertex and a face, one or more
-
-    def __post_init__(self) -> None:
-        if self.pairs < 1:
-            raise ConfigError(f"a buffer for {self.pairs} pairs: give one row or more")
 
 
 @struct.dataclass
@@ -245,21 +215,24 @@ class Scene:
 
     garment: Garment
     material: Material
-    constants: PhysicsConstants
+    # `terms.term.Term`s, whose sum each frame minimises: what is modelled, see `scene.build.scene_terms`.
+    terms: tuple[Any, ...]
     timestep: Float[Array, ""]  # [s]
     initial_state: ClothState
     body: SceneBody | None
     pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
-    terms: tuple[
-        Any, ...
-    ]  # `terms.term.Term`s, whose sum each frame minimises, see `scene.build.scene_terms`
     num_frames: int = struct.field(pytree_node=False)
-    self_contact: PairCapacity | None = struct.field(pytree_node=False, default=None)
-    pieces: Int[Array, " vertices"] | None = (
-        None  # self-contact between different pieces only; None: all cloth
-    )
-    ground: Float[Array, ""] | None = None  # height of a level ground [m]
     substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated
+
+    def term(self, kind: type) -> Any:
+        """Return the first term of a type; None without one."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
+
+    def with_term(self, changed: Any) -> Scene:
+        """Return the scene with a term in the place of the first one of its type."""
+        kinds = [type(term) for term in self.terms]
+        place = kinds.index(type(changed))
+        return self.replace(terms=(*self.terms[:place], changed, *self.terms[place + 1 :]))
 
 
 @struct.dataclass
@@ -277,7 +250,8 @@ class Trajectory:
     iterations: Int[Array, " frames"]  # of the solver; with substeps, the most that one of them took
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # row of the first frame with a status; -1 while status is OK
-    pair_demand: Int[Array, " frames"] | None = None  # of `PairCapacity.pairs`; None without self-contact
+    # Rows that frames asked the terms' buffers for, by their names.
+    demands: dict[str, Int[Array, " frames"]] = struct.field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -290,7 +264,8 @@ class Trajectory:
         Their axes are frames, vertices and xyz, as many as an array has. What was not modelled is left out.
         """
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        values |= {f"{name}_energy": track for name, track in values.pop("energies").items()}
+        for kind, tracks in (("energy", values.pop("energies")), ("demand", values.pop("demands"))):
+            values |= {f"{name}_{kind}": track for name, track in tracks.items()}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 

@@ -20,8 +20,9 @@ from eslr_jax.config import SimConfig
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.physics.materials import fabric_material
 from eslr_jax.render import render_frames, side_by_side
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.simulate import simulate
+from eslr_jax.terms import Collision, scene_terms
 
 CLIP = "cmu_069_23"
 # Garment, fabric, and colour in sRGB.
@@ -45,9 +46,9 @@ def main() -> None:
     moving, strips = with_settling(poses, SETTLE_FRAMES, body), []
     look = {"rest_positions": np.asarray(poses.rest_positions), "rig": body, "camera": _CAMERA, "size": _SIZE}
     for name, fabric, color in worn:
-        options = SceneOptions(has_skin=True, integrator="bdf2")
+        options = {"terms": scene_terms(Collision(has_skin=True)), "integrator": "bdf2"}
         scene = prepare_scene(
-            load_garment(name, vertices=vertices), moving, material=fabric_material(fabric), options=options
+            load_garment(name, vertices=vertices), moving, material=fabric_material(fabric), **options
         )
         trajectory = simulate(None, scene, config=_CONFIG).trajectory
         print(f"{name}: {float(np.mean(trajectory.iterations[1:])):.0f} iterations a frame", flush=True)

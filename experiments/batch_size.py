@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from harness import keep, kept, machine, parser
 
-from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body
 from eslr_jax.assets import split_clips
 from eslr_jax.assets.garments import Resolution
 from eslr_jax.evaluation.scene_parts import time_in_turns
@@ -23,6 +23,7 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
 from eslr_jax.simulation.budget import device_name
+from eslr_jax.terms import Repulsion, scene_terms
 
 CONFIG = SimConfig(iterations=20)
 
@@ -33,7 +34,7 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
     poses = [pose_body(body, load_motion(clip), num_frames=frames + 1) for clip in clips]
     garments = [load_garment("tshirt", vertices=vertices)] * len(clips)
     scenes = stack_scenes(
-        prepare_scenes(garments, poses, [COTTON] * len(clips), options=SceneOptions(self_contact=False))
+        prepare_scenes(garments, poses, [COTTON] * len(clips), terms=scene_terms(without=(Repulsion,)))
     )
     calls = {}
     for batch in batches:

@@ -34,6 +34,7 @@ from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.io.animated import AnimatedMesh
 from eslr_jax.io.point_cache import write_pc2
+from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
@@ -63,7 +64,8 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
     Raises:
         EslrError: The scene can't be carried over, or Blender failed; the message holds the last line it wrote.
     """
-    constants, cloth = scene.constants, prepare_cloth(scene.garment, scene.material)
+    cloth = prepare_cloth(scene.garment, scene.material)
+    body, friction = scene.term(Collision) or Collision(), scene.term(Friction) or Friction()
     first, rows = scene.initial_state, cloth.vertices
     start = np.asarray(first.position, np.float32)[rows]
     edges, _ = springs(cloth)
@@ -75,19 +77,20 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
     if scene.body is None and np.asarray(first.velocity)[rows].any():
         raise EslrError("Blender starts cloth without velocity")
     stretch = strip_stiffness(cloth.shear, cloth.area_stiffness)
-    distance = float(contact_thickness(scene.garment, constants.collision_thickness))
+    distance = float(contact_thickness(scene.garment, body.thickness))
     arrays = {
         "start": start, "faces": cloth.faces, "is_pinned": cloth.is_pinned, "frames": scene.num_frames,
         "quality": effort[0], "collision_quality": effort[1],
-        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME, "gravity": float(constants.gravity),
+        "time_scale": float(scene.timestep) / SECONDS_PER_FRAME,
+        "gravity": float(scene.term(Gravity).acceleration),
         "mass": cloth.masses[cloth.masses > 0].mean(),
         "tension": 3**0.5 / 2 * stretch.mean() * lengths.mean() / 1e3,
         "bending": 0.03 * (cloth.bending / cloth.hinge_areas).mean(),
         "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE), "body_distance": _BODY_DISTANCE,
-        "friction": 100.0 * float(constants.friction_coefficient),
+        "friction": 100.0 * float(friction.coefficient),
     }  # fmt: skip
-    if scene.self_contact is not None:
-        arrays["layer_distance"] = float(contact_thickness(scene.garment, constants.repulsion_thickness))
+    if (layers := scene.term(Repulsion)) is not None:
+        arrays["layer_distance"] = float(contact_thickness(scene.garment, layers.thickness))
     if cloth.is_pinned.any():
         below = np.repeat(start[None], scene.num_frames, axis=0)
         below[:, cloth.is_pinned] = np.asarray(scene.pin_targets)[:, rows[cloth.is_pinned]]

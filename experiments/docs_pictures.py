@@ -24,8 +24,9 @@ from known_answers.drape import hang
 from other_bodies import child
 from PIL import Image
 
-from eslr_jax import SceneOptions, SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.assets import load_garment_file, prepare_stored
+from eslr_jax.body.lbs import skin_garment
 from eslr_jax.body.rig import make_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.evaluation.fields import Field, run_field
@@ -43,10 +44,9 @@ from eslr_jax.io.obj import obj_text
 from eslr_jax.io.palette import outfit_colors
 from eslr_jax.physics.materials import WOVEN, fabric_names
 from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
-from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.simulate import last_frames
+from eslr_jax.terms import Collision, Repulsion, Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Term
 
 COPIED = {
     "speed": RESULTS / "speed_vs_error.png",
@@ -105,16 +105,18 @@ def shoot(
     *,
     fabric: tuple[str, ...] = (),
     vertices: Literal["1k", "4k", "10k"] = "1k",
-    **options: Any,
+    others: tuple[Term, ...] = (),
 ) -> Shot:
     """Put garments on and simulate them on a walk, as `eslr simulate` does."""
     body = load_body()
     poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
     stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
     cloth = prepare_stored(stored, name="+".join(garments))
-    modelled = SceneOptions(has_skin=True, has_folds=True, integrator="bdf2", **options)
+    terms = scene_terms(Collision(has_skin=True), Repulsion(where="folds"), *others)
     moving = with_settling(poses, SETTLE_FRAMES, body)
-    scene = prepare_scene(cloth, moving, material=garment_material(fabric, cloth, stored), options=modelled)
+    scene = prepare_scene(
+        cloth, moving, material=garment_material(fabric, cloth, stored), terms=terms, integrator="bdf2"
+    )
     run = simulate(None, scene, config=_CONFIG)
     trajectory, scene = last_frames(run.trajectory, run.scene, frames)
     return Shot(stored, body, poses, scene, trajectory)
@@ -202,8 +204,8 @@ def fabrics(frames: int) -> np.ndarray:
 
 def extend(frames: int) -> np.ndarray:
     """A T-shirt without and with the guide's own energy."""
-    blown = shoot(("tshirt",), frames, terms=(Push(_WIND),))
-    still = shoot(("tshirt",), frames, terms=(Push(0.0),))
+    blown = shoot(("tshirt",), frames, others=(Push(_WIND),))
+    still = shoot(("tshirt",), frames, others=(Push(0.0),))
     pictures = [figures(shot, [frames - 1], camera=0.0)[0] for shot in (still, blown)]
     return side_by_side(pictures, ("0 N/m2", f"{_WIND:g} N/m2"))
 

@@ -30,14 +30,18 @@ from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.preconditioner import stretched_stiffness
 from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import Repulsion, scene_terms
 from eslr_jax.types import Scene
 
 SIZES = ("1k", "4k", "10k", "50k", "200k")
-CASES = {"without self-contact": False, "with self-contact": True}
+CASES = {
+    "without self-contact": scene_terms(without=(Repulsion,)),
+    "with self-contact": scene_terms(Repulsion(where="all")),
+}
 RATIO = "whole frame with self-contact / without"
 CLIP = "cmu_016_32"
 FRAMES = 12  # simulated before the one that is timed
@@ -79,8 +83,8 @@ def frame_parts(scene: Scene, iterations: int) -> dict[str, tuple]:
         "many": (minimise, (problem, start, MANY)),
         f"whole frame, {ITERATIONS} iterations": (whole, (scene, state, step)),
     }
-    if scene.self_contact is not None:
-        search = jax.jit(partial(find_self_contacts, capacity=scene.self_contact))
+    if (layers := scene.term(Repulsion)) is not None:
+        search = jax.jit(partial(find_self_contacts, capacity=layers.num_rows))
         parts["self search"] = (search, (state.position, problem.inertial_guess, scene.garment))
     return parts
 
@@ -89,10 +93,7 @@ def measure(size: str, turns: int, frames: int, cases: Sequence[str]) -> dict[st
     """Return the milliseconds of every part by case, after some frames, and their ratios to an iteration."""
     poses = pose_body(load_body(), load_motion(CLIP), num_frames=frames + 1)
     garment = load_garment("tshirt", vertices=size)
-    calls = {
-        case: frame_parts(prepare_scene(garment, poses, options=SceneOptions(self_contact=CASES[case])), MANY)
-        for case in cases
-    }
+    calls = {case: frame_parts(prepare_scene(garment, poses, terms=CASES[case]), MANY) for case in cases}
     timed = time_in_turns(
         {(case, part): call for case, parts in calls.items() for part, call in parts.items()}, turns
     )

@@ -37,6 +37,7 @@ from jaxtyping import Float, Int
 from eslr_jax.errors import EslrError
 from eslr_jax.evaluation.foreign import foreign_trajectory
 from eslr_jax.extras import require
+from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
 from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
@@ -165,8 +166,8 @@ def contact_stiffness(scene: Scene) -> float:
     3 k a r^2 / r, with the mean vertex area a and the distance r.
     """
     areas = np.asarray(scene.garment.vertex_areas)
-    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
-    return 3.0 * float(scene.constants.collision_stiffness) * float(areas[areas > 0].mean()) * radius
+    radius = float(contact_thickness(scene.garment, scene.term(Collision).thickness))
+    return 3.0 * float(scene.term(Collision).stiffness) * float(areas[areas > 0].mean()) * radius
 
 
 def require_newton() -> ModuleType:
@@ -190,7 +191,7 @@ class NewtonCloth:
         newton = require_newton()
         self._warp = require("warp", extra="peers", purpose="the comparison with other simulators")
         self._warp.config.log_level = self._warp.LOG_WARNING  # it would report every kernel it loads
-        constants = scene.constants
+        friction = scene.term(Friction) or Friction()
         self._cloth = cloth = prepare_cloth(scene.garment, scene.material)
         self._timestep = float(scene.timestep)
         self.substeps = setting.substeps or stable_substeps(cloth, self._timestep)
@@ -200,10 +201,10 @@ class NewtonCloth:
         with contextlib.redirect_stdout(io.StringIO()):  # Style3D reports its own times
             builder = _build(newton, scene, setting.solver, cloth)
             self._model = model = builder.finalize()
-            model.set_gravity((0.0, -float(constants.gravity), 0.0))
+            model.set_gravity((0.0, -float(scene.term(Gravity).acceleration), 0.0))
             model.soft_contact_ke = contact_stiffness(scene)
             model.soft_contact_kd = 0.0
-            model.soft_contact_mu = float(constants.friction_coefficient)
+            model.soft_contact_mu = float(friction.coefficient)
             model.particle_grid, model.particle_max_radius = None, 0.0  # XPBD would keep all vertices apart
             self._solver = _make_solver(newton, model, setting, scene)
         self._body = None
@@ -265,7 +266,7 @@ class NewtonCloth:
 def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     """Return a model builder that holds cloth at rest and the body in its first frame."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
-    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
+    radius = float(contact_thickness(scene.garment, scene.term(Collision).thickness))
     count = len(cloth.rest)
     flags = np.where(cloth.masses > 0, int(newton.ParticleFlags.ACTIVE), 0).tolist()
     builder.add_particles(
@@ -300,7 +301,7 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
     if solver == "vbd":
         builder.color(include_bending=True)
     if scene.body is not None:
-        friction = float(scene.constants.friction_coefficient)
+        friction = float(scene.term(Friction).coefficient)
         config = newton.ModelBuilder.ShapeConfig(
             density=0.0, ke=contact_stiffness(scene), kd=0.0, mu=friction
         )
@@ -312,12 +313,12 @@ def _build(newton: ModuleType, scene: Scene, solver: str, cloth: Cloth) -> Any:
 
 def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene) -> Any:
     """Return the solver; layers of cloth pass through each other where the scene does not model them."""
-    solvers, constants, iterations = newton.solvers, scene.constants, setting.iterations
-    friction_speed = float(constants.friction_speed)
+    solvers, iterations = newton.solvers, setting.iterations
+    friction_speed = float((scene.term(Friction) or Friction()).speed)
     if setting.solver == "vbd":
         layers = {}
-        if scene.self_contact is not None:
-            distance = float(contact_thickness(scene.garment, constants.repulsion_thickness))
+        if (kept := scene.term(Repulsion)) is not None:
+            distance = float(contact_thickness(scene.garment, kept.thickness))
             layers = {
                 "particle_enable_self_contact": True,
                 "particle_self_contact_margin": distance,
@@ -327,7 +328,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
     if setting.solver == "xpbd":
         return solvers.SolverXPBD(model, iterations=iterations)
     solver = solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=iterations))
-    if scene.self_contact is None:
+    if scene.term(Repulsion) is None:
         solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
     solver.collision.friction_epsilon = friction_speed
     return solver

@@ -32,8 +32,9 @@ from eslr_jax.geometry.padding import choose_bucket, common_bucket
 from eslr_jax.geometry.prepare import pad_alike
 from eslr_jax.io.skeleton import RiggedMesh, Skeleton
 from eslr_jax.render import render_frame, side_by_side, write_png
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.simulate import last_frames, simulate
+from eslr_jax.terms import Collision, Ground, scene_terms
 from eslr_jax.types import Body
 
 _SMPL = {
@@ -277,7 +278,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     took = (time.perf_counter() - began) / len(own)
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
     surface = obstacle_surface(body)  # bodies of one topology then share a program
-    options = SceneOptions(has_skin=True, integrator="bdf2", ground="off")
+    options = {"terms": scene_terms(Collision(has_skin=True), without=(Ground,)), "integrator": "bdf2"}
     still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames))
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
     for name, cloth in zip(garments, cloths, strict=True):
@@ -285,7 +286,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
         runs = [
             simulate(
                 None,
-                prepare_scene(cloth, poses, options=options, surface=surface),
+                prepare_scene(cloth, poses, **options, surface=surface),
                 config=CONFIG,
                 raises=False,
             )

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from harness import keep, machine, parser
 
-from eslr_jax import SceneOptions, SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
+from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.assets import load_garment_file, prepare_stored
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.fit.outfit import combine_garments
 from eslr_jax.geometry.topology import is_on_boundary
 from eslr_jax.io.garment import GarmentFile
+from eslr_jax.terms import Collision, scene_terms
 
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
 CLIP = "cmu_016_32"  # of the test split
@@ -52,8 +53,8 @@ def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1)
     outfit = combine_garments([load(name) for name in names], names)
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(CLIP), num_frames=frames), SETTLE_FRAMES, body)
-    options = SceneOptions(has_skin=True, integrator="bdf2", substeps=substeps)
-    run = simulate(None, prepare_scene(prepare_stored(outfit), poses, options=options), config=CONFIG)
+    options = {"terms": scene_terms(Collision(has_skin=True)), "integrator": "bdf2", "substeps": substeps}
+    run = simulate(None, prepare_scene(prepare_stored(outfit), poses, **options), config=CONFIG)
     garment = np.repeat([0, 1], list(outfit.metadata["outfit"].values()))[outfit.faces[:, 0]]
     positions = np.asarray(run.trajectory.positions)[SETTLE_FRAMES:][::EVERY]
     counts = [

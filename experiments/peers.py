@@ -44,6 +44,7 @@ from eslr_jax.simulation.budget import device_name
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.rollout import rollout_scene, step_frame
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import Collision
 from eslr_jax.types import ClothState, Scene
 
 CLIP = "cmu_016_32"  # of the test split
@@ -173,7 +174,7 @@ def measure_scene(
     """Return a row of plain values per method and effort: ours, with skin contacts, Newton's, Blender's."""
     methods = [our_method(scene, *effort) for effort in efforts]
     if scene.body is not None:
-        covered = scene.replace(body=scene.body.replace(has_skin=True))
+        covered = scene.with_term(scene.term(Collision).replace(has_skin=True))
         methods += [our_method(covered, *effort, "ours, skin covered") for effort in covering]
     methods += newton_methods(scene, settings)
     truth = rollout_scene(None, scene, SimConfig(iterations=500))

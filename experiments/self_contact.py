@@ -22,8 +22,9 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.referee import judge
-from eslr_jax.scene.plan import SceneOptions, prepare_scene, shared_surface
+from eslr_jax.scene.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import simulate
+from eslr_jax.terms import Collision, Repulsion, scene_terms
 from eslr_jax.types import Scene
 
 FRAMES = 61  # two seconds
@@ -39,9 +40,10 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
     surface = shared_surface([cloth], poses)  # all clips then share a program
     kinds = [(True, False, 0), *((True, True, number) for number in range(starts)), (False, False, 0)]
     for is_put_on, has_layers, number in kinds:
-        options = SceneOptions(self_contact=has_layers, has_skin=True, integrator="bdf2")
+        layers = {} if has_layers else {"without": (Repulsion,)}
+        terms = scene_terms(Collision(has_skin=True), Repulsion(where="all"), **layers)
         moving = with_settling(poses, SETTLE_FRAMES, body if is_put_on else None)
-        scene = moved(prepare_scene(cloth, moving, surface=surface, options=options), number)
+        scene = moved(prepare_scene(cloth, moving, surface=surface, terms=terms, integrator="bdf2"), number)
         run = simulate(None, scene, config=CONFIG)
         positions = np.asarray(run.trajectory.positions)
         start, *counts = (
@@ -57,8 +59,9 @@ def measure(garment: str, clip: str, vertices: str, frames: int, starts: int) ->
             "iterations": float(np.mean(trajectory.iterations)),
             "frame_ms": run.timing.frame_ms,
         }  # fmt: skip
-        if trajectory.pair_demand is not None:
-            row |= {"pairs_found": int(np.max(trajectory.pair_demand)), "rows": run.scene.self_contact.pairs}
+        if trajectory.demands:
+            found = int(np.max(trajectory.demands["repulsion"]))
+            row |= {"pairs_found": found, "rows": run.scene.term(Repulsion).num_rows}
         yield row
 
 

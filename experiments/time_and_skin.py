@@ -24,7 +24,7 @@ import numpy as np
 from harness import parser, put
 from scipy.spatial import cKDTree
 
-from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body, simulate
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, simulate
 from eslr_jax.assets import load_splits
 from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.cli.console import use_compile_cache
@@ -35,6 +35,7 @@ from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import Integrator, start_integrator
 from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.terms import Collision, Repulsion, scene_terms
 from eslr_jax.types import Scene
 
 PARTS = ("skin", "time")
@@ -57,8 +58,8 @@ def make_scenes(garments: list[Any], motions: list[Any]) -> list[Scene]:
     """Return every garment on every motion: scenes of one shape, which share a program, garment by garment."""
     count = len(motions)
     cloths = [garment for garment in garments for _ in range(count)]
-    options = SceneOptions(has_skin=True, has_folds=True)
-    return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths), options=options)
+    options = {"terms": scene_terms(Collision(has_skin=True), Repulsion(where="folds"))}
+    return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths), **options)
 
 
 def begun(scene: Scene, integrator: Integrator) -> Scene:

@@ -52,9 +52,10 @@ def small_config():
 @pytest.fixture(scope="session")
 def small_scene(small_garment, small_poses):
     """The sleeve on the limb."""
-    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+    from eslr_jax.scene.plan import prepare_scene
+    from eslr_jax.terms import Ground, scene_terms
 
-    return prepare_scene(small_garment, small_poses, options=SceneOptions(ground="off"))
+    return prepare_scene(small_garment, small_poses, terms=scene_terms(without=(Ground,)))
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,10 @@ from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.io.garment import write_garment_npz
 from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
 from eslr_jax.scene.archive import save_scene
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.terms import Repulsion, scene_terms
+
+LAYERED = scene_terms(Repulsion(where="all"))
 
 
 def write_run(folder, body, name, scale=1.0, **options):
@@ -27,8 +30,7 @@ def write_run(folder, body, name, scale=1.0, **options):
         folder / "trajectory.npz",
         TrajectoryFile(frames, velocities, garment.faces, timestep=1 / 30, body=track),
     )
-    options = SceneOptions(**{"self_contact": True} | options)
-    scene = prepare_scene(prepare_stored(garment), poses, options=options)
+    scene = prepare_scene(prepare_stored(garment), poses, **{"terms": LAYERED} | options)
     start = dict(zip(("position", "velocity"), np.float32([frames[0], velocities[0]]), strict=True))
     save_scene(folder / "scene.npz", scene.replace(initial_state=scene.initial_state.replace(**start)))
     (folder / "report.json").write_text("{}")

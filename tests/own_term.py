@@ -2,7 +2,7 @@
 
 from flax import struct
 
-from eslr_jax.terms.term import Term
+from eslr_jax.terms import Term
 
 
 @struct.dataclass

@@ -10,9 +10,9 @@ from formats import write_smpl, write_walker
 from other_bodies import smpl_female
 
 from eslr_jax import load_garment, load_motion, pose_body
+from eslr_jax.body.lbs import skin_garment
 from eslr_jax.io.obj import obj_text
 from eslr_jax.io.trajectory import read_trajectory
-from eslr_jax.scene.build import skin_garment
 
 
 def eslr(*arguments):

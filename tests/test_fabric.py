@@ -15,7 +15,8 @@ from eslr_jax.fabric import beyond_training, garment_material, parse_fabric
 from eslr_jax.numerics import gather_corners
 from eslr_jax.physics.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
 from eslr_jax.physics.validate import validate_material
-from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes
+from eslr_jax.scene.plan import prepare_scene, prepare_scenes
+from eslr_jax.terms import CLOTH
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains
 
@@ -59,19 +60,19 @@ def test_a_scene_has_the_fabrics_of_the_garments_file(two_fabrics, body):
     stored, plain = two_fabrics
     texts = ["silk", "left:denim"]
     garment = prepare_stored(dataclasses.replace(stored, metadata={"fabrics": texts}))
-    poses, options = pose_body(body, still_motion(body, 2)), SceneOptions(has_body=False)
-    scene = prepare_scene(garment, poses, options=options)
+    poses, options = pose_body(body, still_motion(body, 2)), {"terms": CLOTH}
+    scene = prepare_scene(garment, poses, **options)
     jax.tree.map(np.testing.assert_array_equal, scene.material, garment_material(texts, plain, stored))
     assert scene.garment.material is None  # gradients with respect to a fabric have one place
-    given = prepare_scene(garment, poses, material=COTTON, options=options)
+    given = prepare_scene(garment, poses, material=COTTON, **options)
     assert given.material.density == COTTON.density
-    assert prepare_scene(plain, poses, options=options).material.density == COTTON.density
+    assert prepare_scene(plain, poses, **options).material.density == COTTON.density
     whole = prepare_stored(dataclasses.replace(stored, metadata={"fabrics": ["denim"]}))
-    scenes = prepare_scenes([whole, plain], [poses] * 2, [None, None], options=options)
+    scenes = prepare_scenes([whole, plain], [poses] * 2, [None, None], **options)
     assert [one.material.density for one in scenes] == [fabric_material("denim").density, COTTON.density]
     assert jax.tree.structure(scenes[0]) == jax.tree.structure(scenes[1])
     with pytest.raises(ConfigError, match="one isotropic fabric for each garment"):
-        prepare_scenes([garment], [poses], [None], options=options)
+        prepare_scenes([garment], [poses], [None], **options)
 
 
 def test_fabric_per_part(two_fabrics):

@@ -14,13 +14,15 @@ from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.evaluation.gap import trajectory_states
 from eslr_jax.geometry.closest import closest_points
-from eslr_jax.physics.materials import COTTON, constants_for, fabric_material
+from eslr_jax.physics.materials import COTTON, fabric_material
 from eslr_jax.physics.potential import evaluate
-from eslr_jax.scene.build import build_scene, safe_plan
-from eslr_jax.scene.plan import SceneOptions, first_frames, plan_scene, prepare_scene, prepare_scenes
+from eslr_jax.scene.build import build_scene
+from eslr_jax.scene.plan import first_frames, prepare_scene, prepare_scenes
 from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import PhysicsConstants
+from eslr_jax.terms import CLOTH, Collision, Repulsion, scene_terms
+from eslr_jax.terms.stretch import contact_excess
+from eslr_jax.terms.worn import REACH
 
 
 def test_frame_zero_is_clear_of_the_body(small_scene):
@@ -34,11 +36,11 @@ def test_frame_zero_is_clear_of_the_body(small_scene):
 def test_what_is_not_asked_for_is_absent(small_garment, small_poses):
     scene = prepare_scene(small_garment, small_poses)
     assert scene.pin_targets is None
-    assert scene.self_contact is None
-    options = SceneOptions(has_body=False, start_at_rest=True, self_contact=True)
-    other = prepare_scene(small_garment, small_poses, options=options)
+    assert scene.term(Repulsion) is None
+    options = {"terms": (*CLOTH, Repulsion(where="all")), "starts_at_rest": True}
+    other = prepare_scene(small_garment, small_poses, **options)
     assert other.body is None
-    assert other.self_contact is not None
+    assert other.term(Repulsion) is not None
     np.testing.assert_array_equal(other.initial_state.velocity, 0.0)
     np.testing.assert_allclose(
         scene.initial_state.velocity * scene.timestep,
@@ -57,27 +59,25 @@ def test_a_garment_that_hangs_on_joints_of_another_body_is_refused(small_garment
         prepare_scene(stranger, small_poses)
 
 
-@pytest.mark.parametrize("options", [{"integrator": "Euler"}, {"ground": "none"}])
+@pytest.mark.parametrize("options", [{"integrator": "Euler"}, {"terms": (Repulsion(where="none"),)}])
 def test_a_misspelt_option_is_refused(small_garment, small_poses, options):
-    (name,) = options
-    with pytest.raises(ConfigError, match=f"{name} is .*give one of"):
-        prepare_scene(small_garment, small_poses, options=SceneOptions(**options))
+    with pytest.raises(ConfigError, match="give one of"):
+        prepare_scene(small_garment, small_poses, **options)
 
 
-def test_contacts_are_as_stiff_as_the_fabric_asks_for_with_any_plan(small_garment, small_poses):
-    denim = fabric_material("denim")
-    expected = float(constants_for(denim).collision_stiffness)
-    assert expected > 5 * float(PhysicsConstants().collision_stiffness)
-    for plan in (safe_plan(small_poses), plan_scene(small_garment, small_poses)):
-        scene = build_scene(small_garment, small_poses, denim, plan)
-        assert float(scene.constants.collision_stiffness) == pytest.approx(expected)
+def test_contacts_are_as_stiff_as_the_fabric_asks_for(small_garment, small_poses):
+    """The same vertex at the same depth presses with the fabric's share."""
+    denim, stiffness = fabric_material("denim"), Collision().stiffness
+    scenes = [prepare_scene(small_garment, small_poses, material=one) for one in (denim, COTTON)]
+    found = [float(jax.jit(first_problem)(scene).data_of(Collision).stiffness) for scene in scenes]
+    assert found == pytest.approx([float(contact_excess(denim)) * stiffness, stiffness])
+    assert found[0] > 5 * stiffness
 
 
 def test_a_body_with_tips_keeps_faces_off_them(small_garment, small_poses):
-    scene = prepare_scene(small_garment, small_poses, options=SceneOptions(has_tips=True))
-    problem = jax.jit(first_problem)(scene)
-    assert problem.body.tips is not None
-    assert float(jnp.sum(jnp.abs(problem.body.tips.side))) > 0
+    scene = prepare_scene(small_garment, small_poses, terms=scene_terms(Collision(has_tips=True)))
+    tips = jax.jit(first_problem)(scene).data_of(Collision).tips
+    assert float(jnp.sum(jnp.abs(tips.side))) > 0
 
 
 def test_scenes_with_and_without_pieces_can_be_stacked():
@@ -88,17 +88,20 @@ def test_scenes_with_and_without_pieces_can_be_stacked():
     two = make_garment(np.concatenate([positions, above]), np.concatenate([faces, faces + len(positions)]))
     motion = drifting_ball(4)
     scenes = prepare_scenes(
-        [one, two], [motion, motion], [COTTON, COTTON], options=SceneOptions(has_folds=True)
+        [one, two], [motion, motion], [COTTON, COTTON], terms=scene_terms(Repulsion(where="folds"))
     )
-    assert [scene.pieces for scene in scenes] == [None, None]
-    assert all(scene.self_contact is not None for scene in scenes)
+    assert [scene.term(Repulsion).pieces for scene in scenes] == [None, None]
+    assert all(scene.term(Repulsion) is not None for scene in scenes)
 
 
-def test_what_a_plan_leaves_out_changes_no_force(small_garment, small_poses, small_scene, small_trajectory):
-    """The safe plan searches every face of the body, and models pins although there are none."""
-    whole = build_scene(small_garment, small_poses, small_scene.material, safe_plan(small_poses))
+def test_what_a_plan_leaves_out_changes_no_force(
+    small_garment, small_poses, small_scene, small_trajectory, monkeypatch
+):
+    """A scene that is not planned searches every face of the body, and models pins although there are none."""
+    whole = build_scene(small_garment, small_poses, small_scene.material, small_scene.terms)
     assert whole.pin_targets is not None
-    near = prepare_scene(small_garment, small_poses, options=SceneOptions(reach=0.04))
+    monkeypatch.setattr("eslr_jax.terms.worn.REACH", REACH / 2)  # else all of this small body is in reach
+    near = prepare_scene(small_garment, small_poses, terms=small_scene.terms)
     assert whole.body.surface.faces.shape[0] > near.body.surface.faces.shape[0]
     position = small_trajectory.positions[3] + 1e-3
 
@@ -175,10 +178,8 @@ def test_two_pieces_that_meet_are_kept_apart(small_poses):
     for gap, meets in ((0.02, True), (0.3, False)):
         rest = np.concatenate([positions, positions + np.array([0.0, gap, 0.0])])
         garment = make_garment(rest, both)
-        options = SceneOptions(has_body=False)
-        assert (prepare_scene(garment, small_poses, options=options).self_contact is not None) == meets
-        off = SceneOptions(has_body=False, self_contact=False)
-        assert prepare_scene(garment, small_poses, options=off).self_contact is None
+        layers = prepare_scene(garment, small_poses, terms=(*CLOTH, Repulsion())).term(Repulsion)
+        assert (layers is not None) == meets
 
 
 def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garment, small_poses):
@@ -187,14 +188,12 @@ def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garme
 
     positions, faces = make_sheet(6, 6, 0.02, jitter=0)
     loose = make_garment(positions + np.array([0.16, 0.0, 0.0]), faces)
-    folds = SceneOptions(has_folds=True)
-    assert prepare_scene(small_garment, small_poses, options=folds).self_contact is None
-    assert prepare_scene(loose, small_poses).self_contact is None
-    scene = prepare_scene(loose, small_poses, options=folds)
-    assert scene.self_contact is not None
-    assert scene.pieces is None
-    off = SceneOptions(has_folds=True, self_contact=False)
-    assert prepare_scene(loose, small_poses, options=off).self_contact is None
+    folds = {"terms": scene_terms(Repulsion(where="folds"))}
+    assert prepare_scene(small_garment, small_poses, **folds).term(Repulsion) is None
+    assert prepare_scene(loose, small_poses).term(Repulsion) is None
+    scene = prepare_scene(loose, small_poses, **folds)
+    assert scene.term(Repulsion) is not None
+    assert scene.term(Repulsion).pieces is None
 
 
 def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
@@ -202,4 +201,4 @@ def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
     body = load_body()
     poses = pose_body(body, load_motion("cmu_016_29"), num_frames=6)
     shirt = load_garment("tshirt")
-    assert prepare_scene(shirt, poses, options=SceneOptions(has_folds=True)).self_contact is not None
+    assert prepare_scene(shirt, poses, terms=(*CLOTH, Repulsion(where="folds"))).term(Repulsion) is not None

@@ -10,19 +10,20 @@ import pytest
 from draped_ball import drifting_ball, square
 from own_term import Push
 
-from eslr_jax import SceneOptions, load_scene, prepare_scene, save_scene, simulate
+from eslr_jax import load_scene, prepare_scene, save_scene, scene_terms, simulate
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.terms.air import Air, blowing
+from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion
+from eslr_jax.terms.air import blowing
 
 
-def all_of_a_scene(**options):
+def all_of_a_scene(*others, substeps=1):
     garment = square(5, 0.12, is_pinned=np.array([0, 3]))
-    options = {"self_contact": True, "has_skin": True, "ground": "on", "integrator": "bdf2"} | options
-    return prepare_scene(garment, drifting_ball(3), options=SceneOptions(**options))
+    terms = scene_terms(Collision(has_skin=True), Ground(is_always=True), Repulsion(where="all"), *others)
+    return prepare_scene(garment, drifting_ball(3), terms=terms, integrator="bdf2", substeps=substeps)
 
 
 def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
-    scene = all_of_a_scene(air=blowing((3.0, 0.0, 0.0), 0.3), damping=0.01, substeps=2, terms=(Push(0.5),))
+    scene = all_of_a_scene(blowing((3.0, 0.0, 0.0), 0.3), Damping(0.01), Push(0.5), substeps=2)
     save_scene(tmp_path / "scene.npz", scene)
     again = load_scene(tmp_path / "scene.npz")
     assert jax.tree.structure(again) == jax.tree.structure(scene)
@@ -32,7 +33,7 @@ def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
 
 
 def test_a_term_is_found_where_its_module_is_imported(tmp_path):
-    save_scene(tmp_path / "scene.npz", all_of_a_scene(terms=(Push(0.5),)))
+    save_scene(tmp_path / "scene.npz", all_of_a_scene(Push(0.5)))
     code = "import sys, eslr_jax\ntry: eslr_jax.load_scene(sys.argv[1])\nexcept eslr_jax.EslrError as e: print(e)"
     command = [sys.executable, "-c", code, str(tmp_path / "scene.npz")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -40,7 +41,7 @@ def test_a_term_is_found_where_its_module_is_imported(tmp_path):
 
 
 def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path):
-    scene = all_of_a_scene(air=Air(lambda points, time: 2.0 * points))
+    scene = all_of_a_scene(Air(lambda points, time: 2.0 * points))
     with pytest.raises(ConfigError, match=r"scene\.terms\.\d+\.wind is a function of your own"):
         save_scene(tmp_path / "scene.npz", scene)
     assert not list(tmp_path.iterdir())

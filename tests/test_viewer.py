@@ -13,6 +13,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.evaluation.fields import FIELDS
 from eslr_jax.evaluation.run import read_run
 from eslr_jax.io.garment import write_garment_npz
+from eslr_jax.terms import Repulsion, scene_terms
 from eslr_jax.viewer import go_to_worst, open_view, play, show
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -110,7 +111,9 @@ def test_a_field_is_plotted_over_time_and_leads_to_its_worst_frame(view):
 
 def test_a_field_that_a_run_lacks_is_told(tmp_path, body):
     pytest.importorskip("viser")
-    view = open_view([read_run(write_run(tmp_path, body, "run", self_contact=False))], port=8792)
+    view = open_view(
+        [read_run(write_run(tmp_path, body, "run", terms=scene_terms(without=(Repulsion,))))], port=8792
+    )
     try:
         view.controls["color"].value = "repulsion-energy"
         show(view)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.numerics import product
+from eslr_jax.types import Garment
 
 SERIES_BELOW = 1e-2  # [rad^2], where the truncated series are exact to float32 and the closed forms are not
 
@@ -131,6 +132,18 @@ def skin_frames(
         transforms: Affine map of each joint in every frame, shape [frames, joints, 3, 4].
     """
     return jax.lax.map(lambda frame: skin(positions, weights, indices, frame), transforms)
+
+
+def skin_garment(
+    garment: Garment, transforms: Float[Array, "frames joints 3 4"]
+) -> Float[Array, "frames vertices 3"]:
+    """Return the garment carried by the joints [m], shape [frames, vertices, 3].
+
+    Args:
+        garment: Rest mesh with its skin weights.
+        transforms: Maps from rest to posed points, shape [frames, joints, 3, 4].
+    """
+    return skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
 
 
 def bend(

@@ -203,19 +203,19 @@ class Info:
         from eslr_jax.assets.motions import DEFAULT_MOTION
         from eslr_jax.body.motion import pose_body
         from eslr_jax.evaluation.scene_parts import describe_scene, time_parts
-        from eslr_jax.scene.plan import SceneOptions, prepare_scene
+        from eslr_jax.scene.plan import prepare_scene
+        from eslr_jax.terms import Collision, Repulsion, scene_terms
 
         use_compile_cache()
         check_resolution([garment], self.vertices)
         method = choose_method(Options(simulator=self.simulator))
-        options = SceneOptions(  # those of `eslr simulate`
-            self_contact=self.self_contact or None, has_folds=True, has_skin=True, integrator="bdf2"
-        )
+        layers = Repulsion(where="all" if self.self_contact else "folds")
+        terms = scene_terms(Collision(has_skin=True), layers)  # those of `eslr simulate`
         with waiting("measuring"):
             rig = load_body()
             poses = pose_body(rig, load_motion(self.motion or DEFAULT_MOTION))
             cloth = load_garment(garment, vertices=self.vertices, body=rig)
-            scene = prepare_scene(cloth, poses, options=options)
+            scene = prepare_scene(cloth, poses, terms=terms, integrator="bdf2")
             parts = describe_scene(scene, poses, method.config)
             costs = time_parts(method.params, scene, method.config)
         if self.json:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from eslr_jax.io.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
+    from eslr_jax.terms import Term
     from eslr_jax.types import Material, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
@@ -172,9 +173,8 @@ def _prepare(options: Options) -> _Setting:
     from eslr_jax.fabric import garment_material
     from eslr_jax.fit.outfit import wear_together
     from eslr_jax.fit.report import describe_cost
-    from eslr_jax.scene.plan import SceneOptions, prepare_scene
+    from eslr_jax.scene.plan import prepare_scene
     from eslr_jax.simulation.simulate import begin_compiling
-    from eslr_jax.terms.air import blowing
 
     names, method = options.garments, choose_method(options)
     check_resolution(names, options.vertices)
@@ -196,23 +196,36 @@ def _prepare(options: Options) -> _Setting:
     settle = options.settle
     if settle is None:
         settle = SETTLE_FRAMES if has_solver else 0
-    modelled = SceneOptions(
-        self_contact=False if options.no_self_contact else options.self_contact or None,
-        has_folds=has_solver,
-        ground=options.ground,
-        has_skin=has_solver,
-        integrator=options.integrator or ("bdf2" if has_solver else "euler"),
-        substeps=options.substeps,
-        air=blowing(options.wind, options.gust),
-        damping=options.damping,
-    )
     begin = partial(begin_compiling, method.params, config=method.config, is_paced=method.pace is not None)
     settling = with_settling(actor.poses, settle, actor.rig)
-    scene = prepare_scene(cloth, settling, material=material, options=modelled, on_shapes=begin)
+    scene = prepare_scene(
+        cloth,
+        settling,
+        material=material,
+        terms=_modelled(options, has_solver=has_solver),
+        integrator=options.integrator or ("bdf2" if has_solver else "euler"),
+        substeps=options.substeps,
+        on_shapes=begin,
+    )
     if scene.body is not None:
         vertices = np.asarray(scene.body.surface.vertex_ids)
         check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
     return _Setting(names, garments, stored, actor, material, method, settle, scene)
+
+
+def _modelled(options: Options, *, has_solver: bool) -> tuple[Term, ...]:
+    """Return the terms that the options ask for, where they are needed; networks alone know no skin, no folds."""
+    from eslr_jax.terms import Collision, Damping, Ground, Repulsion, scene_terms
+    from eslr_jax.terms.air import blowing
+
+    layers = Repulsion(where="all" if options.self_contact else "folds" if has_solver else "pieces")
+    changed = [Collision(has_skin=has_solver), Ground(is_always=options.ground == "on"), layers]
+    if (air := blowing(options.wind, options.gust)) is not None:
+        changed.append(air)
+    if options.damping is not None:
+        changed.append(Damping(options.damping))
+    left_out = (Ground,) * (options.ground == "off") + (Repulsion,) * options.no_self_contact
+    return scene_terms(*changed, without=left_out)
 
 
 def _announce(options: Options, setting: _Setting) -> None:
@@ -292,13 +305,13 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
     import jax
     import numpy as np
 
+    from eslr_jax.body.lbs import skin_garment
     from eslr_jax.body.motion import first_poses
     from eslr_jax.evaluation.report import describe_model, environment, trajectory_report
     from eslr_jax.evaluation.run import ClothTrack, write_run
     from eslr_jax.evaluation.wear import wear_report
     from eslr_jax.fabric import worn_fabrics
     from eslr_jax.scene.archive import write_tree
-    from eslr_jax.scene.build import skin_garment
     from eslr_jax.scene.plan import first_frames
     from eslr_jax.simulation.simulate import good_frames, last_frames, raise_for_status
     from eslr_jax.simulation.stepper import keeps_tolerance

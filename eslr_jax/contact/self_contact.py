@@ -23,7 +23,7 @@ from eslr_jax.numerics import (
     sub3,
     true_entries,
 )
-from eslr_jax.types import Garment, PairCapacity
+from eslr_jax.types import Garment
 
 TIP_RADIUS = 0.06  # [m] within which vertices of a body with tips are paired with the cloth
 # [m] within which layers are paired: they may approach by this much in a frame. At 0.02 the walls of a pleat that
@@ -80,27 +80,27 @@ class TipPairs:
     status: Int[Array, ""]  # Status.TIP_OVERFLOW if there was too little room
 
 
-def default_capacity(num_vertices: int) -> PairCapacity:
-    """Return the buffers that hold the self-contact of nearly any garment of so many vertices."""
-    return PairCapacity(pairs=PAIRS_PER_VERTEX * num_vertices)
+def default_rows(num_vertices: int) -> int:
+    """Return the size of a buffer that holds the self-contact of nearly any garment of so many vertices."""
+    return PAIRS_PER_VERTEX * num_vertices
 
 
-def starting_capacity(num_vertices: int, pieces: int = 1) -> PairCapacity:
-    """Return a small buffer, for those who enlarge it where it overflows: every row costs in every iteration.
+def starting_rows(num_vertices: int, pieces: int = 1) -> int:
+    """Return the size of a small buffer, for those who enlarge it where it overflows: every row costs time.
 
     Args:
         num_vertices: Of the garment.
         pieces: Pieces of cloth that it consists of.
     """
     share = _BEGINNING if pieces == 1 else _PIECES_BEGINNING
-    return PairCapacity(pairs=max(num_vertices // share, _FEWEST_PAIRS))
+    return max(num_vertices // share, _FEWEST_PAIRS)
 
 
 def find_self_contacts(
     position: Float[Array, "vertices 3"],
     predicted: Float[Array, "vertices 3"],
     garment: Garment,
-    capacity: PairCapacity,
+    capacity: int,
     *,
     pieces: Int[Array, " vertices"] | None = None,
     radius: float = SEARCH_RADIUS,
@@ -116,7 +116,7 @@ def find_self_contacts(
         position: Vertices at t [m], shape [vertices, 3].
         predicted: A guess of the vertices at t + 1 [m], such as the inertial one, shape [vertices, 3].
         garment: Rest mesh.
-        capacity: Sizes of the buffers; static.
+        capacity: Rows of the buffer; static.
         pieces: Piece of every vertex: only cloth of different pieces is paired; None: all cloth is.
         radius: Radius of the search [m].
     """
@@ -151,7 +151,7 @@ def find_tip_contacts(
         garment: Rest mesh.
     """
     count = body.shape[0]
-    capacity = PairCapacity(PAIRS_PER_TIP * (position.shape[0] + count))
+    capacity = PAIRS_PER_TIP * (position.shape[0] + count)
     areas = jnp.full(count, garment.mean_vertex_area)
     points = _Points(_ends(body, next_body), jnp.ones(count, bool), areas, blocks)
     cloth = _Cloth(_ends(position, predicted), garment, has_points=False)
@@ -195,14 +195,14 @@ class _FaceTable(NamedTuple):
     corners: Int[Array, "members corners face_blocks"]
 
 
-def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity) -> FacePairs:
+def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: int) -> FacePairs:
     """Return pairs of points and faces; see `find_self_contacts`."""
     # The choice of pairs has no derivative; their places on the faces have one.
     still = cloth._replace(ends=jax.lax.stop_gradient(cloth.ends))
     point, face, count = _search(jax.lax.stop_gradient(points), still, radius, capacity)
     pairs = _exactly(point, face, points, cloth, radius)
-    is_used = jnp.arange(capacity.pairs) < count
-    is_full = count > capacity.pairs
+    is_used = jnp.arange(capacity) < count
+    is_full = count > capacity
     return pairs.replace(
         vertices=jnp.where(is_used, point, points.ends.shape[2] - 1),
         corners=jnp.where(is_used[:, None], pairs.corners, cloth.ends.shape[2] - 1),
@@ -215,7 +215,7 @@ def _find_pairs(points: _Points, cloth: _Cloth, radius: float, capacity: PairCap
 
 
 def _search(
-    points: _Points, cloth: _Cloth, radius: float, capacity: PairCapacity
+    points: _Points, cloth: _Cloth, radius: float, capacity: int
 ) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"], Int[Array, ""]]:
     """Return points and faces of the pairs, and their number, which may be more than there are rows.
 
@@ -243,12 +243,12 @@ def _search(
             face = garment.face_blocks[faces[pair], column % 32]
             side = _exactly(point, face, points, cloth, radius).side
             is_pair = (side != 0) & (number < candidates.count)
-            return first + rows, _append(found, (point, face), is_pair, capacity.pairs)
+            return first + rows, _append(found, (point, face), is_pair, capacity)
 
         _, found = jax.lax.while_loop(lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found))
         return first + size, found
 
-    nobody = jnp.zeros(capacity.pairs, jnp.int32)
+    nobody = jnp.zeros(capacity, jnp.int32)
     start = (jnp.int32(0), (nobody, nobody, jnp.int32(0)))
     _, (point, face, count) = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, start)
     return point, face, count

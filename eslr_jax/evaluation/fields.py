@@ -20,6 +20,7 @@ from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs
+from eslr_jax.terms import Repulsion
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.terms.term import vertex_shares
@@ -61,7 +62,7 @@ def run_field(run: Run, name: str) -> Field:
         raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
     if name in _BODY_FIELDS and run.trajectory.body is None:
         raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
-    if name == "repulsion-energy" and run.scene.self_contact is None:
+    if name == "repulsion-energy" and run.scene.term(Repulsion) is None:
         raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
         return _distances(run)

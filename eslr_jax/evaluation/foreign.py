@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
 from eslr_jax.evaluation.gap import map_frames, past_states, trajectory_states
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.potential import contact_load, evaluate, potential_terms
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.stepper import buffer_demands
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 from eslr_jax.types import Scene, Trajectory
 
@@ -99,15 +100,14 @@ def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
 
     def measure(
         position: Float[Array, "vertices 3"], problem: FrameProblem
-    ) -> tuple[dict[str, Array], Float[Array, ""], Int[Array, ""] | None]:
+    ) -> tuple[dict[str, Array], Float[Array, ""], dict[str, Array]]:
         gradient = evaluate(position, problem).gradient
         residual = safe_norm(gradient.reshape(-1)) / weight_norm(problem)
-        demand = None if problem.layers is None else problem.layers.pairs.count
-        return potential_terms(position, problem), residual, demand
+        return potential_terms(position, problem), residual, buffer_demands(problem)
 
     states, inputs = trajectory_states(trajectory, scene)
     measured = map_frames(measure, trajectory.positions[1:], states, inputs, scene)
-    energies, residuals, demand = jax.tree.map(
+    energies, residuals, demands = jax.tree.map(
         lambda track: jnp.concatenate([jnp.zeros_like(track[:1]), track]), measured
     )
-    return trajectory.replace(energies=energies, residuals=residuals, pair_demand=demand)
+    return trajectory.replace(energies=energies, residuals=residuals, demands=demands)

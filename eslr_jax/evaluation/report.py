@@ -16,6 +16,7 @@ from eslr_jax.geometry.closest import nearest_places
 from eslr_jax.geometry.crossing import find_crossings
 from eslr_jax.geometry.topology import vertex_normals
 from eslr_jax.io.garment import split_outfit
+from eslr_jax.terms import Ground, Repulsion
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _EVERY = 10  # frames between those whose crossings are counted
@@ -105,7 +106,7 @@ def describe_model(scene: Scene) -> dict[str, Any]:
         "modelled": describe_terms(scene),
         "integrator": "euler" if scene.initial_state.past is None else "bdf2",
         "substeps": scene.substeps,
-        "ground_m": None if scene.ground is None else float(scene.ground),
+        "ground_m": None if (ground := scene.term(Ground)) is None else float(ground.height),
     }
 
 
@@ -119,7 +120,7 @@ def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
 
 def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
     """Return where cloth passes through cloth in spite of self-contact."""
-    if scene.self_contact is None:
+    if scene.term(Repulsion) is None:
         return {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
     faces = _real_faces(scene)
     last = trajectory.num_frames - 1
@@ -151,7 +152,7 @@ def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any]
         Plain values: pairs of faces that intersect, `depth_mm` of the deepest vertex, its `position_m` and its
         place. None where nothing is behind a layer that it passed, or self-contact is not modelled.
     """
-    if scene.self_contact is None:
+    if scene.term(Repulsion) is None:
         return None
     positions = np.asarray(scene.initial_state.position)
     crossings = find_crossings(positions, _real_faces(scene))

@@ -20,18 +20,12 @@ from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import Air, Damping, scene_terms
 from eslr_jax.types import BodyMotion, Scene
 
 Name = TypeVar("Name", bound=Hashable)
 _TURNS = 15  # timings of every part, in turns; medians count
 _ITERATIONS = 20  # of the solver's part
-_UNLESS_NEEDED = {  # terms that a scene lacks, and why
-    "collision": "no body and no ground in reach",
-    "friction": "no body and no ground in reach",
-    "repulsion": "no layers that can meet; see --self-contact",
-    "air": "not asked for",
-    "damping": "not asked for",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +45,8 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         config: Says whether there is a network.
     """
     modelled = describe_terms(scene)
-    left_out = {name: why for name, why in _UNLESS_NEEDED.items() if name not in modelled}
+    known = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.0))
+    left_out = {term.name: term.unless_needed for term in known if term.name not in modelled}
 
     def sort(name: str, is_modelled: bool, size: str, why: str) -> None:
         (modelled if is_modelled else left_out)[name] = size if is_modelled else why
@@ -61,8 +56,6 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
     sort("body", faces > 0, f"{faces} of {total} faces", "out of reach")
     pinned = int(np.sum(scene.garment.is_pinned))
     sort("pins", scene.pin_targets is not None, f"{pinned} vertices", "none")
-    has_ground = scene.ground is not None
-    sort("ground", has_ground, f"at {float(scene.ground):.2f} m" if has_ground else "", "out of reach")
     material = {
         field.name: getattr(scene.material, field.name) for field in dataclasses.fields(scene.material)
     }

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from eslr_jax.body.lbs import skin_garment
 from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFiniteError
 from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
@@ -17,11 +18,10 @@ from eslr_jax.evaluation.referee import intersecting_pairs
 from eslr_jax.evaluation.report import Parts, trajectory_report
 from eslr_jax.evaluation.wear import wear_report
 from eslr_jax.io.garment import split_outfit
-from eslr_jax.scene.build import skin_garment
-from eslr_jax.types import BodyMotion, PairCapacity, Scene, Trajectory
+from eslr_jax.simulation.simulate import enlarge_buffers
+from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 EVERY = 4  # frames between those whose gap and intersections are measured, as in `eslr evaluate`
-_ROWS = 256  # of self-contact, to whose multiple larger buffers are rounded: few sizes are compiled
 _LEAST_FRAMES = (
     3  # the gap is measured from the second simulated frame on: the first one's velocity is guessed
 )
@@ -75,11 +75,11 @@ def score_trajectory(
         trajectory = foreign_trajectory(positions, scene)
     before = trajectory
     trajectory = with_energies(before, scene)
-    if scene.self_contact is not None:  # the buffers that `simulate` begins with may be too small
-        pairs = int(np.max(np.asarray(trajectory.pair_demand)))
-        if pairs > scene.self_contact.pairs:
-            scene = scene.replace(self_contact=PairCapacity(pairs=_ROWS * -(-pairs // _ROWS)))
-            trajectory = with_energies(before, scene)
+    if (
+        larger := enlarge_buffers(scene, trajectory)
+    ) is not None:  # those that `simulate` begins with are small
+        scene = larger
+        trajectory = with_energies(before, scene)
     report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
     del report["iterations_mean"]  # another simulator's are not ours
     if poses is not None:

@@ -10,10 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.numerics import scatter_corners
 from eslr_jax.physics.potential import potential
-from eslr_jax.terms.collision import penetration
 from eslr_jax.terms.problem import FrameProblem, pin
-from eslr_jax.terms.repulsion import push_apart
-from eslr_jax.types import Contacts
 
 _COLLAPSED = 1e-6  # of a face's rest area, below which its normal means nothing
 _OFFSET = 1e-6  # [m] by which the corners of collapsed faces are spread
@@ -35,7 +32,7 @@ def initial_guess(problem: FrameProblem) -> InitialGuess:
     and is its optimum. From the inertial guess L-BFGS misses this optimum by millimetres a second, since its
     first steps bend cloth that only has to move. The guess with the lower potential is taken.
     """
-    fall = problem.constants.gravity * jnp.square(problem.inertial_timestep)
+    fall = problem.gravity * jnp.square(problem.inertial_timestep)
     down = jnp.array([[0.0, 1.0, 0.0]], problem.position.dtype) * fall
 
     def try_guess(moved: Float[Array, "vertices 3"]) -> tuple[Array, Array]:
@@ -51,40 +48,21 @@ def initial_guess(problem: FrameProblem) -> InitialGuess:
 
 
 def push_out(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with vertices inside the body or the ground lifted out of it.
-
-    A vertex goes to the tangent plane of its nearest body point, offset by the contact thickness. The cubic
-    collision energy has no curvature at first touch, so a minimiser that begins deep inside only halves the
-    depth per iteration. This projection costs little and ends 30 to 2000 times lower in energy.
-    """
+    """Return positions [m], shape [vertices, 3], with vertices moved out of obstacles, see `Term.push_out`."""
     position = pin(problem, position)
-    if problem.body is not None:
-        position = _lifted(position, problem.body.nearest, problem.body.thickness)
-    if problem.ground is not None:
-        position = _lifted(position, problem.ground.contacts, problem.ground.thickness)
+    for term, data in problem.parts:
+        position = term.push_out(position, problem, data)
     return pin(problem, position)
 
 
-def _lifted(
-    position: Float[Array, "vertices 3"], contacts: Contacts, thickness: Float[Array, ""] | float
-) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], a thickness [m] or more above their tangent planes."""
-    lift = penetration(position, contacts, thickness)
-    return position + lift[:, None] * contacts.next_normals
-
-
 def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with layers pushed apart and faces pushed off the body's tips.
+    """Return positions [m], shape [vertices, 3], with elements moved apart, see `Term.separate`.
 
-    Like the body's, their barriers have no curvature at first touch: from deep inside, an iteration of the
-    solver only halves the depth.
+    Barriers have no curvature at first touch: from deep inside, an iteration of the solver only halves the depth.
     """
-    if problem.body is not None and problem.body.tips is not None:
-        position = push_apart(position, problem.body.tips, problem.constants.collision_thickness)
-        position = push_out(problem, position)
-    if problem.layers is not None:
-        position = push_apart(position, problem.layers.pairs, problem.layers.thickness)
-        position = push_out(problem, position)
+    for term, data in problem.parts:
+        if (moved := term.separate(position, problem, data)) is not None:
+            position = push_out(problem, moved)
     return position
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from eslr_jax.terms.bending import RIGIDITY_PER_STIFFNESS
-from eslr_jax.types import Material, PhysicsConstants
+from eslr_jax.terms.stretch import stretch_stiffness
+from eslr_jax.types import Material
 
 _COTTON: dict[str, Any] = {
     "density": np.float32(0.20022),  # [kg/m^2] = 426 kg/m^3 x 0.47 mm
@@ -24,9 +22,6 @@ COTTON = Material(**_COTTON)
 """The fabric of SNUG (Santesteban et al. 2022) with which HOOD and the paper evaluate."""
 
 _WANG = "Wang, O'Brien, Ramamoorthi 2011, doi:10.1145/2010324.1964966, data of ARCSim"
-_STIFFEST = (
-    85.2  # [N/m] of the fabrics that networks are trained on (HOOD's ranges); contacts are made for them
-)
 _POISSON = 0.3  # of woven and knitted cloth along its threads; Wang et al. measure 0.1 to 0.6
 
 
@@ -144,38 +139,6 @@ def _lame(stretch: float, thickness: Any) -> dict[str, Any]:
         "lame_mu": np.float32(stretch / (2.0 * (1.0 + _POISSON)) / thickness),
         "lame_lambda": np.float32(stretch * _POISSON / (1.0 - _POISSON**2) / thickness),
     }
-
-
-def stretch_stiffness(material: Material) -> Float[Array, " *faces"]:
-    """Return the tension per width and strain of a fabric that is pulled along one axis [N/m].
-
-    It is E h = 4 mu h (mu + lambda) / (2 mu + lambda), of plane stress; of threads the stiffer one's.
-    """
-    if material.threads is not None:
-        return jnp.max(jnp.asarray(material.threads.stiffness)[:2], axis=0)
-    mu, lame_lambda = jnp.asarray(material.lame_mu), jnp.asarray(material.lame_lambda)
-    return 4.0 * jnp.asarray(material.thickness) * mu * (mu + lame_lambda) / (2.0 * mu + lame_lambda)
-
-
-@jax.jit  # outside jit, every operation is a program of its own
-def _excess(material: Material) -> Float[Array, ""]:
-    """Return how many times as stiff as HOOD's stiffest a fabric is, at least once."""
-    return jnp.maximum(jnp.max(stretch_stiffness(material)) / _STIFFEST, 1.0)
-
-
-def constants_for(material: Material) -> PhysicsConstants:
-    """Return the physical constants of a scene of this fabric.
-
-    A sheet under tension presses on what it is bent over. The depth to which it sinks in shall depend on its
-    strain alone. So if the stiffest face of a fabric is stiffer than HOOD's ranges, contacts are stiffer by
-    that factor.
-    """
-    excess = _excess(material)
-    usual = PhysicsConstants()
-    return usual.replace(
-        collision_stiffness=usual.collision_stiffness * excess,
-        repulsion_stiffness=usual.repulsion_stiffness * excess,
-    )
 
 
 def describe_cotton() -> Fabric:

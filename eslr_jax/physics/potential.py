@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import components
-from eslr_jax.terms.collision import contact_forces
 from eslr_jax.terms.problem import FrameProblem, pin
 
 
@@ -34,7 +33,7 @@ def potential_terms(
     """
     x = components(pin(problem, position))  # once: gradients of all terms are then summed by components
     energies: dict[str, Array] = {}
-    for term, data in zip(problem.terms, problem.data, strict=True):
+    for term, data in problem.parts:
         energy = term.energy(x, problem, data)
         energies[term.name] = energies[term.name] + energy if term.name in energies else energy
     return energies
@@ -51,17 +50,11 @@ def evaluate(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Poi
 
 
 def contact_load(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
-    """Return the normal force of the nearest body point on every vertex [N]; it loads the next frame's friction.
-
-    The force of an opposing body part loads none: between two limbs the nearer one alone rubs.
+    """Return the normal force on every vertex [N] that loads the next frame's friction.
 
     Args:
         position: Positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem; without a body the forces are zero.
+        problem: The frame's problem.
     """
-    if problem.body is None:
-        return jnp.zeros(position.shape[0], position.dtype)
-    body = problem.body
-    return contact_forces(
-        position, body.nearest, problem.garment, problem.constants.collision_stiffness, body.thickness
-    )
+    loads = (term.load(position, problem, data) for term, data in problem.parts)
+    return sum(loads, jnp.zeros(position.shape[0], position.dtype))

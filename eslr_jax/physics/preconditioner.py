@@ -51,11 +51,7 @@ def sum_diagonals(
 ) -> Float[Array, " vertices"]:
     """Return the sum of the curvatures per vertex [N/m] that some of the terms estimate at positions [m]."""
     x = components(position)
-    diagonals = (
-        term.diagonal(x, problem, data)
-        for term, data in zip(problem.terms, problem.data, strict=True)
-        if is_counted(term)
-    )
+    diagonals = (term.diagonal(x, problem, data) for term, data in problem.parts if is_counted(term))
     return sum(diagonals, jnp.zeros_like(x[0]))
 
 

@@ -50,7 +50,7 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
     faces, hinges, vertices = (_element_blocks(on, x, problem) for on in ("faces", "hinges", "vertices"))
     rest = [
         (remainder, data)
-        for term, data in zip(problem.terms, problem.data, strict=True)
+        for term, data in problem.parts
         if (remainder := term.remainder(problem)) is not None
     ]
     others = None
@@ -75,7 +75,7 @@ def _element_blocks(on: str, x: Vector3, problem: FrameProblem) -> Float[Array, 
     def energy(corners: tuple[Vector3, ...]) -> Float[Array, ""]:
         energies = (
             jnp.sum(term.corner_energies(corners, problem, data))
-            for term, data in zip(problem.terms, problem.data, strict=True)
+            for term, data in problem.parts
             if term.on == on
         )
         return sum(energies, jnp.zeros((), x[0].dtype))

@@ -15,7 +15,7 @@ from jax.tree_util import Partial
 
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.io.npz import read_arrays, write_arrays
-from eslr_jax.terms.term import Term
+from eslr_jax.terms import Term
 from eslr_jax.types import Scene
 
 _OWN = "eslr_jax."  # package whose types and functions a file may name

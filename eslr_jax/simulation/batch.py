@@ -14,10 +14,12 @@ from jax.sharding import Mesh, PartitionSpec
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.padding import choose_bucket
-from eslr_jax.scene.plan import SceneOptions, prepare_scenes
+from eslr_jax.scene.build import Integrator
+from eslr_jax.scene.plan import prepare_scenes
 from eslr_jax.simulation.rollout import check_network, rollout_scene
 from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, hold_last, simulate
-from eslr_jax.types import BodyMotion, Garment, Material, PhysicsConstants, Scene, Trajectory
+from eslr_jax.terms import Term
+from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
 
 SCENES = "scenes"  # axis of the device mesh
 
@@ -29,8 +31,10 @@ def simulate_batch(
     *,
     config: SimConfig | None = None,
     material: Material | Sequence[Material] | None = None,
-    constants: PhysicsConstants | None = None,
-    options: SceneOptions | None = None,
+    terms: tuple[Term, ...] | None = None,
+    integrator: Integrator = "euler",
+    substeps: int = 1,
+    starts_at_rest: bool = False,
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
 ) -> list[Trajectory]:
@@ -46,8 +50,10 @@ def simulate_batch(
         config: Network, iterations and tolerance; the solver alone by default.
         material: Fabric of all, or one for each; isotropic and the same all over a garment. By default each
             garment has its own, of its file, or else cotton.
-        constants: Physical constants of all.
-        options: What the scenes leave out or add.
+        terms: What to model where one of the scenes needs it; by default `scene_terms()`.
+        integrator: How time is stepped.
+        substeps: Number of equal parts in which a frame is simulated.
+        starts_at_rest: Frame 0 stands still; else it moves as the body does.
         batch_size: Scenes per step on a device, see `rollout_scenes`.
         devices: Of `jax.devices()`, to spread the scenes over; by default the first alone.
 
@@ -77,8 +83,10 @@ def simulate_batch(
             [garments[i] for i in group],
             [poses[i] for i in group],
             [materials[i] for i in group],
-            constants=constants,
-            options=options,
+            terms=terms,
+            integrator=integrator,
+            substeps=substeps,
+            starts_at_rest=starts_at_rest,
         )
         for scene in scenes:
             check_scene(scene)

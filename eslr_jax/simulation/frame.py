@@ -8,24 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.contact.ground import ground_contacts
-from eslr_jax.contact.layer_edges import LayerPairs, with_edges
-from eslr_jax.contact.nearest import are_pinched, find_both_sides
-from eslr_jax.contact.self_contact import find_self_contacts, find_tip_contacts
-from eslr_jax.contact.skin import find_skin_contacts
 from eslr_jax.scene.build import slice_tracks
-from eslr_jax.terms.collision import contact_forces
-from eslr_jax.terms.problem import (
-    BodyContact,
-    FrameProblem,
-    GroundContact,
-    SecondOrder,
-    SelfContact,
-    contact_thickness,
-    with_terms,
-)
-from eslr_jax.terms.repulsion import pair_heights
-from eslr_jax.types import ClothState, PastState, Scene, SceneBody
+from eslr_jax.terms.problem import FrameProblem, MovingBody, SecondOrder, with_terms
+from eslr_jax.types import ClothState, PastState, Scene
 
 
 class BodyStep(NamedTuple):
@@ -78,7 +63,7 @@ def without_tracks(scene: Scene) -> Scene:
 
 
 def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameProblem:
-    """Find the frame's contacts and state its minimisation problem.
+    """Let the terms look at the frame, and state its minimisation problem.
 
     Args:
         scene: Its constant parts; what moves is read from `inputs`.
@@ -88,25 +73,17 @@ def frame_problem(scene: Scene, state: ClothState, inputs: FrameInput) -> FrameP
     problem = FrameProblem(
         garment=scene.garment,
         material=scene.material,
-        constants=scene.constants,
         timestep=scene.timestep,
         position=state.position,
         inertial_guess=state.position + scene.timestep * state.velocity,
         time=(state.frame + 1).astype(scene.timestep.dtype) * scene.timestep,
+        friction_load=state.friction_load,
         pin_targets=inputs.pin_targets,
     )
     if state.past is not None:
         problem = _second_order(problem, state, state.past)
     if scene.body is not None and inputs.body is not None:
-        body = _body_contact(problem, scene.body, inputs.body, state.friction_load)
-        problem = problem.replace(body=body)
-    if scene.ground is not None:
-        problem = problem.replace(ground=_ground_contact(scene, state, scene.ground))
-    if scene.self_contact is not None:
-        cloth = (state.position, problem.inertial_guess, scene.garment)
-        pairs = find_self_contacts(*cloth, scene.self_contact, pieces=scene.pieces)
-        pairs = with_edges(*cloth[:2], pairs, scene.garment)
-        problem = problem.replace(layers=_layers(problem, pairs))
+        problem = problem.replace(body=MovingBody(scene.body.surface, *inputs.body))
     return with_terms(problem, scene.terms)
 
 
@@ -138,55 +115,3 @@ def _second_order(problem: FrameProblem, state: ClothState, past: PastState) -> 
     origin, velocity = before(state.position, past.position), before(state.velocity, past.velocity)
     acts = jnp.where(past.is_known, (1.0 + ratio) / whole, 1.0) * problem.timestep
     return problem.replace(inertial_guess=origin + acts * velocity, bdf2=SecondOrder(origin, acts))
-
-
-def _body_contact(
-    problem: FrameProblem, body: SceneBody, step: BodyStep, friction_load: Float[Array, " vertices"]
-) -> BodyContact:
-    """Return the contact of a frame with the scene's body."""
-    garment, constants = problem.garment, problem.constants
-    nearest, opposing = find_both_sides(
-        problem.position, step.start, step.end, body.surface, garment.vertex_blocks, problem.inertial_guess
-    )
-    skin = tips = None
-    if body.has_skin:
-        cloth = (problem.position, problem.inertial_guess)
-        skin = find_skin_contacts(cloth, (step.start, step.end), nearest, body.surface, garment)
-        # Between two limbs nobody sees skin, and rows of both would pull the cloth to both sides.
-        pinched = are_pinched(nearest, opposing)
-        skin = skin.replace(is_near=skin.is_near & ~jnp.any(pinched[skin.corners], axis=1))
-    if body.has_tips:
-        tips = find_tip_contacts(
-            problem.position, problem.inertial_guess, *step, body.surface.patch_vertices, garment
-        )
-    return BodyContact(
-        nearest=nearest,
-        opposing=opposing,
-        friction_load=friction_load,
-        thickness=contact_thickness(garment, constants.collision_thickness),
-        skin=skin,
-        tips=tips,
-    )
-
-
-def _layers(problem: FrameProblem, pairs: LayerPairs) -> SelfContact:
-    """Return the contact of a frame between layers of the cloth.
-
-    A vertex on the wrong side of a face is pushed back by one contact thickness a frame. Pushed back within one
-    frame, from centimetres deep, it tore the cloth: neighbouring pairs with opposite sides pulled with thousands
-    of times the weight.
-    """
-    thickness = contact_thickness(problem.garment, problem.constants.repulsion_thickness)
-    height, _ = pair_heights(problem.position, pairs)
-    return SelfContact(pairs, thickness + jnp.minimum(height, 0.0), limit=thickness)
-
-
-def _ground_contact(scene: Scene, state: ClothState, height: Float[Array, ""]) -> GroundContact:
-    """Return the contact of a frame with the ground.
-
-    The ground is flat and stands still: no edge dips into it, and where the cloth is tells how hard it presses.
-    """
-    constants, contacts = scene.constants, ground_contacts(state.position, height)
-    thickness = constants.collision_thickness
-    load = contact_forces(state.position, contacts, scene.garment, constants.collision_stiffness, thickness)
-    return GroundContact(contacts, load, thickness)

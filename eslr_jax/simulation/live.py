@@ -12,17 +12,15 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.self_contact import default_capacity
+from eslr_jax.contact.self_contact import default_rows
 from eslr_jax.numerics import Vector3
-from eslr_jax.physics.materials import constants_for
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
-from eslr_jax.terms.air import Air
+from eslr_jax.terms import Air, Collision, Elements, Repulsion, Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.term import Elements, Term
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene
 
 MOST_ITERATIONS = 100
@@ -85,10 +83,11 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     Raises:
         MotionError: The motion has fewer than two frames.
     """
-    options = SceneOptions(has_skin=True, integrator="bdf2", air=Air((0.0, 0.0, 0.0)), terms=(no_hand(),))
-    scene = prepare_scene(
-        garment, poses, material=material, options=options, on_shapes=partial(_begin_compiling, material)
-    )
+    # Nobody enlarges its buffers here.
+    layers = Repulsion(num_rows=default_rows(garment.vertex_mask.shape[0]))
+    terms = scene_terms(Collision(has_skin=True), layers, Air((0.0, 0.0, 0.0)), no_hand())
+    begin = partial(_begin_compiling, material)
+    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
     return _staged(scene, material)
 
 
@@ -105,8 +104,6 @@ def _begin_compiling(material: Material, scene: Scene) -> None:
 
 def _staged(scene: Scene, material: Material) -> Stage:
     """Return the stage of a scene."""
-    if scene.self_contact is not None:  # nobody enlarges its buffers here
-        scene = scene.replace(self_contact=default_capacity(scene.garment.vertex_mask.shape[0]))
     inputs = frame_inputs(scene)
     back = (
         inputs
@@ -124,9 +121,8 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
     asked = jax.tree.map(jnp.asarray, (Air(jnp.asarray(wind, jnp.float32)), hand))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
-    constants = jax.tree.map(jnp.asarray, constants_for(material))
     terms = (*stage.constant.terms[: -len(asked)], *asked)  # they stand last
-    constant = stage.constant.replace(material=material, constants=constants, terms=terms)
+    constant = stage.constant.replace(material=material, terms=terms)
     return stage._replace(constant=constant)
 
 

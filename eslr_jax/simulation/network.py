@@ -17,6 +17,7 @@ from eslr_jax.physics.guess import InitialGuess, initial_guess
 from eslr_jax.physics.potential import Point, evaluate, potential
 from eslr_jax.physics.preconditioner import solve_stiffness, stiffness
 from eslr_jax.physics.subspace import combine_directions
+from eslr_jax.terms import Collision
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.types import ClothState
 
@@ -64,7 +65,8 @@ def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
     if problem.pin_targets is not None:
         is_pinned = problem.garment.is_pinned[:, None]
         velocity = jnp.where(is_pinned, position - state.position, velocity)
-    contacts = None if problem.body is None else problem.body.nearest
+    touched = problem.data_of(Collision)
+    contacts = None if touched is None else touched.nearest
     return GraphInputs(
         position=position,
         velocity=velocity,
@@ -72,7 +74,7 @@ def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
         contacts=contacts,
         body_velocity=None if contacts is None else contacts.next_points - contacts.points,
         inertial_guess=problem.inertial_guess,
-        weight=problem.constants.gravity * problem.masses,
+        weight=problem.gravity * problem.masses,
     )
 
 

@@ -13,9 +13,10 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.models.registry import check_params
 from eslr_jax.physics.solve import SOLUTION
-from eslr_jax.scene.build import ScenePlan, build_scene, safe_plan, worn_material
+from eslr_jax.scene.build import Integrator, build_scene, worn_material
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, part_of_frame
 from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper, past_state
+from eslr_jax.terms import Ground, Repulsion, Term, scene_terms
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
 
 
@@ -26,7 +27,9 @@ def rollout(
     *,
     config: SimConfig | None = None,
     material: Material | None = None,
-    plan: ScenePlan | None = None,
+    terms: tuple[Term, ...] | None = None,
+    integrator: Integrator = "euler",
+    substeps: int = 1,
 ) -> Trajectory:
     """Simulate a garment on a moving body.
 
@@ -40,8 +43,10 @@ def rollout(
         poses: Of `pose_body`.
         config: Network, iterations and tolerance; the solver alone by default.
         material: Fabric; by default the garment's own, of its file, or else cotton.
-        plan: What is modelled, of `plan_scene`, which looks at values and leaves out what they don't need. By
-            default the whole body is searched, pins are modelled, and layers of cloth pass through each other.
+        terms: What is modelled, of `plan_scene`, which looks at values and leaves out what they don't need. By
+            default there is no ground, and layers of cloth pass through each other.
+        integrator: How time is stepped; static.
+        substeps: Number of equal parts in which a frame is simulated; static.
 
     Returns:
         The trajectory; frame 0 is the garment skinned to the first pose and pushed out of the body.
@@ -52,7 +57,10 @@ def rollout(
     """
     config = config or SimConfig()
     check_network(params, config)
-    scene = build_scene(garment, poses, worn_material(garment, material), plan or safe_plan(poses))
+    if terms is None:
+        terms = scene_terms(without=(Ground, Repulsion))
+    worn = garment, poses, worn_material(garment, material)
+    scene = build_scene(*worn, terms, integrator=integrator, substeps=substeps)
     return rollout_scene(params, scene, config)
 
 
@@ -184,13 +192,12 @@ def step_frame(
     is_first_bad = (state.status == 0) & (end.status != 0)
     bad_frame = jnp.where(is_first_bad, number, state.first_bad_frame)
     end = end.replace(frame=number, first_bad_frame=bad_frame, past=past)
-    demand = reports.pair_demand
     return end, FrameReport(
         energies=jax.tree.map(lambda values: values[-1], reports.energies),
         residual=residual,
         iterations=jnp.max(reports.iterations),
         gap_bound=jnp.max(reports.gap_bound),
-        pair_demand=None if demand is None else jnp.max(demand),
+        demands=jax.tree.map(jnp.max, reports.demands),
     )
 
 
@@ -213,7 +220,7 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         residuals=reports.residual,
         gap_bounds=reports.gap_bound,
         iterations=reports.iterations,
-        pair_demand=reports.pair_demand,
+        demands=reports.demands,
         status=end.status,
         first_bad_frame=jnp.where(is_good, -1, end.first_bad_frame - start.frame),
     )

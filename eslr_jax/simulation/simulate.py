@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,17 +13,14 @@ from jaxtyping import Array, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
-from eslr_jax.physics.validate import validate_constants, validate_material, validate_timestep
+from eslr_jax.physics.validate import validate_material, validate_timestep
 from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper, past_state
-from eslr_jax.types import ClothState, PairCapacity, Scene, Trajectory
+from eslr_jax.types import ClothState, Scene, Trajectory
 
-_HEADROOM = 1.25  # of a buffer made larger: later frames may need more
-# Sizes of buffers from one to twice as large: few, since each is compiled, and close, since every row costs time.
-_SIZES = 4
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
 Pace = Callable[[int, float], int]
@@ -252,27 +248,20 @@ def _without_frames(scene: Scene) -> Scene:
 
 
 def enlarge_buffers(scene: Scene, trajectory: Trajectory) -> Scene | None:
-    """Return the scene with larger buffers where a rollout had too little room for self-contact, else None.
-
-    The buffer holds what the fullest frame asked for and a quarter more, rounded up. Every size is compiled
-    anew, so scenes of one shape share a few sizes.
+    """Return the scene with larger buffers where a rollout had too little room in one, else None.
 
     Args:
         scene: The scene that was simulated.
         trajectory: What came of it.
     """
-    status = Status(int(jax.device_get(trajectory.status)))
-    if (
-        Status.SELF_CONTACT_OVERFLOW not in status
-        or trajectory.pair_demand is None
-        or scene.self_contact is None
-    ):
+    larger = []
+    for term in scene.terms:
+        demand = trajectory.demands.get(term.name)
+        larger.append(None if demand is None else term.enlarged(int(np.max(np.asarray(demand)))))
+    if all(one is None for one in larger):
         return None
-    pairs, room = int(np.max(np.asarray(trajectory.pair_demand))), scene.self_contact.pairs
-    if pairs <= room:
-        return None
-    steps = math.ceil(_SIZES * math.log2(_HEADROOM * pairs / room))
-    return scene.replace(self_contact=PairCapacity(pairs=round(room * 2 ** (steps / _SIZES))))
+    pairs = zip(larger, scene.terms, strict=True)
+    return scene.replace(terms=tuple(before if one is None else one for one, before in pairs))
 
 
 def good_frames(trajectory: Trajectory) -> Trajectory:
@@ -315,7 +304,8 @@ def check_scene(scene: Scene) -> None:
     if scene.num_frames < 2:
         raise MotionError(f"the scene has {scene.num_frames} frame; give two or more")
     validate_material(scene.material, scene.garment)
-    validate_constants(scene.constants)
+    for term in scene.terms:
+        term.check()
     validate_timestep(scene.timestep)
 
 
@@ -338,8 +328,10 @@ def raise_for_status(trajectory: Trajectory, *, settle: int = 0) -> None:
     frame = int(trajectory.first_bad_frame) - settle
     when = f"frame {frame}" if frame >= 0 else "before frame 0, while the garment settled"
     message = f"{when}: {status.describe()}"
-    if Status.SELF_CONTACT_OVERFLOW in status and trajectory.pair_demand is not None:
-        message += f": {int(np.max(np.asarray(trajectory.pair_demand)))} pairs or more"
+    if Status.SELF_CONTACT_OVERFLOW in status and trajectory.demands:
+        message += (
+            f": {max(int(np.max(np.asarray(rows))) for rows in trajectory.demands.values())} rows or more"
+        )
     error: type[EslrError] = CapacityError
     if Status.NON_FINITE in status:
         error = NonFiniteError

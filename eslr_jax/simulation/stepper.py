@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.nearest import MAX_APPROACH, approach
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import initial_guess, separate
@@ -29,9 +28,9 @@ class FrameReport(NamedTuple):
     energies: dict[str, Float[Array, ""]]  # that it ended with [J], by the names of the terms
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
+    demands: dict[str, Int[Array, ""]]  # see Trajectory
     # Share of the initial gap that the solver left at most; infinite without one.
     gap_bound: Float[Array, ""] | float = math.inf
-    pair_demand: Int[Array, ""] | None = None  # see Trajectory
 
 
 MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
@@ -96,7 +95,7 @@ def make_stepper(
             residual=residual,
             iterations=minimum.iterations,
             gap_bound=minimum.gap_bound,
-            pair_demand=None if problem.layers is None else problem.layers.pairs.count,
+            demands=buffer_demands(problem),
         )
         return next_state(position, problem, state, status | minimum.status, residual), report
 
@@ -196,15 +195,14 @@ def past_state(
 
 
 def problem_status(problem: FrameProblem) -> Int[Array, ""]:
-    """Return the status bits of a frame's contacts: too small a buffer, too fast a body."""
+    """Return the status bits that the terms raise, such as too small a buffer or too fast a body."""
     status = jnp.int32(Status.OK)
-    if problem.layers is not None:
-        status = status | problem.layers.pairs.status
-    if problem.body is not None:
-        contacts = problem.body.nearest
-        moved = approach(contacts.points, contacts.next_points, contacts.normals)
-        is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & problem.garment.vertex_mask)
-        status = status | jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
-        if problem.body.tips is not None:
-            status = status | problem.body.tips.status
+    for term, data in problem.parts:
+        status = status | term.status(problem, data)
     return status
+
+
+def buffer_demands(problem: FrameProblem) -> dict[str, Int[Array, ""]]:
+    """Return how many rows the terms of a frame ask their buffers for, by their names."""
+    demands = {term.name: term.demand(data) for term, data in problem.parts}
+    return {name: count for name, count in demands.items() if count is not None}

@@ -1,6 +1,6 @@
 """Energies of cloth, one a file: each with its constants, its curvature and its name in every report.
 
-Two sets: the terms of `scene.build.scene_terms` (set `consistent`), which simulate and train, and `hood`, HOOD's
+Two sets: the terms of `scene_terms` (set `consistent`), which simulate and train, and `hood`, HOOD's
 published losses, for tables. Side by side, from x_t to x_{t+1}:
 
 | term      | `consistent`                                  | `hood`                                      |
@@ -23,3 +23,21 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 | damping   | of the fabric's strain, `terms.damping`       | none                                        |
 | your own  | a subclass of `terms.term.Term`               | none                                        |
 """
+
+from eslr_jax.terms.air import Air
+from eslr_jax.terms.bending import Bending
+from eslr_jax.terms.collision import Collision
+from eslr_jax.terms.damping import Damping
+from eslr_jax.terms.defaults import CLOTH, scene_terms
+from eslr_jax.terms.friction import Friction
+from eslr_jax.terms.gravity import Gravity
+from eslr_jax.terms.ground import Ground
+from eslr_jax.terms.inertia import Inertia
+from eslr_jax.terms.repulsion import Repulsion
+from eslr_jax.terms.stretch import Stretch
+from eslr_jax.terms.term import Elements, Term
+
+__all__ = [
+    "CLOTH", "Air", "Bending", "Collision", "Damping", "Elements", "Friction", "Gravity", "Ground", "Inertia",
+    "Repulsion", "Stretch", "Term", "scene_terms",
+]  # fmt: skip

@@ -14,6 +14,7 @@ Source: Hoerner 1965, Fluid-Dynamic Drag, chapter 3 (plates across and along a f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,9 +24,11 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from eslr_jax.errors import ConfigError
-from eslr_jax.numerics import Vector3, cross3, dot3, gather_corners, safe_normalize, sub3
+from eslr_jax.numerics import Vector3, as_partial, cross3, dot3, gather_corners, safe_normalize, sub3
+from eslr_jax.ranges import Range, check_range
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Elements, Term
+from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Garment
 
 _NUM_WAVES = 8  # of a gust, in each direction
@@ -45,6 +48,13 @@ class Air(Term):
     """Air that cloth moves through."""
 
     name = "air"
+    ranges = MappingProxyType(
+        {
+            "density": Range(0.0, 1e3, "kg/m^3"),  # up to water
+            "normal_drag": Range(0.0, 10.0),
+            "tangential_drag": Range(0.0, 10.0),
+        }
+    )
 
     # Velocity [m/s], shape [3]; or a function of points [m], shape [points, 3], and the time since the first
     # frame [s] to velocities, shape [points, 3] or [3], such as `gusts`.
@@ -53,6 +63,22 @@ class Air(Term):
     normal_drag: Float[Array, ""] | float = 1.17  # of a square plate across the flow (Hoerner 1965, 3-15)
     # Of a rough plate along the flow, both sides (Hoerner 1965, 2-6).
     tangential_drag: Float[Array, ""] | float = 0.02
+
+    def check(self) -> None:
+        """Check its constants and its wind (host)."""
+        super().check()
+        if callable(self.wind):
+            return
+        if check_range("wind", self.wind, Range(-100.0, 100.0, "m/s")).shape != (3,):
+            raise ConfigError(
+                f"wind = {self.wind!r} is no velocity; give three numbers in m/s, such as 3, 0, 0"
+            )
+
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Air:
+        """Return air whose wind is an array, or a function that a compiled program can take."""
+        if callable(self.wind):
+            return self.replace(wind=as_partial(self.wind))
+        return self.replace(wind=np.asarray(self.wind, np.float32))
 
     def prepare(self, problem: FrameProblem) -> AirFlow:
         """Return the air around the faces of the cloth."""

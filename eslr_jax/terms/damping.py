@@ -10,6 +10,7 @@ Source: Baraff and Witkin 1998, doi 10.1145/280814.280821, section 4.5, with for
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, gather_corners
+from eslr_jax.ranges import Range
 from eslr_jax.terms.bending import angle_energies, dihedral_angles
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.stretch import green_strains, strain_energies, stretch_diagonal
@@ -37,6 +39,7 @@ class Damping(Term):
 
     name = "damping"
     is_elastic = True
+    ranges = MappingProxyType({"time": Range(0.0, 1.0, "s")})
 
     time: Float[Array, ""] | float  # tau, by which stress runs ahead of strain [s]
 

@@ -2,55 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components, dot3, in_memory, sub3
+from eslr_jax.ranges import Range
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Term
+from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts
+
+
+class Rubbing(NamedTuple):
+    """What the cloth rubs against."""
+
+    contacts: Contacts
+    force: Float[Array, " vertices"]  # Coulomb's greatest friction force of every vertex [N]
 
 
 @struct.dataclass
 class Friction(Term):
-    """Friction with the body and with the ground."""
+    """Friction with what the terms before it say that the cloth touches: the body and the ground."""
 
     name = "friction"
     on = "vertices"
+    unless_needed = "nothing in reach to rub on"
+    ranges = MappingProxyType(
+        {"coefficient": Range(0.0, 10.0), "speed": Range(1e-6, 1.0, "m/s")}  # not zero: it divides
+    )
+
+    coefficient: Float[Array, ""] | float = 0.5  # (HOOD)
+    # [m/s] below which friction sticks: creep on a 20 degree slope stays under 1 mm/s at 0.5.
+    speed: Float[Array, ""] | float = 9e-4
+
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Friction | None:
+        """Return itself, or None where no term before it touches anything."""
+        return self if any(type(term).touched is not Term.touched for term in others) else None
+
+    def prepare(self, problem: FrameProblem) -> tuple[Rubbing, ...]:
+        """Return all that the cloth rubs against."""
+        touched = (term.touched(problem, data) for term, data in problem.parts)
+        return tuple(Rubbing(one[0], self.coefficient * one[1]) for one in touched if one is not None)
 
     def corner_energies(
-        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
+        self, corners: tuple[Vector3, ...], problem: FrameProblem, data: tuple[Rubbing, ...]
     ) -> Float[Array, " vertices"]:
         """Return the energy of every vertex [J]; see `friction_energies`."""
-        slip = _slip(problem)
-        energies = [
-            friction_energies(corners[0], problem.position, contacts, pressing, slip)
-            for contacts, pressing in _touching(problem)
-        ]
+        slip = self._slip(problem)
+        energies = [friction_energies(corners[0], problem.position, *rubbing, slip) for rubbing in data]
         return sum(energies, jnp.zeros_like(corners[0][0]))
 
-    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"] | float:
+    def diagonal(
+        self, x: Vector3, problem: FrameProblem, data: tuple[Rubbing, ...]
+    ) -> Float[Array, " vertices"] | float:
         """Return the curvature where the cloth sticks [N/m]; along two of three axes, with its force spread."""
-        return sum((pressing / (3.0 * _slip(problem)) for _, pressing in _touching(problem)), 0.0)
+        return sum((rubbing.force / (3.0 * self._slip(problem)) for rubbing in data), 0.0)
 
-
-def _slip(problem: FrameProblem) -> Float[Array, ""]:
-    """Return the distance in a frame below which friction acts like a spring [m]."""
-    return problem.constants.friction_speed * problem.timestep
-
-
-def _touching(problem: FrameProblem) -> Iterator[tuple[Contacts, Float[Array, " vertices"]]]:
-    """Return what the cloth rubs against, with the greatest friction force of every vertex [N]."""
-    for touched, contacts in (
-        (problem.body, None if problem.body is None else problem.body.nearest),
-        (problem.ground, None if problem.ground is None else problem.ground.contacts),
-    ):
-        if touched is not None and contacts is not None:
-            yield contacts, problem.constants.friction_coefficient * touched.friction_load
+    def _slip(self, problem: FrameProblem) -> Float[Array, ""]:
+        """Return the distance in a frame below which friction acts like a spring [m]."""
+        return self.speed * problem.timestep
 
 
 def friction_energies(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any
 
 from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.numerics import Vector3, components, in_memory
+from eslr_jax.ranges import Range
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Term
 
@@ -18,12 +20,15 @@ class Gravity(Term):
 
     name = "gravity"
     on = "vertices"
+    ranges = MappingProxyType({"acceleration": Range(1e-2, 100.0, "m/s^2")})  # residuals are in weights
+
+    acceleration: Float[Array, ""] | float = 9.81  # [m/s^2], along -y
 
     def corner_energies(
         self, corners: tuple[Vector3, ...], problem: FrameProblem, data: Any
     ) -> Float[Array, " vertices"]:
         """Return the energy of every vertex [J]; see `gravity_energies`."""
-        return gravity_energies(corners[0], problem.position, problem.masses, problem.constants.gravity)
+        return gravity_energies(corners[0], problem.position, problem.masses, self.acceleration)
 
 
 def gravity_energies(

@@ -8,44 +8,24 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from eslr_jax.contact.layer_edges import LayerPairs
-from eslr_jax.contact.self_contact import TipPairs
-from eslr_jax.contact.skin import SkinContacts
 from eslr_jax.numerics import safe_norm
+from eslr_jax.ranges import Range
 from eslr_jax.terms.term import Term
-from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
+from eslr_jax.types import BodySurface, Garment, Material
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
+STIFFNESS_RANGE = Range(0.0, 1e12, "J/m^5")  # of contact
+THICKNESS_RANGE = Range(0.0, 5e-2, "m")
+_GRAVITY = 9.81  # [m/s^2], of the unit of residuals where a scene has no gravity
 
 
 @struct.dataclass
-class BodyContact:
-    """Contact of the cloth's vertices with the body."""
+class MovingBody:
+    """The part of the body that cloth can reach, at both ends of a frame."""
 
-    nearest: Contacts
-    opposing: Contacts  # with the body part on the other side of the cloth
-    friction_load: Float[Array, " vertices"]  # normal force at t [N]
-    thickness: Float[Array, ""]  # distance kept [m], of `contact_thickness`
-    skin: SkinContacts | None = None  # None: skin may show between vertices
-    tips: TipPairs | None = None  # None: a tip may pass between vertices
-
-
-@struct.dataclass
-class GroundContact:
-    """Contact of the cloth's vertices with a level ground."""
-
-    contacts: Contacts  # the points of the ground under the vertices
-    friction_load: Float[Array, " vertices"]  # normal force at t [N]
-    thickness: Float[Array, ""] | float  # distance kept [m]
-
-
-@struct.dataclass
-class SelfContact:
-    """Contact between layers of the cloth."""
-
-    pairs: LayerPairs
-    thickness: Float[Array, " pairs"]  # distance kept [m], see `simulation.frame`
-    limit: Float[Array, ""]  # overlap beyond which the force grows no further [m]
+    surface: BodySurface
+    start: Float[Array, "surface_vertices 3"]  # at t [m]
+    end: Float[Array, "surface_vertices 3"]  # at t + 1 [m]
 
 
 class SecondOrder(NamedTuple):
@@ -61,15 +41,13 @@ class FrameProblem:
 
     garment: Garment
     material: Material
-    constants: PhysicsConstants
     timestep: Float[Array, ""]  # [s]
     position: Float[Array, "vertices 3"]  # at t [m]
     # Where inertia alone takes the cloth [m], see `simulation.frame`.
     inertial_guess: Float[Array, "vertices 3"]
     time: Float[Array, ""] | float = 0.0  # at t + 1, since the scene's first frame [s]
-    body: BodyContact | None = None
-    ground: GroundContact | None = None
-    layers: SelfContact | None = None
+    body: MovingBody | None = None
+    friction_load: Float[Array, " vertices"] | float = 0.0  # normal force on the body at t [N]
     pin_targets: Float[Array, "vertices 3"] | None = None  # positions of pinned vertices at t + 1 [m]
     bdf2: SecondOrder | None = None  # None: implicit Euler
     terms: tuple[Term, ...] = ()  # whose sum is the potential
@@ -86,6 +64,20 @@ class FrameProblem:
         return self.position if self.bdf2 is None else self.bdf2.origin
 
     @property
+    def parts(self) -> tuple[tuple[Term, Any], ...]:
+        """Its terms, each with what it has prepared."""
+        return tuple(zip(self.terms, self.data, strict=True))
+
+    def data_of(self, kind: type[Term]) -> Any:
+        """Return what the first term of a kind has prepared; None without one."""
+        return next((data for term, data in self.parts if isinstance(term, kind)), None)
+
+    @property
+    def gravity(self) -> Any:
+        """Acceleration of gravity [m/s^2]."""
+        return next((term.acceleration for term in self.terms if term.name == "gravity"), 0.0)  # type: ignore[attr-defined]
+
+    @property
     def masses(self) -> Float[Array, " vertices"]:
         """Lumped masses [kg], shape [vertices]; zero where padded."""
         return vertex_masses(self.garment, self.material)
@@ -98,7 +90,11 @@ def vertex_masses(garment: Garment, material: Material) -> Float[Array, " vertic
 
 def with_terms(problem: FrameProblem, terms: tuple[Term, ...]) -> FrameProblem:
     """Return a problem whose potential is the sum of some terms, each prepared for the frame."""
-    return problem.replace(terms=terms, data=tuple(term.prepare(problem) for term in terms))
+    problem = problem.replace(terms=(), data=())
+    for term in terms:
+        data = term.prepare(problem)
+        problem = problem.replace(terms=(*problem.terms, term), data=(*problem.data, data))
+    return problem
 
 
 def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> Float[Array, ""]:
@@ -117,7 +113,8 @@ def contact_thickness(garment: Garment, thickness: Float[Array, ""] | float) -> 
 
 def weight_norm(problem: FrameProblem) -> Float[Array, ""]:
     """Return the norm of the vertices' weights [N], the unit of residuals."""
-    return problem.constants.gravity * safe_norm(problem.masses)
+    is_weightless = all(term.name != "gravity" for term in problem.terms)
+    return (_GRAVITY if is_weightless else problem.gravity) * safe_norm(problem.masses)
 
 
 def pin(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:

@@ -10,15 +10,19 @@ the cloth (`TipPairs`); they don't give way.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.layer_edges import LayerPairs, layer_heights
-from eslr_jax.contact.self_contact import TipPairs
+from eslr_jax.contact.layer_edges import LayerPairs, layer_heights, with_edges
+from eslr_jax.contact.self_contact import TipPairs, default_rows, find_self_contacts, starting_rows
+from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import (
     Vector3,
     components,
@@ -30,62 +34,127 @@ from eslr_jax.numerics import (
     sub3,
     take3,
 )
-from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.terms.problem import STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem, contact_thickness
+from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term
+from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Garment
 
 Pairs = LayerPairs | TipPairs
+_HEADROOM = 1.25  # of a buffer made larger: later frames may need more
+# Sizes of buffers from one to twice as large: few, since each is compiled, and close, since every row costs time.
+_SIZES = 4
 _SWEEPS = 4  # of `push_apart`
+
+
+class LayerContact(NamedTuple):
+    """Contact between layers of the cloth during a frame."""
+
+    pairs: LayerPairs
+    stiffness: Float[Array, ""]  # [J/m^5]
+    thickness: Float[Array, " pairs"]  # distance kept [m]
+    limit: Float[Array, ""]  # overlap beyond which the force grows no further [m]
 
 
 @struct.dataclass
 class Repulsion(Term):
-    """Layers of cloth keep apart."""
+    """Layers of cloth keep apart.
+
+    A piece is a connected component of the mesh. "pieces" keeps different pieces apart that come close to each
+    other; "folds" also a garment of one piece off itself, if it can meet itself; "all" keeps all cloth apart.
+    """
 
     name = "repulsion"
+    unless_needed = "no layers that can meet"
+    ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
 
-    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
+    stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], as of the body
+    thickness: Float[Array, ""] | float = 3e-3  # [m] (ContourCraft)
+    where: Literal["pieces", "folds", "all"] = struct.field(pytree_node=False, default="pieces")
+    # Rows for pairs of a vertex and a face; None: to be planned. `simulate` enlarges them where they are too few.
+    num_rows: int | None = struct.field(pytree_node=False, default=None)
+    pieces: Int[Array, " vertices"] | None = None  # of every vertex, where only different ones keep apart
+
+    def check(self) -> None:
+        """Check its constants and choices (host)."""
+        super().check()
+        if self.where not in ("pieces", "folds", "all"):
+            raise ConfigError(f"repulsion where = {self.where!r}; give one of pieces, folds, all")
+        if self.num_rows is not None and self.num_rows < 1:
+            raise ConfigError(f"a buffer for {self.num_rows} pairs: give one row or more")
+
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Repulsion | None:
+        """Return repulsion with a small buffer, or None where no layers can meet.
+
+        The buffer starts small because `simulate` enlarges it. A pure `rollout` can't: give
+        it `num_rows`, or check the status of the trajectory.
+        """
+        is_one_piece, pieces = worn.num_pieces == 1, None
+        if self.where != "all":
+            if not (worn.meets_itself() if is_one_piece else worn.pieces_meet()):
+                return None
+            if is_one_piece and self.where == "pieces":
+                return None
+            pieces = None if is_one_piece else jnp.asarray(worn.pieces)
+        rows = starting_rows(len(worn.pieces), worn.num_pieces) if self.num_rows is None else self.num_rows
+        return self.replace(num_rows=rows, pieces=pieces)
+
+    def alike(self, worn: Worn, planned: Sequence[Any]) -> Repulsion:
+        """Return repulsion with the largest of the buffers; of different pieces only if all scenes have it so."""
+        has_pieces = all(one.pieces is not None for one in planned)
+        rows = max(one.num_rows or 0 for one in planned)
+        return self.replace(num_rows=rows, pieces=jnp.asarray(worn.pieces) if has_pieces else None)
+
+    def prepare(self, problem: FrameProblem) -> LayerContact:
+        """Return the pairs of a frame.
+
+        A vertex on the wrong side of a face is pushed back by one contact thickness a frame. Pushed back within
+        one frame, from centimetres deep, it tore the cloth: neighbouring pairs with opposite sides pulled with
+        thousands of times the weight.
+        """
+        cloth, garment = (problem.position, problem.inertial_guess), problem.garment
+        rows = default_rows(len(problem.position)) if self.num_rows is None else self.num_rows
+        pairs = with_edges(*cloth, find_self_contacts(*cloth, garment, rows, pieces=self.pieces), garment)
+        thickness = contact_thickness(garment, self.thickness)
+        height, _ = pair_heights(problem.position, pairs)
+        stiffness = self.stiffness * contact_excess(problem.material)
+        return LayerContact(pairs, stiffness, thickness + jnp.minimum(height, 0.0), limit=thickness)
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: LayerContact) -> tuple[Elements, ...]:
         """Return the energy of every pair [J]; see `repulsion_energies`."""
-        return (_elements(x, *_layers(problem)),)
+        return (Elements(repulsion_energies(x, *data), data.pairs.corners),)
 
-    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
+    def diagonal(self, x: Vector3, problem: FrameProblem, data: LayerContact) -> Float[Array, " vertices"]:
         """Return an estimate of the curvature [N/m]; see `repulsion_diagonal`."""
-        return repulsion_diagonal(x, *_layers(problem))
+        return repulsion_diagonal(x, *data)
+
+    def separate(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: LayerContact
+    ) -> Float[Array, "vertices 3"]:
+        """Return positions [m] with layers pushed apart."""
+        return push_apart(position, data.pairs, data.thickness)
+
+    def status(self, problem: FrameProblem, data: LayerContact) -> Int[Array, ""]:
+        """Return whether the buffer was too small."""
+        return data.pairs.status
+
+    def demand(self, data: LayerContact) -> Int[Array, ""]:
+        """Return the number of pairs found."""
+        return data.pairs.count
+
+    def enlarged(self, demand: int) -> Repulsion | None:
+        """Return repulsion with room for so many pairs and a quarter more; None where they have room.
+
+        Sizes are rounded up: each is compiled anew, and scenes of one shape share a few of them.
+        """
+        if self.num_rows is None or demand <= self.num_rows:
+            return None
+        steps = math.ceil(_SIZES * math.log2(_HEADROOM * demand / self.num_rows))
+        return self.replace(num_rows=round(self.num_rows * 2 ** (steps / _SIZES)))
 
     def describe(self, garment: Garment) -> str:
         """Return what touches what."""
         return "layers of cloth"
-
-
-def _layers(problem: FrameProblem) -> tuple[Pairs, Any, Any, Any]:
-    """Return the pairs of layers with stiffness, thickness and limit; a scene with their term has found them."""
-    layers: Any = problem.layers
-    return layers.pairs, problem.constants.repulsion_stiffness, layers.thickness, layers.limit
-
-
-@struct.dataclass
-class TipCollision(Term):
-    """Tips of the body that are finer than the cloth's mesh against its faces."""
-
-    name = "collision"
-
-    def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
-        """Return the energy of every tip [J]; see `repulsion_energies`."""
-        constants, tips = problem.constants, problem.body.tips  # type: ignore[union-attr]
-        return (_elements(x, tips, constants.collision_stiffness, constants.collision_thickness),)
-
-    def diagonal(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, " vertices"]:
-        """Return an estimate of the curvature [N/m]; see `repulsion_diagonal`."""
-        constants, tips = problem.constants, problem.body.tips  # type: ignore[union-attr]
-        return repulsion_diagonal(x, tips, constants.collision_stiffness, constants.collision_thickness)
-
-    def describe(self, garment: Garment) -> str:
-        """Return what touches what."""
-        return "faces off the body's tips"
-
-
-def _elements(x: Vector3, pairs: Pairs, *distances: Any) -> Elements:
-    return Elements(repulsion_energies(x, pairs, *distances), pairs.corners)
 
 
 def pair_heights(

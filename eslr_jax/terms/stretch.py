@@ -22,6 +22,8 @@ from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Term
 from eslr_jax.types import Garment, Material, Threads
 
+_STIFFEST = 85.2  # [N/m], of the fabrics that networks are trained on (HOOD's ranges)
+
 STIFFENING = 0.01  # strain beyond a thread's limit at which it is twice as stiff
 
 
@@ -177,3 +179,24 @@ def principal_stretches(
     # Equal stretches, as at rest, and a collapsed face are roots of zero, where a plain root has no slope.
     radius = safe_norm(jnp.stack([0.5 * (c00 - c11), c01], axis=-1))
     return safe_sqrt(mean + radius), safe_sqrt(mean - radius)
+
+
+def stretch_stiffness(material: Material) -> Float[Array, " *faces"]:
+    """Return the tension per width and strain of a fabric that is pulled along one axis [N/m].
+
+    It is E h = 4 mu h (mu + lambda) / (2 mu + lambda), of plane stress; of threads the stiffer one's.
+    """
+    if material.threads is not None:
+        return jnp.max(jnp.asarray(material.threads.stiffness)[:2], axis=0)
+    mu, lame_lambda = jnp.asarray(material.lame_mu), jnp.asarray(material.lame_lambda)
+    return 4.0 * jnp.asarray(material.thickness) * mu * (mu + lame_lambda) / (2.0 * mu + lame_lambda)
+
+
+def contact_excess(material: Material) -> Float[Array, ""]:
+    """Return how many times as stiff as HOOD's stiffest fabric a fabric is, at least once.
+
+    A sheet under tension presses on what it is bent over. The depth to which it sinks in shall depend on its
+    strain alone. So if the stiffest face of a fabric is stiffer than HOOD's ranges, contacts are stiffer by
+    that factor.
+    """
+    return jnp.maximum(jnp.max(stretch_stiffness(material)) / _STIFFEST, 1.0)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, gather_corners, segment_sum
+from eslr_jax.ranges import Range, check_number
 
 if TYPE_CHECKING:
     from eslr_jax.terms.problem import FrameProblem
-    from eslr_jax.types import Garment
+    from eslr_jax.terms.worn import Worn
+    from eslr_jax.types import Contacts, Garment, SceneBody
 
 
 class Elements(NamedTuple):
@@ -29,15 +33,88 @@ class Term:
     A subclass is a frozen pytree (`flax.struct.dataclass`). Its fields are its constants, which are traced, and
     its choices, which are static. It has `corner_energies` if its elements are the faces, hinges or vertices of
     the mesh, else `elements`. All else has a default. `scene.terms` holds the terms that a scene models:
-    potential, gradient, tangent, preconditioner, report and colours walk it.
+    potential, gradient, tangent, preconditioner, start, report and colours walk it.
     """
 
     name: ClassVar[str]  # in reports, colours and `Trajectory.energies`; terms of one name are added up
     on: ClassVar[Literal["faces", "hinges", "vertices"] | None] = None  # its elements; None: of its own
     is_elastic: ClassVar[bool] = False  # its curvature acts between neighbours, and not against a fixed place
+    reads_body: ClassVar[bool] = False  # it reads `FrameProblem.body`
+    unless_needed: ClassVar[str] = "not asked for"  # why a scene may lack it
+    ranges: ClassVar[Mapping[str, Range]] = MappingProxyType({})  # of its constants, each one number
+
+    def check(self) -> None:
+        """Check its constants (host).
+
+        Raises:
+            ConfigError: One is not finite or out of its range.
+        """
+        for field, accepted in self.ranges.items():
+            check_number(f"{self.name} {field}", getattr(self, field), accepted)
+
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Term | None:
+        """Return the term as a scene holds it, or None where the scene does not need it (host).
+
+        Args:
+            worn: The garment and the motion of the body that wears it.
+            others: Terms that stand before it, planned.
+        """
+        return self
+
+    def alike(self, worn: Worn, planned: Sequence[Any]) -> Term:
+        """Return the term for one scene of a batch, in the shape that all of them share (host).
+
+        Args:
+            worn: The garment and the motion of this scene.
+            planned: The term as those scenes of the batch hold it that need it.
+        """
+        return planned[0]
+
+    def start(
+        self, position: Float[Array, "vertices 3"], garment: Garment, body: SceneBody | None
+    ) -> Float[Array, "vertices 3"]:
+        """Return the positions of frame 0 [m], moved out of what the term forbids."""
+        return position
 
     def prepare(self, problem: FrameProblem) -> Any:
-        """Return what is computed once a frame, from its state; `data` of the other methods."""
+        """Return what is computed once a frame, from its state; `data` of the other methods.
+
+        `problem` holds the terms that stand before this one, with their data.
+        """
+        return None
+
+    def push_out(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
+    ) -> Float[Array, "vertices 3"]:
+        """Return positions at t + 1 [m] with vertices moved out of an obstacle: where a frame starts."""
+        return position
+
+    def separate(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
+    ) -> Float[Array, "vertices 3"] | None:
+        """Return positions at t + 1 [m] with elements moved apart, after `push_out`; None: nothing moves."""
+        return None
+
+    def touched(self, problem: FrameProblem, data: Any) -> tuple[Contacts, Float[Array, " vertices"]] | None:
+        """Return the points that vertices rub on, and the normal forces at t [N]; None: nothing rubs."""
+        return None
+
+    def load(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
+    ) -> Float[Array, " vertices"] | float:
+        """Return the normal force at t + 1 [N] that the next frame's `FrameProblem.friction_load` holds."""
+        return 0.0
+
+    def status(self, problem: FrameProblem, data: Any) -> Int[Array, ""]:
+        """Return bits of `errors.Status`: what went wrong in `prepare`."""
+        return jnp.int32(Status.OK)
+
+    def demand(self, data: Any) -> Int[Array, ""] | None:
+        """Return the rows that a frame asks its buffer for; None without a buffer."""
+        return None
+
+    def enlarged(self, demand: int) -> Term | None:
+        """Return the term with a buffer for so many rows; None where they have room (host)."""
         return None
 
     def corner_energies(

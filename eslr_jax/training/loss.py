@@ -81,7 +81,7 @@ def physics_loss(
         # HOOD's is in joules, and its gradient is clipped in these.
         scale = 1.0
         if config.energy_set == "consistent":
-            scale = _FALL * problem.constants.gravity * jnp.sum(problem.masses)
+            scale = _FALL * problem.gravity * jnp.sum(problem.masses)
         is_last = config.refinement_weights == "last"
         loss = (energies[-1] if is_last else jnp.mean(energies)) / scale
     last = jax.tree.map(lambda values: values[-1], terms)

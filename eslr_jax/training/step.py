@@ -15,16 +15,15 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int
 
 from eslr_jax.config import Criterion, TrainConfig
-from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import is_warming_up
 from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
 from eslr_jax.physics.potential import potential_terms
-from eslr_jax.scene.build import scene_terms
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.network import graph_inputs
 from eslr_jax.simulation.stepper import next_state
+from eslr_jax.terms import Collision, Ground, Repulsion, scene_terms
 from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
@@ -38,7 +37,7 @@ from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
-from eslr_jax.types import Normalizer, PhysicsConstants, Scene, SceneBody
+from eslr_jax.types import Normalizer, Scene, SceneBody
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
@@ -290,17 +289,16 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
     transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
     searched = SceneBody(data.surface, body.start[None, :0])
+    left_out = (Ground,) if config.self_contact else (Ground, Repulsion)
     scene = Scene(
         garment=garment,
         material=slot.material,
-        constants=PhysicsConstants(collision_stiffness=config.collision_stiffness),
         timestep=jnp.float32(1.0 / FPS),
         initial_state=slot.state,
         body=searched,
         pin_targets=None,
         num_frames=0,
-        self_contact=default_capacity(garment.vertex_mask.shape[0]) if config.self_contact else None,
-        terms=scene_terms(searched, has_ground=False, has_layers=config.self_contact),
+        terms=scene_terms(Collision(stiffness=config.collision_stiffness), without=left_out),
     )
     inputs = FrameInput(body, data.skinned(index, later, slot.shape))
     return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))

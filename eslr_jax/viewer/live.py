@@ -28,7 +28,6 @@ from eslr_jax.fit.outfit import wear_together
 from eslr_jax.io.garment import GarmentFile
 from eslr_jax.io.palette import byte_color
 from eslr_jax.scene.build import slice_tracks
-from eslr_jax.scene.plan import ground_height
 from eslr_jax.simulation.live import (
     MOST_ITERATIONS,
     Stage,
@@ -285,7 +284,7 @@ def _load(live: Live, choice: Choice) -> None:
         rig = load_body(choice.body, betas=choice.betas)
         poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
         spots, drawn_body = np.array(poses.positions).mean(axis=1), []
-        spots[:, 1] = float(ground_height(poses))
+        spots[:, 1] = float(np.min(np.asarray(poses.positions)[..., 1]))
         body = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
         standing = np.asarray(poses.positions[0]) - spots[0]
         if live.cast is None:  # there is something to see while the rest loads

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
-from eslr_jax.contact.self_contact import starting_capacity
+from eslr_jax.contact.self_contact import starting_rows
 from eslr_jax.geometry.prepare import prepare_garment
 from eslr_jax.geometry.surface import prepare_surface
 from eslr_jax.geometry.topology import face_cross_products
-from eslr_jax.physics.materials import COTTON, constants_for
-from eslr_jax.scene.build import initial_state, scene_terms
-from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, SceneBody
+from eslr_jax.physics.materials import COTTON
+from eslr_jax.scene.build import initial_state
+from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Repulsion, Stretch, Term
+from eslr_jax.types import Garment, Material, Scene, SceneBody
 
 FRAME = 1.0 / 30.0  # [s]
 Mesh = tuple[np.ndarray, np.ndarray]  # positions [vertices, 3] in metres, faces [faces, 3]
@@ -189,7 +190,8 @@ def make_scene(
     *,
     timestep: float = FRAME,
     material: Material = COTTON,
-    constants: PhysicsConstants | None = None,
+    gravity: float = Gravity.acceleration,
+    friction: float = Friction.coefficient,
     body: Mesh | None = None,
     body_positions: Float[np.ndarray, "frames body_vertices 3"] | None = None,
     pin_targets: Float[np.ndarray, "frames vertices 3"] | None = None,
@@ -199,30 +201,31 @@ def make_scene(
     """Put cloth, body and pins together; the cloth starts at rest.
 
     Without their tracks [m] the body, whose vertices all have faces, stands still, and pinned vertices stay
-    where they start. In frame 0 the body must not touch itself; `has_tips` says that it has tips finer
-    than the cloth's mesh.
+    where they start. In frame 0 the body must not touch itself; `has_tips` says that it has
+    tips finer than the cloth's mesh.
     """
     position = jnp.asarray(start, jnp.float32)
     obstacle = pins = None
+    terms: list[Term] = [Stretch(), Bending(), Inertia(), Gravity(gravity)]
     if body is not None:
+        terms += [Collision(has_tips=has_tips), Friction(friction)]
         track = body[0][None] if body_positions is None else body_positions
         obstacle = SceneBody(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
-            has_tips=has_tips,
         )
+    if self_contact:
+        terms.append(Repulsion(num_rows=starting_rows(len(start))))
     if np.any(garment.is_pinned):
         targets = np.asarray(start)[None] if pin_targets is None else pin_targets
         pins = jnp.asarray(np.broadcast_to(targets, (num_frames, *position.shape)), jnp.float32)
     return Scene(
         garment=garment,
         material=material,
-        constants=constants or constants_for(material),
         timestep=jnp.float32(timestep),
         initial_state=initial_state(position, jnp.zeros_like(position)),
         body=obstacle,
         pin_targets=pins,
-        terms=scene_terms(obstacle, has_ground=False, has_layers=self_contact),
+        terms=tuple(terms),
         num_frames=num_frames,
-        self_contact=starting_capacity(len(start)) if self_contact else None,
     )

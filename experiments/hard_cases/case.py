@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.scene.build import Integrator, start_integrator
+from eslr_jax.terms import Collision
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.colliders import Collider
 
@@ -40,9 +41,10 @@ class Simulator:
 
     def prepare(self, scene: Scene) -> Scene:
         """Return a case's scene with what this simulator models."""
-        body = scene.body and scene.body.replace(has_skin=self.has_skin)
         start = start_integrator(scene.initial_state, self.integrator)
-        return scene.replace(body=body, initial_state=start, substeps=self.substeps)
+        if (touching := scene.term(Collision)) is not None:
+            scene = scene.with_term(touching.replace(has_skin=self.has_skin))
+        return scene.replace(initial_state=start, substeps=self.substeps)
 
 
 @dataclasses.dataclass(frozen=True)

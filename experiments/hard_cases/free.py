@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.terms import Gravity
 from eslr_jax.types import Garment
 from hard_cases.build import FRAME, corners_of, hanging_sheet, make_cloth, make_scene, sheet, turn_about_x
 from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
@@ -51,7 +52,7 @@ def _measure_free_fall(runs: Runs) -> list[Measure]:
 
 def _own_parabola(run: Run) -> np.ndarray:
     """Return how far the integrator of a run falls by every frame [m]; BDF2 begins with a step of Euler's."""
-    gravity, count = float(run.scene.constants.gravity), len(run.positions)
+    gravity, count = float(run.scene.term(Gravity).acceleration), len(run.positions)
     steps = np.arange(count)
     if run.scene.initial_state.past is None:
         return gravity * FRAME**2 * steps * (steps + 1) / 2

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax import SceneOptions, load_body, load_garment, pose_body, prepare_garment, prepare_scene
+from eslr_jax import load_body, load_garment, pose_body, prepare_garment, prepare_scene
 from eslr_jax.body.motion import still_motion
 from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.geometry.surface import prepare_surface
@@ -66,7 +66,7 @@ def _build_turned(options: Mapping[str, Any]) -> Scenes:
     rig = load_body()
     garment = load_garment("tshirt", body=rig, **options)
     poses = pose_body(rig, still_motion(rig, 61, arm_angle=ARM_ABDUCTION))
-    scene = prepare_scene(garment, poses, options=SceneOptions(start_at_rest=True))
+    scene = prepare_scene(garment, poses, starts_at_rest=True)
     short = first_frames(scene, 31)
     turned = {label: CaseScene(_turned(short, matrix)) for label, matrix in _TURNS.items()}
     return {"0": CaseScene(scene), **turned}

@@ -15,11 +15,10 @@ from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_problem
-from eslr_jax.terms.bending import Bending, bending_energy
-from eslr_jax.terms.gravity import Gravity
-from eslr_jax.terms.inertia import Inertia
+from eslr_jax.terms import Bending, Gravity, Inertia, Stretch
+from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.problem import FrameProblem, pin, vertex_masses, with_terms
-from eslr_jax.terms.stretch import Stretch, principal_stretches, stretch_energy
+from eslr_jax.terms.stretch import principal_stretches, stretch_energy
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.case import Run
 from hard_cases.colliders import triangle_distances
@@ -94,7 +93,7 @@ def _masses(scene: Scene) -> Float[np.ndarray, " vertices"]:
 
 def weight(scene: Scene) -> float:
     """Return the cloth's weight [N]."""
-    return float(scene.constants.gravity) * float(_masses(scene).sum())
+    return float(scene.term(Gravity).acceleration) * float(_masses(scene).sum())
 
 
 def mechanical_energy(run: Run) -> Float[np.ndarray, " frames"]:
@@ -112,7 +111,7 @@ def _energy(scene: Scene, positions: Array, velocities: Array) -> Float[np.ndarr
     height = np.asarray(positions, np.float64)[..., 1] @ masses
     kinetic = 0.5 * np.sum(np.asarray(velocities, np.float64) ** 2, axis=-1) @ masses
     elastic = np.asarray(_elastic(positions, scene), np.float64)
-    return elastic + float(scene.constants.gravity) * height + kinetic
+    return elastic + float(scene.term(Gravity).acceleration) * height + kinetic
 
 
 @jax.jit
@@ -137,7 +136,6 @@ def settle(
     problem = FrameProblem(
         garment=scene.garment,
         material=scene.material,
-        constants=scene.constants,
         timestep=jnp.float32(_SETTLED),
         position=position,
         inertial_guess=position,

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.types import PhysicsConstants
 from hard_cases.build import Mesh, capsule, make_cloth, make_scene, plane, revolve, sheet
 from hard_cases.case import CaseScene, HardCase, Measure, Run, Runs, Scenes
 from hard_cases.colliders import Capsule, Plane, RoundedCone
@@ -85,8 +84,7 @@ def _build_slope(options: Mapping[str, Any]) -> Scenes:
     turn = np.array([[np.cos(tilt), -np.sin(tilt), 0], [np.sin(tilt), np.cos(tilt), 0], [0, 0, 1]])
     normal = turn @ np.array([0.0, 1.0, 0.0])
     start = mesh[0] @ turn.T + 3e-3 * normal
-    constants = PhysicsConstants(friction_coefficient=0.5)
-    scene = make_scene(garment, start, 1801, body=plane(0.6, 13, tilt), constants=constants)
+    scene = make_scene(garment, start, 1801, body=plane(0.6, 13, tilt))
     return {"rest": CaseScene(scene, lambda frame: (Plane(np.zeros(3), normal),))}
 
 

@@ -23,10 +23,11 @@ from harness import keep, machine, parser
 from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.build import build_scene, safe_plan
+from eslr_jax.scene.build import build_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.stepper import next_state
+from eslr_jax.terms import CLOTH, Collision, Friction
 from eslr_jax.types import Scene, tree_cast
 from inverse.sheet import RESULTS
 
@@ -42,7 +43,7 @@ Change = dict[str, jax.Array]
 def walk(garment: str, frames: int) -> Scene:
     """Return the scene that `rollout(None, garment, poses)` simulates."""
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=frames + 1)
-    return build_scene(load_garment(garment), poses, COTTON, safe_plan(poses))
+    return build_scene(load_garment(garment), poses, COTTON, (*CLOTH, Collision(), Friction()))
 
 
 def changed(scene: Scene, change: Change) -> Scene:

@@ -9,8 +9,9 @@ import numpy as np
 from hard_cases.build import make_cloth, same_way_faces
 
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state, scene_terms
-from eslr_jax.types import Garment, Material, PhysicsConstants, Scene
+from eslr_jax.scene.build import initial_state
+from eslr_jax.terms import CLOTH
+from eslr_jax.types import Garment, Material, Scene
 
 RESULTS = harness.RESULTS / "inverse"
 TIMESTEP = 1 / 30  # [s]
@@ -30,11 +31,10 @@ def held_scene(garment: Garment, shift: jax.Array, material: Material = COTTON) 
     return Scene(
         garment=jax.tree.map(jnp.asarray, garment),
         material=material,
-        constants=PhysicsConstants(),
         timestep=jnp.float32(TIMESTEP),
         initial_state=initial_state(rest, jnp.zeros_like(rest)),
         body=None,
         pin_targets=rest + shift,
-        terms=scene_terms(None, has_ground=False, has_layers=False),
+        terms=CLOTH,
         num_frames=shift.shape[0],
     )

@@ -20,11 +20,10 @@ from eslr_jax.geometry.weave import warp_directions
 from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.physics.materials import COTTON, Weave, stretch_stiffness
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms.air import Air
+from eslr_jax.terms import Air, Term
 from eslr_jax.terms.bending import bending_energy, dihedral_angles, plate_curvatures
 from eslr_jax.terms.stretch import stretch_energy
-from eslr_jax.terms.term import Term
-from eslr_jax.types import Garment, Material, PhysicsConstants, Scene, Trajectory
+from eslr_jax.types import Garment, Material, Scene, Trajectory
 from known_answers.sheets import cantilever_rigidity, grid, irregular, tube
 from known_answers.strip import LENGTH, kept_in, strip
 
@@ -117,8 +116,7 @@ def buckling(simulator: Simulator) -> list[Answer]:
     material = with_rigidity(garment, (RIGIDITY, RIGIDITY))
     start = positions * [1 - shortening, 1, 1]
     start[:, 1] += 0.02 * np.sin(np.pi * positions[:, 0] / length)
-    weightless = PhysicsConstants(gravity=1e-3)
-    scene = make_scene(garment, start, 121, timestep=0.1, material=material, constants=weightless)
+    scene = make_scene(garment, start, 121, timestep=0.1, material=material, gravity=1e-3)
     end = _simulate(simulator, scene.replace(terms=(*scene.terms, Brake(2.0)))).positions[-1]
 
     def elastic(position):
@@ -186,9 +184,8 @@ def slope(simulator: Simulator, angles: tuple[float, ...] = (25.0, 35.0, 45.0, 6
         along = np.array([np.cos(tilt), np.sin(tilt), 0.0])
         normal = np.array([-np.sin(tilt), np.cos(tilt), 0.0])
         start = np.outer(mesh[0][:, 0], along) + mesh[0] * [0, 0, 1] + 2.2e-3 * normal
-        constants = PhysicsConstants(friction_coefficient=friction)
         body, start = plane(8.0, 41, tilt), start + 0.8 * along
-        scene = make_scene(garment, start, 49, timestep=1 / 60, body=body, constants=constants)
+        scene = make_scene(garment, start, 49, timestep=1 / 60, body=body, friction=friction)
         path = np.asarray(_simulate(simulator, scene).positions).mean(axis=1) @ -along
         # From the second differences, which do not know when it began to slide.
         found = float(np.polyfit(np.arange(24) / 60, path[25:], 2)[0] * 2)
@@ -203,9 +200,7 @@ def sphere(simulator: Simulator) -> list[Answer]:
     count = 17
     mesh = sheet(count, count, (0.4, 0.4))
     garment, ball = make_cloth(mesh, {}), icosphere(3, 0.1)
-    scene = make_scene(
-        garment, mesh[0] + [0, 0.105, 0], 121, body=ball, constants=PhysicsConstants(friction_coefficient=0.1)
-    )
+    scene = make_scene(garment, mesh[0] + [0, 0.105, 0], 121, body=ball, friction=0.1)
     trajectory = _simulate(simulator, scene.replace(terms=(*scene.terms, Brake(2.0))))
     last, loads = np.asarray(trajectory.positions[-1]), np.asarray(trajectory.friction_loads[-1])
     upward = last[:, 1] / np.linalg.norm(last, axis=1)

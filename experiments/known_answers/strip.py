@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from hard_cases.build import make_cloth, make_scene, same_way_faces
 
-from eslr_jax import PhysicsConstants, SimConfig
+from eslr_jax import SimConfig
 from eslr_jax.scene.build import start_integrator
 from eslr_jax.simulation.rollout import rollout_scene
 
@@ -20,9 +20,7 @@ def strip(integrator="euler", *terms, frames, is_pinned, timestep=1 / 30, tilt=0
     x, along = (grid.ravel() for grid in np.meshgrid([0.0, 0.05], np.linspace(0, LENGTH, 11), indexing="ij"))
     mesh = np.stack([x, -along * np.cos(tilt), along * np.sin(tilt)], axis=1), same_way_faces(2, 11)
     garment = jax.tree.map(jnp.asarray, make_cloth(mesh, {}, is_pinned=along == 0 if is_pinned else None))
-    scene = make_scene(
-        garment, mesh[0], frames, timestep=timestep, constants=PhysicsConstants(gravity=gravity)
-    )
+    scene = make_scene(garment, mesh[0], frames, timestep=timestep, gravity=gravity)
     start = start_integrator(scene.initial_state, integrator)
     return scene.replace(initial_state=start, terms=(*scene.terms, *terms))
 

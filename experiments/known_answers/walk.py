@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax import SceneOptions, SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
 from eslr_jax.geometry.closest import closest_points
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
@@ -31,7 +31,7 @@ def run(garment: str, vertices: str, frames: int, *, iterations: int, steps: int
     """Return positions [m] and faces of a walk at 30 frames a second, each of so many steps of iterations."""
     cloth = load_garment(garment, vertices=vertices)
     poses = pose_body(load_body(), load_motion(CLIP), fps=FPS * steps, num_frames=(frames - 1) * steps + 1)
-    scene = prepare_scene(cloth, poses, options=SceneOptions(integrator=integrator))
+    scene = prepare_scene(cloth, poses, integrator=integrator)
     # Traced, so that all numbers of iterations share a program.
     trajectory = rollout_scene(None, scene, SimConfig(iterations=_FINEST), jnp.int32(iterations))
     raise_for_status(trajectory)

@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
+from eslr_jax.terms import Collision
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
 from paper.mat_space import (
@@ -109,8 +110,7 @@ class Mat:
     def apply(self, params: Network, problem: FrameProblem, state: ClothState, /) -> Any:
         """Return positions at t + 1 [m]."""
         assert params.space is not None
-        assert problem.body is not None
-        contacts = problem.body.nearest
+        contacts = problem.data_of(Collision).nearest
         turn = heading(state.position, params.space)
         step = problem.timestep * state.velocity
         seen = observe(state.position, step, contacts, params.space, turn)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from eslr_jax.assets.models import model_record
+from eslr_jax.body.lbs import skin_garment
 from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
 from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
@@ -20,7 +21,6 @@ from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.models.registry import count_parameters
-from eslr_jax.scene.build import skin_garment
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters

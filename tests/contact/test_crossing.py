@@ -8,10 +8,9 @@ from cloth import make_garment, make_sheet
 
 from eslr_jax.contact.crossing import sides_where_crossed
 from eslr_jax.contact.self_contact import find_self_contacts
-from eslr_jax.types import PairCapacity
 
 find = jax.jit(find_self_contacts, static_argnames="capacity")
-AMPLE = PairCapacity(pairs=4000)
+AMPLE = 4000
 SPACING = 0.012  # [m]
 CROSSING = 3.5 * SPACING  # from the fold to where the sides of a folded sheet cross [m]
 

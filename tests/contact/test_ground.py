@@ -12,35 +12,36 @@ from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.build import initial_state
-from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes
+from eslr_jax.scene.plan import prepare_scene, prepare_scenes
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import PhysicsConstants
+from eslr_jax.terms import CLOTH, Friction, Gravity, Ground, scene_terms
 
-ON = SceneOptions(ground="on", has_body=False)
+ON = (*CLOTH, Ground(is_always=True), Friction())
 FLOOR = -RADIUS  # [m], the lowest point of the ball
 FINE = 1 / 240  # [s]
 
 
 def resting_height(scene):
     """The height at which the barrier carries the weight: 3 k d^2 = density g, d below the thickness [m]."""
-    constants = scene.constants
-    load = float(scene.material.density) * constants.gravity / (3 * constants.collision_stiffness)
-    return FLOOR + constants.collision_thickness - np.sqrt(load)
+    ground, gravity = scene.term(Ground), scene.term(Gravity).acceleration
+    return (
+        FLOOR + ground.thickness - np.sqrt(float(scene.material.density) * gravity / (3 * ground.stiffness))
+    )
 
 
 def sliding(friction, speed=1.0, num_frames=61):
     """A sheet that lies on the ground and slides along x."""
-    constants = PhysicsConstants(friction_coefficient=friction)
-    scene = prepare_scene(square(), drifting_ball(num_frames), constants=constants, options=ON)
+    terms = (*CLOTH, Ground(is_always=True), Friction(friction))
+    scene = prepare_scene(square(), drifting_ball(num_frames), terms=terms)
     position = scene.initial_state.position.at[:, 1].set(resting_height(scene))
     velocity = jnp.zeros_like(position).at[:, 0].set(speed)
     return scene.replace(initial_state=initial_state(position, velocity), timestep=jnp.float32(FINE))
 
 
 def test_a_falling_sheet_rests_on_the_ground_at_contact_thickness():
-    scene = prepare_scene(square(), drifting_ball(41), options=ON)
-    assert float(scene.ground) == pytest.approx(FLOOR)
+    scene = prepare_scene(square(), drifting_ball(41), terms=ON)
+    assert float(scene.term(Ground).height) == pytest.approx(FLOOR)
     trajectory = rollout_scene(None, scene, SimConfig(iterations=60))
     heights = np.asarray(trajectory.positions)[..., 1]
     assert heights.min() > FLOOR
@@ -71,14 +72,17 @@ def test_newton_and_the_solver_find_the_same_minimum_on_the_ground():
 def test_a_ground_is_modelled_where_cloth_could_reach_it():
     poses, high = drifting_ball(), square()
     below = high.rest_positions.at[:, 1].add(-0.08)  # beside the ball, 6 cm above the ground
-    assert prepare_scene(high, poses).ground is None
-    assert prepare_scene(high.replace(rest_positions=below), poses).ground == pytest.approx(FLOOR)
-    off = SceneOptions(ground="off")
-    assert prepare_scene(high.replace(rest_positions=below), poses, options=off).ground is None
+
+    def ground(cloth, **options):
+        return prepare_scene(cloth, poses, **options).term(Ground)
+
+    assert ground(high) is None
+    assert ground(high.replace(rest_positions=below)).height == pytest.approx(FLOOR)
+    assert ground(high.replace(rest_positions=below), terms=scene_terms(without=(Ground,))) is None
     smaller = below.at[:, [0, 2]].multiply(0.3)  # within 2 cm of the ball: it reaches no ground, but may fall
     cloth = high.replace(rest_positions=smaller)
-    assert prepare_scene(cloth, poses).ground is not None
-    assert prepare_scene(cloth.replace(is_pinned=jnp.ones(64, bool)), poses).ground is None
+    assert ground(cloth) is not None
+    assert ground(cloth.replace(is_pinned=jnp.ones(64, bool))) is None
 
 
 def test_scenes_of_a_batch_share_the_ground():
@@ -86,9 +90,4 @@ def test_scenes_of_a_batch_share_the_ground():
     high = square()
     low = high.replace(rest_positions=high.rest_positions.at[:, 1].add(-0.08))
     scenes = prepare_scenes([high, low], poses, [COTTON] * 2)
-    assert [float(scene.ground) for scene in scenes] == pytest.approx([FLOOR, FLOOR])
-
-
-def test_no_ground_is_compiled_where_there_is_none():
-    scene = prepare_scene(square(), drifting_ball(), options=SceneOptions(ground="off"))
-    assert jax.eval_shape(first_problem, scene).ground is None
+    assert [float(scene.term(Ground).height) for scene in scenes] == pytest.approx([FLOOR, FLOOR])

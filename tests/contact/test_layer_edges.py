@@ -9,7 +9,7 @@ from cloth import make_garment
 from eslr_jax.contact.layer_edges import with_edges
 from eslr_jax.contact.self_contact import find_self_contacts
 from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energies
-from eslr_jax.types import PairCapacity, tree_cast
+from eslr_jax.types import tree_cast
 
 HALF = 0.03  # [m] of a ridge along x, and of a valley along z over it
 RIDGE = np.array([[-HALF, 0, 0], [HALF, 0, 0], [0, -0.012, HALF], [0, -0.012, -HALF]])
@@ -22,7 +22,7 @@ def energy(position, edges, thickness):
     return repulsion_energies(position, edges, STIFFNESS, thickness).sum()
 
 
-SIXTEEN = PairCapacity(pairs=16)
+SIXTEEN = 16
 
 
 def layers(height):

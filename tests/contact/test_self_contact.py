@@ -13,11 +13,11 @@ from eslr_jax.errors import Status
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energies
-from eslr_jax.types import PairCapacity, tree_cast
+from eslr_jax.types import tree_cast
 
 NEAR, RADIUS, COSINE = 0.02, 0.04, 0.8
 STIFFNESS, THICKNESS = 3.5e7, 3e-3
-AMPLE = PairCapacity(pairs=8000)
+AMPLE = 8000
 find_self_contacts = jax.jit(self_contact.find_self_contacts, static_argnames="capacity")
 repulsion = jax.jit(jax.value_and_grad(lambda *given: repulsion_energies(*given).sum()))
 push = jax.jit(push_apart)
@@ -182,10 +182,10 @@ def test_flat_cloth_has_no_pairs(cloth):
 
 def test_too_small_a_capacity_sets_the_bit_and_says_what_is_needed(cloth):
     position = jnp.asarray(roll_up(cloth), jnp.float32)
-    contacts = find_self_contacts(position, position, cloth, PairCapacity(50))
+    contacts = find_self_contacts(position, position, cloth, 50)
     assert int(contacts.status) == Status.SELF_CONTACT_OVERFLOW
-    needed = PairCapacity(int(contacts.count))
-    assert needed.pairs > 50
+    needed = int(contacts.count)
+    assert needed > 50
     assert int(find_self_contacts(position, position, cloth, needed).status) == Status.OK
 
 

@@ -13,9 +13,10 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.geometry.prepare import to_device
 from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import Collision, scene_terms
 from eslr_jax.terms.collision import skin_diagonal, skin_energies
 
 STIFFNESS, THICKNESS = 3.5e7, 2e-3  # [J/m^5], [m]
@@ -25,8 +26,8 @@ def scene_of(*, has_skin, num_frames):
     """A coarse square over a ball of 2 cm radius that fits between four of its vertices, 5 cm apart."""
     positions, faces = ball(15, 24)
     small = positions * 0.2 + np.array([0.0, 0.8 * RADIUS, 0.0]), faces
-    options = SceneOptions(has_skin=has_skin)
-    return prepare_scene(square(side=6), drifting_ball(num_frames, speed=0.0, mesh=small), options=options)
+    options = {"terms": scene_terms(Collision(has_skin=has_skin))}
+    return prepare_scene(square(side=6), drifting_ball(num_frames, speed=0.0, mesh=small), **options)
 
 
 @pytest.mark.parametrize(("room", "is_skin"), [(0.003, False), (0.03, True)])
@@ -36,11 +37,11 @@ def test_cloth_that_limbs_pinch_has_no_rows_of_skin(room, is_skin):
     upper = positions + np.array([0.0, 2 * RADIUS + room, 0.0])
     both = np.concatenate([positions, upper]), np.concatenate([faces, faces + len(positions)])
     scene = prepare_scene(
-        square(side=9), drifting_ball(2, speed=0.0, mesh=both), options=SceneOptions(has_skin=True)
+        square(side=9), drifting_ball(2, speed=0.0, mesh=both), terms=scene_terms(Collision(has_skin=True))
     )
     between = scene.garment.rest_positions.at[:, 1].set(RADIUS + room / 2)
     scene = scene.replace(initial_state=scene.initial_state.replace(position=between))
-    skin = first_problem(scene).body.skin
+    skin = first_problem(scene).data_of(Collision).skin
     middle = 4 * 9 + 4
     rows = jnp.any((skin.corners == middle) & (skin.weights > 0.2), axis=1)
     assert bool(jnp.any(rows & skin.is_near)) == is_skin
@@ -145,8 +146,8 @@ def test_padding_changes_no_row_of_skin():
     assert padded.vertex_mask.shape[0] > 81
     rows = []
     for one in (garment, padded):
-        scene = prepare_scene(one, poses, options=SceneOptions(has_skin=True))
-        rows.append(first_problem(scene).body.skin)
+        scene = prepare_scene(one, poses, terms=scene_terms(Collision(has_skin=True)))
+        rows.append(first_problem(scene).data_of(Collision).skin)
     assert bool(rows[0].is_near.any())
     np.testing.assert_array_equal(rows[0].is_near, rows[1].is_near)
     is_near = np.asarray(rows[0].is_near)

@@ -17,10 +17,11 @@ from eslr_jax.evaluation.controls import Control, control_garment, control_param
 from eslr_jax.evaluation.gap import stepped_potentials, trajectory_gap
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
 from eslr_jax.models.registry import MODELS, init_model
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import CLOTH
 
 SIZES = {"message_passing_steps": 1, "latent_size": 8, "attention_size": 4, "attention_features": 8}
 CONFIG = dataclasses.replace(
@@ -41,8 +42,8 @@ def trained():
 
 @pytest.fixture(scope="module")
 def scene():
-    options = SceneOptions(has_body=False, start_at_rest=True)
-    return prepare_scene(square(6), drifting_ball(4), options=options)
+    options = {"terms": CLOTH, "starts_at_rest": True}
+    return prepare_scene(square(6), drifting_ball(4), **options)
 
 
 @pytest.fixture(scope="module")

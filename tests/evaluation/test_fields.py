@@ -24,10 +24,10 @@ from eslr_jax.physics.potential import potential, potential_terms
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.scene.archive import save_scene
 from eslr_jax.scene.build import initial_state
-from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
+from eslr_jax.scene.plan import first_frames, prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.types import PhysicsConstants
+from eslr_jax.terms import CLOTH, Collision, Gravity, Repulsion, scene_terms
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_stretch_of_uniform_stretch(runs):
 @pytest.fixture(scope="module", params=[False, True], ids=["vertices", "skin"])
 def problem(request):
     """The last frame of a square that falls over a ball."""
-    scene = prepare_scene(square(), drifting_ball(4), options=SceneOptions(has_skin=request.param))
+    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Collision(has_skin=request.param)))
     states, inputs = trajectory_states(rollout_scene(None, scene, SimConfig(iterations=15)), scene)
     state, inputs = jax.tree.map(lambda leaf: leaf[-1], (states, inputs))
     return frame_problem(scene, state, inputs)
@@ -91,8 +91,8 @@ def test_repulsion_counts_where_layers_meet():
         skin_indices=np.zeros((72, 1), int),
         allow_components=True,
     )
-    options = SceneOptions(has_body=False, start_at_rest=True, self_contact=True)
-    scene = prepare_scene(garment, drifting_ball(2), options=options)
+    options = {"terms": (*CLOTH, Repulsion(where="all")), "starts_at_rest": True}
+    scene = prepare_scene(garment, drifting_ball(2), **options)
     still = jnp.asarray(garment.rest_positions)
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     problem = frame_problem(scene, initial_state(still, jnp.zeros_like(still)), inputs)
@@ -104,10 +104,8 @@ def test_repulsion_counts_where_layers_meet():
 
 def test_a_run_with_an_energy_of_ones_own_is_scored_from_its_files(tmp_path, small_garment, small_poses):
     """Its term is found where its module is imported."""
-    options = SceneOptions(terms=(Push(2.0),), integrator="bdf2")
-    scene = prepare_scene(
-        small_garment, small_poses, constants=PhysicsConstants(gravity=1.62), options=options
-    )
+    terms = scene_terms(Gravity(1.62), Push(2.0))
+    scene = prepare_scene(small_garment, small_poses, terms=terms, integrator="bdf2")
     whole = rollout_scene(None, scene, SimConfig(iterations=60))
     weights = np.ones((scene.garment.vertex_mask.size, 1))
     stored = GarmentFile(

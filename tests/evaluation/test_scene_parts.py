@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import pytest
 
 from eslr_jax.evaluation.scene_parts import describe_scene, take_turns, time_parts
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
-from eslr_jax.terms.air import Air
+from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.terms import CLOTH, Air, Damping, Repulsion
 from eslr_jax.types import Threads
 
 
@@ -18,14 +18,12 @@ def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene,
         "pins", "ground", "air", "damping", "repulsion", "fabric by part", "network",
     }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
-    options = SceneOptions(has_body=False, self_contact=True, air=Air((3.0, 0.0, 4.0)), damping=0.01)
-    bare = describe_scene(
-        prepare_scene(small_garment, small_poses, options=options), small_poses, small_config
-    )
+    options = {"terms": (*CLOTH, Repulsion(where="all"), Air((3.0, 0.0, 4.0)), Damping(0.01))}
+    bare = describe_scene(prepare_scene(small_garment, small_poses, **options), small_poses, small_config)
     assert bare.left_out["collision"] == "no body and no ground in reach"
     assert bare.modelled["repulsion"] == "layers of cloth"
     assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
-    scene = prepare_scene(small_garment, small_poses, options=SceneOptions(integrator="bdf2", substeps=2))
+    scene = prepare_scene(small_garment, small_poses, integrator="bdf2", substeps=2)
     threads = Threads(warp=jnp.ones((100, 2)), stiffness=jnp.ones((4, 100)))
     woven = scene.replace(material=scene.material.replace(threads=threads))
     parts = describe_scene(woven, small_poses, small_config)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax import SceneOptions, SimConfig, prepare_scene, score_trajectory, simulate
+from eslr_jax import SimConfig, prepare_scene, score_trajectory, simulate
 from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError, MotionError, NonFiniteError
 from eslr_jax.evaluation.evaluate import EvaluationOptions, evaluate
@@ -13,17 +13,17 @@ from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.models.registry import init_model
+from eslr_jax.terms import Repulsion, scene_terms
 from eslr_jax.terms.air import blowing
-from eslr_jax.types import PairCapacity
 
 FRAMES = 7
-GUSTY = SceneOptions(air=blowing((3.0, 0.0, 0.0), 1.0))  # blows otherwise in every frame
+GUSTY = {"terms": scene_terms(blowing((3.0, 0.0, 0.0), 1.0))}  # blows otherwise in every frame
 
 
 @pytest.fixture(scope="module", params=["euler", "bdf2", "gusts"])
 def task(request):
-    options = SceneOptions(integrator=request.param) if request.param != "gusts" else GUSTY
-    scene = prepare_scene(square(), drifting_ball(FRAMES), options=options)
+    options = {"integrator": request.param} if request.param != "gusts" else GUSTY
+    scene = prepare_scene(square(), drifting_ball(FRAMES), **options)
     return scene, simulate(None, scene, config=SimConfig(iterations=60)).trajectory
 
 
@@ -65,7 +65,7 @@ def test_a_worse_trajectory_scores_worse(task):
 @pytest.mark.slow
 def test_pairs_of_triangles_are_counted():
     pytest.importorskip("ipctk")
-    scene = prepare_scene(square(), drifting_ball(3, speed=0.0), options=SceneOptions(start_at_rest=True))
+    scene = prepare_scene(square(), drifting_ball(3, speed=0.0), starts_at_rest=True)
     still = np.repeat(np.asarray(scene.initial_state.position)[None], 3, axis=0)
     score = score_trajectory(still, scene)
     assert score["intersections_cloth"] == score["intersections_body"] == 0
@@ -99,7 +99,7 @@ def test_a_trajectory_is_plain_arrays_by_name(tmp_path, small_trajectory):
     np.testing.assert_array_equal(arrays["stretch_energy"], small_trajectory.energies["stretch"])
     np.testing.assert_array_equal(arrays["positions"], small_trajectory.positions)
     assert "terms" not in arrays
-    assert "pair_demand" not in arrays  # no self-contact
+    assert "repulsion_demand" not in arrays  # no self-contact
     np.savez(tmp_path / "a.npz", **arrays)
 
 
@@ -137,14 +137,15 @@ def test_an_evaluation_without_the_gap_has_the_rollouts():
 
 def test_a_scene_whose_buffers_are_too_small_is_scored_with_larger_ones():
     """`prepare_scene` begins with a small buffer, which `simulate` enlarges in a scene of its own."""
-    scene = prepare_scene(square(), drifting_ball(4), options=SceneOptions(self_contact=True))
+    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Repulsion(where="all")))
     low = np.asarray(scene.initial_state.position)
     folded = low.copy()
     folded[:, 0] = np.where(low[:, 0] > 0, -low[:, 0], low[:, 0])  # one half lies 6 mm over the other
     folded[:, 1] += np.where(low[:, 0] > 0, 6e-3, 0.0)
     positions = np.repeat(folded[None], 4, axis=0)
-    little = scene.replace(self_contact=PairCapacity(pairs=2))
+    little = scene.with_term(scene.term(Repulsion).replace(num_rows=2))
     told = with_energies(foreign_trajectory(positions, little), little)
-    assert int(np.max(told.pair_demand)) > 2
-    expected = score_trajectory(positions, scene.replace(self_contact=PairCapacity(pairs=256)), every=1)
+    assert int(np.max(told.demands["repulsion"])) > 2
+    ample = scene.with_term(scene.term(Repulsion).replace(num_rows=256))
+    expected = score_trajectory(positions, ample, every=1)
     assert score_trajectory(positions, little, every=1)["total"] == expected["total"]

@@ -9,15 +9,15 @@ from cloth import make_sheet
 from draped_ball import RADIUS, ball, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 
+from eslr_jax.body.lbs import skin_garment
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.evaluation.referee import judge
 from eslr_jax.evaluation.report import start_crossing, trajectory_report
 from eslr_jax.evaluation.wear import wear_report
 from eslr_jax.evaluation.words import describe_report, describe_start
-from eslr_jax.scene.build import skin_garment
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import Repulsion
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def rolled(flat):
 
 def test_cloth_through_cloth_is_told_where_it_is_modelled(worn):
     garment, poses, scene, trajectory, skinned = worn
-    layered = scene.replace(self_contact=default_capacity(len(skinned[0])))
+    layered = scene.replace(terms=(*scene.terms, Repulsion()))
     crossed = skinned.copy()
     crossed[2] = rolled(skinned[0] - skinned[0].mean(axis=0))
     report = report_of((garment, poses, layered, trajectory, skinned), crossed)

@@ -12,7 +12,7 @@ from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.build import initial_state
 from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
 from eslr_jax.terms.problem import vertex_masses
-from eslr_jax.types import PhysicsConstants, Scene, SceneBody
+from eslr_jax.types import Scene, SceneBody
 
 TIMESTEP = 1 / 30
 FRAMES = 4
@@ -46,7 +46,6 @@ def worn():
     scene = Scene(
         garment=jax.tree.map(jnp.asarray, garment),
         material=COTTON,
-        constants=PhysicsConstants(),
         timestep=jnp.float32(TIMESTEP),
         initial_state=initial_state(positions[0], jnp.zeros_like(positions[0])),
         body=SceneBody(surface, body),

@@ -22,6 +22,7 @@ from newton_cloth import (
 from eslr_jax.config import SimConfig
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import Collision
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.collision import contact_forces
 from eslr_jax.terms.problem import contact_thickness
@@ -108,14 +109,14 @@ def test_xpbd_needs_more_substeps_on_finer_cloth():
 
 def test_contact_spring_pushes_as_our_cubic_does_through_the_whole_distance():
     scene = drop_scene({}, columns=9, seconds=0.1).scene
-    radius = float(contact_thickness(scene.garment, scene.constants.collision_thickness))
+    radius = float(contact_thickness(scene.garment, scene.term(Collision).thickness))
     inside = jnp.zeros_like(scene.initial_state.position)
     up = jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), inside.shape)
     near = jnp.ones(len(inside), bool)
     contacts = Contacts(
         inside, inside, up, up, jnp.zeros(len(inside)), near, jnp.zeros(len(inside), jnp.int32)
     )
-    forces = contact_forces(inside, contacts, scene.garment, scene.constants.collision_stiffness, radius)
+    forces = contact_forces(inside, contacts, scene.garment, scene.term(Collision).stiffness, radius)
     count = np.sum(np.asarray(scene.garment.vertex_mask))
     assert contact_stiffness(scene) * radius == pytest.approx(float(forces.sum()) / count, rel=1e-4)
 

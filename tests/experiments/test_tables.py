@@ -164,7 +164,7 @@ def broken_rollouts(monkeypatch):
             return iter((self.garment, self.scene, None))
 
     rows = [(Row(**vars(worn)), None) for _ in states]
-    found = iter(SimpleNamespace(status=int(bits), first_bad_frame=3, pair_demand=None) for bits in states)
+    found = iter(SimpleNamespace(status=int(bits), first_bad_frame=3, demands={}) for bits in states)
     monkeypatch.setattr(rollouts, "scenes_of", lambda *_: rows)
     monkeypatch.setattr(rollouts, "rollout_scene", lambda *_: next(found))
     monkeypatch.setattr(rollouts, "trajectory_gap", lambda *_, **__: gap)

@@ -12,14 +12,11 @@ from cloth import make_garment, make_sheet
 from eslr_jax.geometry import topology
 from eslr_jax.geometry.padding import pad_garment
 from eslr_jax.geometry.prepare import to_device
-from eslr_jax.terms.bending import Bending
-from eslr_jax.terms.collision import Collision
-from eslr_jax.terms.friction import Friction
-from eslr_jax.terms.gravity import Gravity
-from eslr_jax.terms.inertia import Inertia
-from eslr_jax.terms.problem import BodyContact, FrameProblem, with_terms
-from eslr_jax.terms.stretch import Stretch
-from eslr_jax.types import Contacts, Garment, Material, PhysicsConstants
+from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Stretch
+from eslr_jax.terms.collision import BodyContact
+from eslr_jax.terms.friction import Rubbing
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.types import Contacts, Garment, Material
 
 TIMESTEP = 1 / 30
 BODY_MOTION = np.array([0.003, 0.002, -0.001])  # [m] in the frame
@@ -99,19 +96,20 @@ def make_case(*, seed=0, dtype=np.float64, is_pinned=None) -> Case:
     problem = FrameProblem(
         garment=garment,
         material=material,
-        constants=PhysicsConstants(),
         timestep=np.float64(TIMESTEP),
         position=start,
         inertial_guess=start + noise(0.002, 3),
-        body=BodyContact(
-            nearest=below,
-            opposing=above,
-            friction_load=np.abs(noise(1e-3)),
-            thickness=np.float64(5e-3),  # as wide as the gap is narrow, so that both sides press
-        ),
+        friction_load=np.abs(noise(1e-3)),
         pin_targets=None if is_pinned is None else start + 0.01,
     )
-    problem = with_terms(problem, (Stretch(), Bending(), Inertia(), Gravity(), Collision(), Friction()))
+    # As wide as the gap is narrow, so that both sides press.
+    touching = BodyContact(below, above, thickness=np.float64(5e-3), stiffness=np.float64(3.5e7))
+    friction = Friction()
+    rubbing = (Rubbing(below, friction.coefficient * problem.friction_load),)
+    problem = problem.replace(
+        terms=(Stretch(), Bending(), Inertia(), Gravity(), Collision(), friction),
+        data=(None, None, None, None, touching, rubbing),
+    )
     return to_numpy(Case(problem, start + BODY_MOTION + noise(0.001, 3)), dtype)
 
 
@@ -127,7 +125,8 @@ def pad_case(case: Case) -> Case:
     def elements(leaf, like):
         return np.pad(leaf, (0, len(like) - len(leaf)), mode="edge")
 
-    body, material = problem.body, problem.material
+    material = problem.material
+    *plain, body, (rubbing,) = problem.data
     padded = problem.replace(
         garment=to_device(garment),
         material=Material(
@@ -139,10 +138,13 @@ def pad_case(case: Case) -> Case:
         ),
         position=vertices(problem.position),
         inertial_guess=vertices(problem.inertial_guess),
-        body=body.replace(
-            nearest=jax.tree.map(vertices, body.nearest),
-            opposing=jax.tree.map(vertices, body.opposing),
-            friction_load=np.pad(body.friction_load, (0, rows)),
+        friction_load=np.pad(problem.friction_load, (0, rows)),
+        data=(
+            *plain,
+            body._replace(
+                nearest=jax.tree.map(vertices, body.nearest), opposing=jax.tree.map(vertices, body.opposing)
+            ),
+            (Rubbing(jax.tree.map(vertices, rubbing.contacts), np.pad(rubbing.force, (0, rows))),),
         ),
     )
     return Case(padded, vertices(case.position))

@@ -14,11 +14,11 @@ from scipy.optimize import brentq
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.validate import validate_air
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms.air import Air, blowing, gusts
+from eslr_jax.terms import Air, scene_terms
+from eslr_jax.terms.air import blowing, gusts
 
 GRAVITY = 9.81  # [m/s^2]
 WEIGHT = float(COTTON.density) * GRAVITY  # [N/m^2]
@@ -68,12 +68,13 @@ def test_a_function_blows_where_and_when_it_is_asked():
 
 def test_a_plain_function_is_a_wind():
     scene = prepare_scene(
-        square(3, 0.1), drifting_ball(2), options=SceneOptions(air=Air(lambda points, time: 2.0 * points))
+        square(3, 0.1), drifting_ball(2), terms=scene_terms(Air(lambda points, time: 2.0 * points))
     )
     air = scene.terms[-1]
     assert len(jax.tree.leaves(air)) == 3, "its numbers"
     np.testing.assert_array_equal(air.wind(jnp.ones((1, 3)), 0.0), 2.0)
-    gusty = validate_air(blowing((3.0, 0.0, 0.0), 0.3))
+    gusty = blowing((3.0, 0.0, 0.0), 0.3)
+    gusty.check()
     assert len(jax.tree.leaves(gusty)) > 3, "mean, strength and phases of gusts are traced"
 
 
@@ -82,4 +83,4 @@ def test_a_plain_function_is_a_wind():
 )
 def test_an_impossible_wind_is_refused(wind, gust):
     with pytest.raises(ConfigError, match="wind"):
-        validate_air(blowing(wind, gust))
+        blowing(wind, gust).check()

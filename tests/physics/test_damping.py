@@ -8,9 +8,8 @@ from scipy.signal import find_peaks
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.physics.validate import validate_damping
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms.damping import Damping
+from eslr_jax.terms import Damping
 
 
 def test_a_stretched_strip_loses_the_share_per_period_that_theory_says():
@@ -43,4 +42,4 @@ def test_a_stretched_strip_loses_the_share_per_period_that_theory_says():
 @pytest.mark.parametrize("damping", [-1e-3, np.inf, 2.0, "thick"])
 def test_an_impossible_damping_is_refused(damping):
     with pytest.raises(ConfigError, match="damping"):
-        validate_damping(damping)
+        Damping(damping).check()

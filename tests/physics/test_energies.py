@@ -11,12 +11,14 @@ from cloth import make_garment, make_sheet
 from draped_ball import drifting_ball
 from physics_cases import make_case, pad_case, to_numpy
 
+from eslr_jax.errors import ConfigError
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import contact_load, potential, potential_terms
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
+from eslr_jax.terms import CLOTH, Collision, Friction, Gravity
 from eslr_jax.terms.bending import bending_energy, dihedral_angles
-from eslr_jax.terms.problem import weight_norm
+from eslr_jax.terms.problem import weight_norm, with_terms
 from eslr_jax.terms.stretch import principal_stretches, stretch_diagonal, stretch_energy
 
 TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction")  # the oracle's order
@@ -46,7 +48,7 @@ def oracle_terms(case, position=None):
     """The six energies by plain NumPy."""
     case = to_numpy(case)
     problem = case.problem
-    garment, material, constants, body = problem.garment, problem.material, problem.constants, problem.body
+    garment, material, body = problem.garment, problem.material, problem.data_of(Collision)
     position = case.position if position is None else position
     rest, faces = garment.rest_positions, garment.faces
     mass = reference.masses(rest, faces, material.density)
@@ -59,7 +61,7 @@ def oracle_terms(case, position=None):
             ),
             reference.bending(position, rest, faces, material.bending_stiffness),
             reference.inertia(position, problem.inertial_guess, mass, problem.timestep),
-            reference.gravity(position, problem.position, mass, constants.gravity),
+            reference.gravity(position, problem.position, mass, Gravity().acceleration),
             sum(
                 reference.collision(
                     position,
@@ -67,7 +69,7 @@ def oracle_terms(case, position=None):
                     side.next_normals,
                     side.is_near,
                     area,
-                    constants.collision_stiffness,
+                    body.stiffness,
                     body.thickness,
                 )
                 for side in (body.nearest, body.opposing)
@@ -78,9 +80,9 @@ def oracle_terms(case, position=None):
                 below.points,
                 below.next_points,
                 below.next_normals,
-                body.friction_load,
-                constants.friction_coefficient,
-                constants.friction_speed * problem.timestep,
+                problem.friction_load,
+                Friction().coefficient,
+                Friction().speed * problem.timestep,
             ),
         ]
     )
@@ -88,7 +90,7 @@ def oracle_terms(case, position=None):
 
 def test_the_frame_presses_on_both_sides(case64):
     """What the oracle of collision is compared on: vertices that touch one body, the other, and both."""
-    body = case64.problem.body
+    body = case64.problem.data_of(Collision)
     touched = [
         side.is_near & (np.sum((case64.position - side.next_points) * side.next_normals, axis=1) < 5e-3)
         for side in (body.nearest, body.opposing)
@@ -237,7 +239,7 @@ def test_point_forces_have_the_closed_form(case64):
     np.testing.assert_allclose(inertia, masses[:, None] * offset / problem.timestep**2, rtol=1e-10)
     np.testing.assert_allclose(gravity, 9.81 * masses[:, None] * [[0.0, 1.0, 0.0]], rtol=1e-10)
     np.testing.assert_allclose(np.linalg.norm(gravity), weight, rtol=1e-10)
-    body, forces = problem.body, []
+    body, forces = problem.data_of(Collision), []
     for side in (body.nearest, body.opposing):
         height = np.sum((position - side.next_points) * side.next_normals, axis=1)
         depth = np.where(side.is_near, np.maximum(body.thickness - height, 0.0), 0.0)
@@ -249,18 +251,18 @@ def test_point_forces_have_the_closed_form(case64):
     )
     np.testing.assert_allclose(collision, expected, atol=1e-12)
     np.testing.assert_allclose(np.sum(friction * body.nearest.next_normals, axis=1), 0, atol=1e-12)
-    assert np.all(np.linalg.norm(friction, axis=1) <= 0.5 * body.friction_load), "Coulomb's limit"
+    assert np.all(np.linalg.norm(friction, axis=1) <= 0.5 * problem.friction_load), "Coulomb's limit"
 
 
 def test_friction_reaches_coulombs_limit_when_sliding(case64):
     """A metre of slip: the force is mu N to within the smoothing."""
     problem = case64.problem
-    along = np.cross(problem.body.nearest.next_normals, [1.0, 0.2, 0.3])
+    along = np.cross(problem.data_of(Collision).nearest.next_normals, [1.0, 0.2, 0.3])
     position = problem.position + along / np.linalg.norm(along, axis=1, keepdims=True)
     with jax.enable_x64(True):
         _, gradients = evaluate(case64._replace(position=position))
     force = np.linalg.norm(gradients[5], axis=1)
-    np.testing.assert_allclose(force, 0.5 * problem.body.friction_load, rtol=1e-6)
+    np.testing.assert_allclose(force, 0.5 * problem.friction_load, rtol=1e-6)
 
 
 # --- invariances --------------------------------------------------------------------------------------------
@@ -343,8 +345,9 @@ def test_energies_and_gradients_are_finite_on_degenerate_input(case32):
 
 def test_a_motion_of_zero_length_is_finite(case32):
     problem = case32.problem
-    nearest = problem.body.nearest.replace(next_points=problem.body.nearest.points)
-    still = problem.replace(body=problem.body.replace(nearest=nearest), inertial_guess=problem.position)
+    *others, (rubbing,) = problem.data
+    still_points = rubbing._replace(contacts=rubbing.contacts.replace(next_points=rubbing.contacts.points))
+    still = problem.replace(data=(*others, (still_points,)), inertial_guess=problem.position)
     values, gradients = evaluate(case32._replace(problem=still, position=problem.position))
     assert float(values[5]) == 0
     assert not np.any(gradients[5])
@@ -394,12 +397,15 @@ def test_pinned_vertices_feel_no_force():
     np.testing.assert_array_equal(evaluate(case._replace(position=moved))[0], values)
 
 
-def test_terms_of_contact_without_a_body_are_zero(case32):
-    problem = case32.problem.replace(body=None)
+def test_the_potential_is_the_sum_of_its_terms(case32):
     both = jax.jit(lambda *frame: (potential_terms(*frame), potential(*frame)))
-    energies, total = both(case32.position, problem)
-    assert energies["collision"] == energies["friction"] == 0.0
+    energies, total = both(case32.position, case32.problem)
     np.testing.assert_allclose(total, sum(map(float, energies.values())), rtol=1e-6)
+
+
+def test_collision_without_a_body_is_refused(case32):
+    with pytest.raises(ConfigError, match="needs a body"):
+        with_terms(case32.problem, (Collision(),))
 
 
 def test_energies_under_vmap_equal_a_loop(case32):
@@ -418,7 +424,7 @@ def test_cloth_without_hinges_has_forces():
         np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), np.array([[0, 1, 2]])
     )
     assert triangle.hinges.shape[0] == 0
-    scene = prepare_scene(triangle, drifting_ball(2), options=SceneOptions(has_body=False))
+    scene = prepare_scene(triangle, drifting_ball(2), terms=CLOTH)
     problem = first_problem(scene)
     stretched = 1.1 * problem.position
     value, gradient = jax.jit(jax.value_and_grad(potential))(stretched, problem)

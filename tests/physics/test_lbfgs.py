@@ -17,8 +17,9 @@ from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
 from eslr_jax.physics.solve import lower_point
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import CLOTH
 from eslr_jax.terms.problem import weight_norm
 
 
@@ -276,8 +277,8 @@ def test_vmap_equals_a_loop(case32):
 def test_free_fall_is_implicit_eulers_parabola(small_poses):
     """v_k = -k g dt and y_k = -g dt^2 k (k + 1) / 2, with the minimiser inside a scan."""
     garment = make_garment(*make_sheet(4, 4, jitter=0))
-    options = SceneOptions(has_body=False, start_at_rest=True)
-    scene = prepare_scene(garment, small_poses, options=options)
+    options = {"terms": CLOTH, "starts_at_rest": True}
+    scene = prepare_scene(garment, small_poses, **options)
     fall = jax.jit(rollout_scene, static_argnames="config")(None, scene, SimConfig(iterations=20))
     step = np.arange(scene.num_frames)
     expected = -9.81 / 30**2 * step * (step + 1) / 2

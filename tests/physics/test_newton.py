@@ -10,14 +10,14 @@ from cloth import make_garment, make_sheet
 from newton_oracle import minimize_newton, potential_float64
 from physics_cases import make_case
 
-from eslr_jax.contact.self_contact import default_capacity
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import stiffness
-from eslr_jax.scene.build import initial_state, scene_terms
+from eslr_jax.scene.build import initial_state
 from eslr_jax.simulation.frame import FrameInput, frame_problem
-from eslr_jax.types import PhysicsConstants, Scene
+from eslr_jax.terms import CLOTH, Repulsion
+from eslr_jax.types import Scene
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,12 @@ def two_layers():
     scene = Scene(
         garment=garment,
         material=COTTON,
-        constants=PhysicsConstants(),
         timestep=jnp.float32(1 / 30),
         initial_state=initial_state(garment.rest_positions, jnp.asarray(velocity)),
         body=None,
         pin_targets=None,
-        terms=scene_terms(None, has_ground=False, has_layers=True),
+        terms=(*CLOTH, Repulsion()),
         num_frames=2,
-        self_contact=default_capacity(len(garment.rest_positions)),
     )
     return jax.jit(frame_problem)(scene, scene.initial_state, FrameInput(None, None))
 
@@ -67,10 +65,9 @@ def test_newton_ends_where_lbfgs_ends(is_pinned):
 
 def test_newton_parts_layers(two_layers):
     problem = two_layers
-    assert int(problem.layers.pairs.count) > 20
+    layers = problem.data_of(Repulsion)
+    assert int(layers.pairs.count) > 20
     found = minimize_newton(problem)
     middle = len(found.position) // 2
     gap = np.mean(found.position[middle:, 1]) - np.mean(found.position[:middle, 1])
-    assert 0.7 < gap / float(problem.layers.thickness.max()) < 1.05, (
-        "pushed apart, against the speed of approach"
-    )
+    assert 0.7 < gap / float(layers.thickness.max()) < 1.05, "pushed apart, against the speed of approach"

@@ -15,9 +15,9 @@ from eslr_jax.physics.minres import solve_symmetric
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.preconditioner import sum_diagonals
 from eslr_jax.physics.tangent import apply, inverse_diagonal, precondition, tangent
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.terms.air import Air
+from eslr_jax.terms import CLOTH, Air, Damping, Repulsion, scene_terms
 
 
 class Crumpled(NamedTuple):
@@ -34,8 +34,8 @@ class Crumpled(NamedTuple):
 @pytest.fixture(scope="module")
 def crumpled():
     """A pinned sheet of 25 vertices on a ball, with all that can be modelled; all vertices are off by noise."""
-    options = SceneOptions(self_contact=True, air=Air((1.0, 2.0, 0.5)), damping=0.01)
-    scene = prepare_scene(square(5, 0.12, is_pinned=np.array([0, 3])), drifting_ball(2), options=options)
+    options = {"terms": scene_terms(Repulsion(where="all"), Air((1.0, 2.0, 0.5)), Damping(0.01))}
+    scene = prepare_scene(square(5, 0.12, is_pinned=np.array([0, 3])), drifting_ball(2), **options)
     first = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     is_free = (scene.garment.vertex_mask & ~scene.garment.is_pinned)[:, None]
     noise, move = np.random.default_rng(0).standard_normal((2, *is_free.shape[:1], 3)).astype(np.float32)
@@ -63,7 +63,7 @@ def test_the_assembled_product_is_that_of_automatic_differentiation(crumpled):
 
 def test_cloth_without_inner_edges_has_a_hessian_too():
     triangle = make_garment(np.array([[0, 0.2, 0], [0.1, 0.2, 0], [0, 0.2, 0.1]]), np.array([[0, 1, 2]]))
-    scene = prepare_scene(triangle, drifting_ball(2), options=SceneOptions(has_body=False))
+    scene = prepare_scene(triangle, drifting_ball(2), terms=CLOTH)
     problem = frame_problem(
         scene, scene.initial_state, jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     )

@@ -18,7 +18,7 @@ from eslr_jax.physics.potential import evaluate, potential
 from eslr_jax.physics.preconditioner import stiffness
 from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.physics.tangent import apply, tangent
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.stretch import stretch_energy
@@ -105,7 +105,13 @@ def test_newton_and_lbfgs_find_one_minimum_of_a_woven_sheet(woven_problem):
 def woven_problem():
     garment = square(5, 0.12)
     material = fabric_on(garment, describe_fabric("denim-woven").weave)
-    return first_problem(prepare_scene(garment, drifting_ball(2), material=material, options=SceneOptions()))
+    return first_problem(
+        prepare_scene(
+            garment,
+            drifting_ball(2),
+            material=material,
+        )
+    )
 
 
 def test_the_assembled_product_holds_threads_and_plate(woven_problem):

@@ -15,10 +15,11 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.rest_shape import with_rest_positions
-from eslr_jax.scene.plan import SceneOptions, prepare_scene, prepare_scenes, shared_surface
+from eslr_jax.scene.plan import prepare_scene, prepare_scenes, shared_surface
 from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_batch, stack_scenes
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status, simulate
+from eslr_jax.terms import CLOTH, Collision, Damping, Ground, Repulsion, scene_terms
 
 QUICK = SimConfig(iterations=5)
 CLIPS = (
@@ -122,11 +123,15 @@ def test_fabrics_that_lie_on_one_mesh_are_refused(garments, poses):
 
 @pytest.mark.slow
 def test_all_that_a_scene_can_model_maps_over_scenes(poses):
-    options = SceneOptions(
-        has_skin=True, integrator="bdf2", substeps=2, ground="on", self_contact=True, damping=0.002
-    )
+    options = {
+        "terms": scene_terms(
+            Collision(has_skin=True), Ground(is_always=True), Repulsion(where="all"), Damping(0.002)
+        ),
+        "integrator": "bdf2",
+        "substeps": 2,
+    }
     scenes = prepare_scenes(
-        [square(8), square(7, is_pinned=np.array([0]))], [poses] * 2, FABRICS[:2], options=options
+        [square(8), square(7, is_pinned=np.array([0]))], [poses] * 2, FABRICS[:2], **options
     )
     together = rollout_scenes(None, stack_scenes(scenes), QUICK, batch_size=2)
     for row, scene in enumerate(scenes):
@@ -136,7 +141,7 @@ def test_all_that_a_scene_can_model_maps_over_scenes(poses):
 
 def test_unlike_scenes_are_not_stacked(garments, poses):
     scene = prepare_scene(garments[0], poses)
-    bare = prepare_scene(garments[0], poses, options=SceneOptions(has_body=False))
+    bare = prepare_scene(garments[0], poses, terms=CLOTH)
     with pytest.raises(ValueError, match="differ in what they model"):
         stack_scenes([scene, bare])
 

@@ -10,7 +10,7 @@ from eslr_jax.config import ModelConfig, SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.models.registry import init_model
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.simulation.stepper import MOST_RESIDUAL
@@ -49,7 +49,7 @@ def test_bdf2_with_few_iterations_stays_where_the_cloth_is():
 
 @pytest.fixture(scope="module")
 def draped():
-    return prepare_scene(square(), drifting_ball(13), options=SceneOptions(integrator="bdf2"))
+    return prepare_scene(square(), drifting_ball(13), integrator="bdf2")
 
 
 def test_bdf2_goes_on_where_it_was_interrupted(draped):

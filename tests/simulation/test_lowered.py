@@ -4,23 +4,25 @@ import jax
 from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation import frame
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.terms.air import Air
+from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion, scene_terms
 
 
 def test_physics_multiplies_in_full_precision():
     """A GPU rounds the operands of other products of float32 to ten bits."""
-    options = SceneOptions(
-        air=Air((0.0, 0.0, 0.0)),
-        damping=0.01,
-        has_skin=True,
-        self_contact=True,
-        ground="on",
-        integrator="bdf2",
-    )
-    scene = prepare_scene(square(), drifting_ball(13), options=options)
+    options = {
+        "terms": scene_terms(
+            Collision(has_skin=True),
+            Ground(is_always=True),
+            Repulsion(where="all"),
+            Air((0.0, 0.0, 0.0)),
+            Damping(0.01),
+        ),
+        "integrator": "bdf2",
+    }
+    scene = prepare_scene(square(), drifting_ball(13), **options)
     stepper = make_stepper(None, SimConfig(iterations=5))
     inputs = jax.tree.map(lambda leaf: leaf[0], frame.frame_inputs(scene))
 

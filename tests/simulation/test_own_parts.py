@@ -8,12 +8,12 @@ from draped_ball import drifting_ball, square
 from flax import linen as nn
 from flax import struct
 
-from eslr_jax import SceneOptions, SimConfig, plan_scene, prepare_scene, rollout, simulate
+from eslr_jax import SimConfig, plan_scene, prepare_scene, rollout, simulate
 from eslr_jax.errors import ConfigError, NonFiniteError
 from eslr_jax.evaluation.report import trajectory_report
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.terms.term import Term
+from eslr_jax.terms import CLOTH, Term
 
 DENSITY = 0.20022  # [kg/m2] of cotton
 
@@ -54,12 +54,12 @@ class Nudge(nn.Module):
 def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiated():
     garment, poses = square(), drifting_ball(4, speed=0.0)
 
-    options = SceneOptions(terms=(Push(1.0),), has_body=False)
-    plan = plan_scene(garment, poses, options=options)
+    options = {"terms": (*CLOTH, Push(1.0))}
+    terms, poses = plan_scene(garment, poses, **options)
 
     def last(pressure):
-        windy = plan.replace(terms=(Push(pressure),))
-        trajectory = rollout(None, garment, poses, config=SimConfig(iterations=30), plan=windy)
+        windy = (*terms[:-1], Push(pressure))
+        trajectory = rollout(None, garment, poses, config=SimConfig(iterations=30), terms=windy)
         return trajectory.positions[-1, :, 0].mean(), trajectory
 
     slope, trajectory = jax.jit(jax.grad(last, has_aux=True))(jnp.float32(5.0))
@@ -68,7 +68,7 @@ def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiate
     known = np.array([0, 1, 3, 6]) / DENSITY / 30**2
     np.testing.assert_allclose(way - way[0], 5.0 * known, rtol=1e-3, atol=1e-6)
     assert float(slope) == pytest.approx(known[-1], rel=1e-2)
-    scene = prepare_scene(garment, poses, options=SceneOptions(has_body=False))
+    scene = prepare_scene(garment, poses, terms=CLOTH)
     own = trajectory_report(trajectory, scene)["terms"]["push"]
     area = float(garment.vertex_areas.sum())
     assert own == pytest.approx(-5.0 * area * 5.0 * known[-1] / 3, rel=1e-3)
@@ -77,21 +77,20 @@ def test_an_own_energy_moves_the_cloth_stands_in_the_report_and_is_differentiate
 def test_an_own_energy_without_a_finite_gradient_is_refused():
     """The solver would stay at its guess, at positions that are finite."""
 
-    options = SceneOptions(terms=(Root(),), has_body=False)
-    scene = prepare_scene(square(), drifting_ball(3, speed=0.0), options=options)
+    options = {"terms": (*CLOTH, Root())}
+    scene = prepare_scene(square(), drifting_ball(3, speed=0.0), **options)
     with pytest.raises(NonFiniteError, match="forces"):
         simulate(None, scene, config=SimConfig(iterations=5))
 
 
 def test_an_own_network_goes_through_both_doors():
     garment, poses, network = square(), drifting_ball(4), Nudge()
-    options = SceneOptions(has_body=False)
-    scene, plan = prepare_scene(garment, poses, options=options), plan_scene(garment, poses, options=options)
+    scene = prepare_scene(garment, poses, terms=CLOTH)
     params = network.init(jax.random.key(0), jax.jit(first_problem)(scene), scene.initial_state)
     config = SimConfig(model=network, iterations=0)
     still = simulate(params, scene, config=config).trajectory
     params = {"params": {"step": jnp.array([1e-3, 0.0, 0.0])}}
-    moved = rollout(params, garment, poses, config=config, plan=plan)
+    moved = rollout(params, garment, poses, config=config, terms=CLOTH)
     way = np.asarray(moved.positions[1] - still.positions[1])
     np.testing.assert_allclose(way, np.broadcast_to([1e-3, 0.0, 0.0], way.shape), atol=1e-6)
     with pytest.raises(ConfigError, match="without weights"):

@@ -11,9 +11,10 @@ from eslr_jax.errors import Status
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import potential
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import CLOTH
 
 CONFIG = MODELS["smooth-small"]
 
@@ -21,9 +22,7 @@ CONFIG = MODELS["smooth-small"]
 @pytest.fixture(scope="module")
 def step_of():
     """The first frame of a sheet in free fall, by weights and by how much the sheet is stretched."""
-    scene = prepare_scene(
-        square(6), drifting_ball(3), options=SceneOptions(has_body=False, start_at_rest=True)
-    )
+    scene = prepare_scene(square(6), drifting_ball(3), terms=CLOTH, starts_at_rest=True)
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
     @jax.jit

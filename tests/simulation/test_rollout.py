@@ -14,10 +14,11 @@ from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFinite
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.models.registry import MODELS, init_model
 from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import SceneOptions, plan_scene, prepare_scene
+from eslr_jax.scene.plan import plan_scene, prepare_scene
 from eslr_jax.simulation.rollout import rollout, rollout_scene, step
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
+from eslr_jax.terms import CLOTH, Gravity
 
 SOLVER = SimConfig(iterations=15)
 SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
@@ -112,10 +113,9 @@ def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, params, 
 
 @pytest.mark.slow
 def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
-    plan = plan_scene(cloth, poses)
-    assert not plan.has_pins
-    assert plan.surface.faces.shape[0] < poses.surface.faces.shape[0]
-    planned = rollout(None, cloth, poses, config=SOLVER, plan=plan)
+    terms, near = plan_scene(cloth, poses)
+    assert near.surface.faces.shape[0] < poses.surface.faces.shape[0]
+    planned = rollout(None, cloth, near, config=SOLVER, terms=terms)
     np.testing.assert_allclose(planned.positions, solved.positions, atol=1e-4)
 
 
@@ -127,8 +127,8 @@ def test_pins_follow_the_body(poses):
 
 
 def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
-    options = SceneOptions(has_body=False, start_at_rest=True)
-    scene = prepare_scene(cloth, poses, options=options)
+    options = {"terms": CLOTH, "starts_at_rest": True}
+    scene = prepare_scene(cloth, poses, **options)
     assert scene.body is None
     trajectory = rollout_scene(None, scene, SOLVER)
     frames = np.arange(3)
@@ -181,7 +181,7 @@ def test_other_values_compile_nothing_anew(cloth, poses):
     before = rollout_scene._cache_size()
     faster = scene.replace(
         initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
-        constants=scene.constants.replace(gravity=0.3 * scene.constants.gravity),
+        terms=scene.with_term(Gravity(0.3 * 9.81)).terms,
         material=jax.tree.map(jnp.asarray, FABRICS[1]),
     )
     rollout_scene(None, faster, SOLVER)

@@ -19,7 +19,7 @@ from eslr_jax.evaluation.gap import GapOptions, measure_gap
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.archive import read_tree, write_tree
 from eslr_jax.scene.build import initial_state
-from eslr_jax.scene.plan import SceneOptions, first_frames, prepare_scene
+from eslr_jax.scene.plan import first_frames, prepare_scene
 from eslr_jax.simulation.program import _compile, find_program
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import (
@@ -30,7 +30,7 @@ from eslr_jax.simulation.simulate import (
     raise_for_status,
     simulate,
 )
-from eslr_jax.types import PairCapacity, PhysicsConstants
+from eslr_jax.terms import CLOTH, Friction, Repulsion, scene_terms
 
 SOLVER = SimConfig(iterations=12)
 
@@ -87,7 +87,7 @@ def crossing_sheets(num_frames=3):
         rest, faces, skin_weights=ones, skin_indices=0 * ones.astype(int), allow_components=True
     )
     scene = prepare_scene(
-        garment, drifting_ball(num_frames), options=SceneOptions(self_contact=True, start_at_rest=True)
+        garment, drifting_ball(num_frames), terms=scene_terms(Repulsion(where="all")), starts_at_rest=True
     )
     close = rest.copy()
     close[64:, 1] -= 0.016
@@ -100,15 +100,16 @@ def crossing_sheets(num_frames=3):
 def simulated(kind):
     """A simulation of fourteen frames, whose buffers need not grow any more."""
     options = {
-        "euler": SceneOptions(),
-        "bdf2": SceneOptions(integrator="bdf2"),
-        "substeps": SceneOptions(substeps=2),
-        "substeps of bdf2": SceneOptions(integrator="bdf2", substeps=2),
+        "euler": {},
+        "bdf2": {"integrator": "bdf2"},
+        "substeps": {"substeps": 2},
+        "substeps of bdf2": {"integrator": "bdf2", "substeps": 2},
     }
     if kind == "self-contact":
-        scene = crossing_sheets(14).replace(self_contact=PairCapacity(pairs=1000))
+        scene = crossing_sheets(14)
+        scene = scene.with_term(scene.term(Repulsion).replace(num_rows=1000))
     else:
-        scene = prepare_scene(square(), drifting_ball(14), options=options[kind])
+        scene = prepare_scene(square(), drifting_ball(14), **options[kind])
     return simulate(None, scene, config=SOLVER)
 
 
@@ -142,7 +143,7 @@ def kept(path, trajectory, scene):
 
 def test_an_unfinished_simulation_with_self_contact_is_read_as_it_was_written(tmp_path):
     part, _, scene = simulated("self-contact")
-    demand = np.asarray(part.pair_demand)
+    demand = np.asarray(part.demands["repulsion"])
     assert demand.shape == (14,)
     assert demand[1:].min() > 0
     again = kept(tmp_path, part, scene)
@@ -239,7 +240,7 @@ def test_tolerance_stops_early_and_is_kept(scene):
         ({"material": COTTON.replace(lame_mu=1e12)}, r"material lame_mu = 1e\+12; give a value from"),
         ({"material": COTTON.replace(density=np.ones(7))}, r"one per vertex \(64\)"),
         ({"timestep": jnp.float32(0.0)}, "timestep = 0; give a value from"),
-        ({"constants": PhysicsConstants(friction_coefficient=-1.0)}, "friction_coefficient = -1"),
+        ({"terms": (*CLOTH, Friction(-1.0))}, "friction coefficient = -1"),
     ],
 )
 def test_unphysical_scenes_are_refused_by_name(scene, changes, message):
@@ -266,18 +267,18 @@ def slow_first_program(monkeypatch, seconds):
 @pytest.mark.slow
 def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     scene = crossing_sheets()
-    few = scene.replace(self_contact=PairCapacity(pairs=20))
+    few = scene.with_term(scene.term(Repulsion).replace(num_rows=20))
     short = rollout_scene(None, few, SOLVER)
     assert Status.SELF_CONTACT_OVERFLOW in Status(int(short.status))
-    with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ pairs or more"):
+    with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ rows or more"):
         raise_for_status(short)
-    assert enlarge_buffers(few, short).self_contact.pairs > 20
+    assert enlarge_buffers(few, short).term(Repulsion).num_rows > 20
     waits = slow_first_program(monkeypatch, 5.0)
     found = simulate(None, few, config=SOLVER)
     assert len(waits) > 1, "a program for every buffer"
     assert found.timing.compile_s >= sum(waits)
     assert found.timing.frame_ms * 2 * len(waits) > 5e3, "the mean is over the two frames of every pass"
-    assert found.scene.self_contact.pairs > 20
+    assert found.scene.term(Repulsion).num_rows > 20
     expected = rollout_scene(None, found.scene, SOLVER)
     assert Status(int(expected.status)) == Status.OK
     np.testing.assert_allclose(found.trajectory.positions, expected.positions, atol=1e-5)
@@ -288,13 +289,12 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
 
 
 def test_buffers_grow_by_shared_sizes_until_they_hold_the_fullest_frame_and_a_quarter_more(scene, whole):
-    tight = scene.replace(self_contact=PairCapacity(pairs=20))
+    tight = scene.replace(terms=(*scene.terms, Repulsion(num_rows=20)))
     for most, pairs in ((21, 28), (33, 48), (38, 48), (60, 80), (64, 80), (65, 95), (40, 57)):
         demand = jnp.array([0] * 5 + [most] + [10] * 8)
-        full = whole.replace(pair_demand=demand, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
-        assert enlarge_buffers(tight, full).self_contact == PairCapacity(pairs=pairs)
-    assert enlarge_buffers(tight, full.replace(status=jnp.int32(Status.OK))) is None
-    with pytest.raises(CapacityError, match="40 pairs or more"):
+        full = whole.replace(demands={"repulsion": demand}, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
+        assert enlarge_buffers(tight, full).term(Repulsion).num_rows == pairs
+    with pytest.raises(CapacityError, match="40 rows or more"):
         raise_for_status(full)
     full = full.replace(first_bad_frame=jnp.int32(5))
     with pytest.raises(CapacityError, match=r"^frame 3: "):
@@ -341,7 +341,7 @@ def test_a_negative_number_of_iterations_is_refused():
 
 def test_a_buffer_without_a_row_is_refused():
     with pytest.raises(ConfigError, match="one row or more"):
-        PairCapacity(pairs=0)
+        Repulsion(num_rows=0).check()
 
 
 def test_a_scene_of_one_frame_is_refused(scene):

@@ -9,10 +9,10 @@ from known_answers.strip import kept_per_period, strip
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.scene.plan import SceneOptions, prepare_scene
+from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.terms.air import Air
+from eslr_jax.terms import Air, scene_terms
 
 GRAVITY = 9.81  # [m/s^2]
 FRAMES = 13
@@ -29,8 +29,12 @@ def draped(*, substeps=1, shorter=1, integrator="euler"):
     is_pinned[[0, 7]] = True
     poses = drifting_ball(shorter * (FRAMES - 1) + 1, speed=0.3 / shorter)
     poses = poses.replace(timestep=poses.timestep / shorter)
-    options = SceneOptions(integrator=integrator, substeps=substeps, air=Air(Partial(rising_wind)))
-    return prepare_scene(square(is_pinned=is_pinned), poses, options=options)
+    options = {
+        "terms": scene_terms(Air(Partial(rising_wind))),
+        "integrator": integrator,
+        "substeps": substeps,
+    }
+    return prepare_scene(square(is_pinned=is_pinned), poses, **options)
 
 
 def test_a_frame_in_two_substeps_is_two_frames_of_half_the_length():
@@ -73,4 +77,4 @@ def test_substeps_go_on_where_they_were_interrupted():
 @pytest.mark.parametrize("wrong", [0, 1.5, True])
 def test_a_number_of_substeps_that_is_none_is_refused(wrong):
     with pytest.raises(ConfigError, match="substeps"):
-        prepare_scene(square(), drifting_ball(3), options=SceneOptions(substeps=wrong))
+        prepare_scene(square(), drifting_ball(3), substeps=wrong)
