@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "ModelConfig": "eslr_jax.config",
     "SimConfig": "eslr_jax.config",
     "TrainConfig": "eslr_jax.config",
+    "Network": "eslr_jax.models.network",
     "EslrError": "eslr_jax.errors",
     "Material": "eslr_jax.types",
     "Trajectory": "eslr_jax.types",
@@ -41,11 +41,12 @@ __all__ = ["__version__", *_PUBLIC]
 if TYPE_CHECKING:
     from eslr_jax.assets import load_body, load_garment, load_model, load_motion
     from eslr_jax.body.motion import pose_body
-    from eslr_jax.config import ModelConfig, SimConfig, TrainConfig
+    from eslr_jax.config import SimConfig, TrainConfig
     from eslr_jax.errors import EslrError
     from eslr_jax.evaluation.run import load_trajectory
     from eslr_jax.evaluation.score import score_trajectory
     from eslr_jax.geometry.prepare import prepare_garment
+    from eslr_jax.models.network import Network
     from eslr_jax.scene.archive import load_scene, save_scene
     from eslr_jax.scene.plan import plan_scene, prepare_scene
     from eslr_jax.simulation.batch import simulate_batch

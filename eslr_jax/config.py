@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from eslr_jax.errors import ConfigError
 
@@ -16,129 +16,6 @@ Criterion = Literal["postcvpr", "cvpr", "metric"]
 Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
 """What a network may be deprived of, see `evaluation.controls`."""
 
-COARSE_SETS = ("coarse0", "coarse1", "coarse2")
-"""Edge sets of a garment's coarse levels, finest first (HOOD)."""
-
-STAGES = (
-    ("coarse0", "mesh"),
-    ("coarse0", "coarse1"),
-    ("coarse1",),
-    ("coarse0", "coarse1"),
-    ("coarse0", "mesh"),
-)
-"""Edge sets of a hierarchical network's stages, in the order in which vertices read their sums (HOOD)."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ModelConfig:
-    """Architecture of a network; the defaults are the paper's 15-layer model (4,753,108 parameters).
-
-    The paper is silent on the fields marked "open". Their defaults fit its parameter counts, or else follow
-    MeshGraphNet and HOOD. `models.lsdmp` lists the open points that are no options.
-    """
-
-    message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
-    smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
-    hierarchical: bool = False  # True: HOOD's coarse levels, see models.hood
-    edge_latents: bool = True  # False: no messages, only smoothing, see models.smoothing
-    attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
-    latent_size: int = 128  # HOOD
-    hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
-    update_body: bool = False  # open: layers update body rows as HOOD does, see models.lsdmp
-    attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
-    attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
-    attention_kernel: Literal["relu", "softmax"] = "relu"  # open
-    attention_norm: bool = False  # LayerNorm before attention; keeps q and k small for "softmax"
-    attention_feedforward: bool = False  # an MLP behind the attention of every block
-    embedding_size: int = 8  # open: k of the geodesic embedding
-    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
-    features: Literal["hood", "gradient"] = "hood"  # HOOD's, or scaled ones with the potential's gradient
-    # "acceleration" changes the state's velocity; "correction" moves the solver's initial guess. "descent" adds
-    # to that the preconditioned gradient step and the last correction, each with a gate per vertex. "subspace"
-    # takes the combination of these three that minimises the potential.
-    output: Literal["acceleration", "correction", "descent", "subspace"] = "acceleration"
-    output_scale: float = 1.0  # metres per unit of output, for corrections
-    refinement_steps: int = 1  # applications per frame, gradient recomputed between; 1 is the paper
-    world_edge_radius: float = 0.03  # [m] (HOOD)
-    precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
-    # What a backward pass computes again: whole layers, all but their products, or nothing.
-    remat: Literal["layers", "products", "none"] = "products"
-    seed: int = 0  # of the random attention features
-
-    @property
-    def garment_options(self) -> dict[str, Any]:
-        """Return the arguments of `assets.load_garment` for a garment that this network reads."""
-        return {
-            "embedding_size": self.embedding_size,
-            "embedding_mode": self.embedding_mode,
-            "has_coarse_edges": self.hierarchical,
-        }
-
-    def __post_init__(self) -> None:
-        """Reject impossible or contradictory values.
-
-        Raises:
-            ValueError: Names the field and what to change.
-        """
-        sizes = (
-            "message_passing_steps",
-            "latent_size",
-            "attention_size",
-            "attention_features",
-            "embedding_size",
-            "refinement_steps",
-        )
-        for name in sizes:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("smoothing_steps", "attention_blocks", "hidden_layers"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("output_scale", "world_edge_radius"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.refinement_steps > 1 and self.features != "gradient":
-            raise ValueError(
-                'refinement_steps > 1 needs features = "gradient": others are the same in every step'
-            )
-        if self.refinement_steps > 1 and self.output == "acceleration":
-            raise ValueError(
-                'refinement_steps > 1 needs output "correction", "descent" or "subspace", not "acceleration"'
-            )
-        if not self.edge_latents and self.features != "gradient":
-            raise ValueError(
-                'edge_latents = false needs features = "gradient", which tell a vertex its force'
-            )
-        if self.hierarchical and (self.smoothing_steps or self.message_passing_steps % len(STAGES)):
-            raise ValueError(
-                "hierarchical = true needs smoothing_steps = 0, and message_passing_steps a multiple of "
-                f"{len(STAGES)}"
-            )
-        if self.hierarchical and not (self.update_body and self.edge_latents):
-            raise ValueError("hierarchical = true needs update_body = true and edge_latents = true")
-        if self.update_body and not self.edge_latents:
-            raise ValueError(
-                "update_body = true needs edge_latents = true: without messages no body row is read"
-            )
-        features = "hood" if self.output == "acceleration" else "gradient"  # without a guess, or of one
-        if self.features != features:
-            raise ValueError(f'output = "{self.output}" needs features = "{features}"')
-
-
-@runtime_checkable
-class Predictor(Protocol):
-    """A network of one's own, such as a Flax module: hashable, and without state besides its weights."""
-
-    def apply(self, params: Any, problem: Any, state: Any, /) -> Any:
-        """Return positions at t + 1 [m], shape [vertices, 3]; pinned vertices are put in place afterwards.
-
-        Args:
-            params: Its weights.
-            problem: The frame's `terms.problem.FrameProblem`.
-            state: Cloth at t, a `types.ClothState`.
-        """
-
-
 MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
 
@@ -146,7 +23,7 @@ MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip tak
 class SimConfig:
     """How a frame is solved; static, so a change compiles anew.
 
-    Without a model the solver starts from its own guess. With one, it starts from the network's prediction, or
+    Without a network the solver starts from its own guess. With one, it starts from the network's prediction, or
     from the point that the prediction corrects if that has less energy; `iterations=0` ends the frame there.
 
     By default a frame ends at a tolerance of 1 %, after 500 iterations at most. With `iterations` alone it takes
@@ -154,7 +31,6 @@ class SimConfig:
     end up to this tolerance apart: vertices of a T-shirt by 1.6 mm in their first frame.
     """
 
-    model: ModelConfig | Predictor | None = None  # architecture, or a network of one's own; None: no network
     iterations: int = None  # type: ignore[assignment]: of L-BFGS per frame, at most; 500 if not given
     # A frame's iterations stop where its optimality gap is estimated to be below this share of the initial gap;
     # 0.01 is kept on 99 % of frames. If not given, 0.01, or 0 where `iterations` is given.
@@ -217,7 +93,8 @@ class EvaluationOptions:
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
-    model: ModelConfig  # architecture: a name in `models.registry.MODELS`, or a table with one as `base`
+    # A `models.network.System`; in a recipe its name, or a table with that as `base` and values that differ.
+    model: Any
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step
     split: str = "train"  # clips of this split
@@ -296,12 +173,7 @@ class TrainConfig:
         for name in ("warmup", "final_learning_rate"):
             if self.schedule == "hood" and getattr(self, name) != getattr(TrainConfig, name):
                 raise ValueError(f'{name} needs schedule = "cosine": HOOD\'s rate has no warm-up and no end')
-        if self.model.output == "acceleration" and self.model.output_scale != ModelConfig.output_scale:
-            raise ValueError(
-                'model.output_scale needs output "correction", "descent" or "subspace": '
-                f"statistics scale an acceleration; leave it at {ModelConfig.output_scale}"
-            )
-        is_hood = self.energy_set == "hood" and self.model.output == "acceleration"  # which sees no gradient
+        is_hood = self.energy_set == "hood" and not getattr(self.model, "reads_gradient", True)
         if is_hood and self.collision_stiffness != TrainConfig.collision_stiffness:
             raise ValueError(
                 'collision_stiffness needs energy_set = "consistent": HOOD has a ramp of its own'
@@ -323,7 +195,7 @@ def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> 
     """Build a frozen config from plain values.
 
     Args:
-        cls: A frozen dataclass of this module.
+        cls: A frozen dataclass.
         values: Field values; nested tables become nested configs.
         where: Prefix of field names in messages.
 
@@ -349,6 +221,8 @@ def from_dict(cls: type[Config], values: dict[str, Any], *, where: str = "") -> 
 
 def _convert(hint: Any, value: Any, name: str) -> Any:
     """Check `value` against a field's annotation and convert nested tables, lists and whole floats."""
+    if hint is Any:
+        return value
     options = get_args(hint) if get_origin(hint) is not None else ()
     if get_origin(hint) is Literal:
         if value not in options:
@@ -370,11 +244,6 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         if isinstance(origin, type) and isinstance(value, origin):
             return value
     raise ConfigError(f"{name} = {value!r} has the wrong type; expected {hint}")
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """Return a config as plain values, ready for JSON."""
-    return dataclasses.asdict(config)
 
 
 def apply_overrides(values: dict[str, Any], overrides: dict[str, Any]) -> None:

@@ -54,9 +54,9 @@ def measure_methods(names: tuple[str, ...], scenes: list[Scene]) -> list[Method]
 
 def measure_ends(name: str, scene: Scene, truth: Trajectory) -> OptimalityGap:
     """Return the potentials that a method leaves after every count of `ITERATIONS`, as NumPy arrays."""
-    params, config = simulator_of(name)
-    options = GapOptions(EVERY, ITERATIONS[1:] if config.model is None else (), ITERATIONS)
-    return jax.device_get(measure_gap(params, truth, scene, config.model, options))
+    network, _ = simulator_of(name)
+    options = GapOptions(EVERY, ITERATIONS[1:] if network is None else (), ITERATIONS)
+    return jax.device_get(measure_gap(network, truth, scene, options))
 
 
 def quantiles(

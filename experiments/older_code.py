@@ -34,7 +34,7 @@ shares = []
 for garment in garments:
     scene = example_scene(garment, size, "cmu_016_32", frames)
     truth = rollout_scene(None, scene, simulator_of("solver")[1], 100)
-    ends = measure_gap(None, truth, scene, None, GapOptions(3, tuple(counts)))
+    ends = measure_gap(None, truth, scene, options=GapOptions(3, tuple(counts)))
     shares.append([np.asarray(ends.share(ends.solver[count])) for count in counts])
 print(json.dumps([float(np.median(row)) for row in np.concatenate(shares, axis=1)]))
 """

@@ -52,9 +52,9 @@ def free_rollouts(name: str, garment: str, size: str, num_frames: int, counts: t
     reads_edges = read_coarse_edges((name,))
     scene = example_scene(garment, size, CLIP, num_frames, has_coarse_edges=reads_edges)
     reports = []
-    params, config = simulator_of(name)
+    network, config = simulator_of(name)
     for count in counts:
-        trajectory = rollout_scene(params, scene, config, count)
+        trajectory = rollout_scene(network, scene, config, count)
         report = trajectory_report(trajectory, scene)
         kept = ("finite", "total", "max_principal_stretch", "penetration_p999_mm", "residual_median")
         reports.append({"garment": garment, "iterations": count, **{name: report[name] for name in kept}})

@@ -28,13 +28,8 @@ from harness import EXPERIMENTS, keep, parser
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import time_in_turns
 from eslr_jax.graph.build import build_graph
-from eslr_jax.models.registry import (
-    MODELS,
-    apply_model,
-    init_model,
-    measure_statistics,
-    merge_statistics,
-)
+from eslr_jax.models.apply import apply_model, measure_statistics, merge_statistics
+from eslr_jax.models.registry import MODELS
 from eslr_jax.training.memory import keep_memory
 
 sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models
@@ -61,64 +56,62 @@ def compile_timed(function, args) -> tuple:
 
 
 def load(model: str, size: str) -> tuple:
-    """Return config, weights, graph and garment of a tube of that size."""
+    """Return network, graph and garment of a tube of that size."""
     from reference_models import make_scene
 
-    config = MODELS[model]
+    network = MODELS[model].new_network()
     scene = make_scene(*SIZES[size])
-    graph = jax.jit(lambda *scene: build_graph(*scene, config))(*scene)
-    params = init_model(config)
-    measured = measure_statistics(config, params, graph, scene[0], scene[2].velocity)
-    params = merge_statistics(params, measured)
-    return config, params, graph, scene[0]
+    graph = jax.jit(lambda *scene: build_graph(*scene, network.config.graph))(*scene)
+    measured = measure_statistics(network, graph, scene[0], scene[2].velocity)
+    return merge_statistics(network, measured), graph, scene[0]
 
 
-def networks(config) -> dict:
-    """Return the three builds of a network, each a function of (params, graph, garment)."""
+def builds_of(config) -> dict:
+    """Return the three builds of a network, each a function of (network, graph, garment)."""
     from reference_models import plain_network
 
     reduced = dataclasses.replace(config, precision="bfloat16")
     return {
-        "plain": lambda *args: plain_network(config, *args, jnp),
-        "exact": lambda *args: apply_model(config, *args),
-        "reduced": lambda *args: apply_model(reduced, *args),
+        "plain": lambda *args: plain_network(*args, jnp),
+        "exact": apply_model,
+        "reduced": lambda network, *args: apply_model(network.replace(config=reduced), *args),
     }
 
 
-def training_step(network):
+def training_step(build):
     """Return a step of Adam on a quadratic loss: forward, backward, update."""
     optimizer = optax.adam(1e-4)
 
-    def step(params, graph, garment, state):
-        def loss(trained):
-            return jnp.sum(network({**params, "params": trained}, graph, garment) ** 2)
+    def step(network, graph, garment, state):
+        def loss(params):
+            return jnp.sum(build(network.replace(params=params), graph, garment) ** 2)
 
-        gradient = jax.grad(loss)(params["params"])
+        gradient = jax.grad(loss)(network.params)
         update, state = optimizer.update(gradient, state)
-        return optax.apply_updates(params["params"], update), state
+        return optax.apply_updates(network.params, update), state
 
     return step, optimizer.init
 
 
 def measure_size(size: str, turns: int, training: bool) -> dict:
     """Return times, compile times and memory of every build at one size."""
-    config, params, graph, garment = load(MODEL, size)
+    network, graph, garment = load(MODEL, size)
     result: dict = {
         "vertices": int(garment.vertex_areas.shape[0]),
         "edges": int(garment.senders.shape[0]),
         "builds": {},
     }
     forwards = {}
-    for name, network in networks(config).items():
-        args = (params, graph, garment)
-        compiled, result["builds"][f"forward_{name}"] = compile_timed(network, args)
+    for name, build in builds_of(network.config).items():
+        args = (network, graph, garment)
+        compiled, result["builds"][f"forward_{name}"] = compile_timed(build, args)
         forwards[f"forward_{name}"] = (compiled, args)
     times = take_turns(forwards, turns)
     if training:
         steps = {}
-        for name, network in networks(config).items():
-            step, init = training_step(network)
-            args = (params, graph, garment, init(params["params"]))
+        for name, build in builds_of(network.config).items():
+            step, init = training_step(build)
+            args = (network, graph, garment, init(network.params))
             compiled, result["builds"][f"train_{name}"] = compile_timed(step, args)
             steps[f"train_{name}"] = (compiled, args)
         times.update(take_turns(steps, max(3, turns // 2)))
@@ -143,11 +136,11 @@ def measure_torch(size: str, turns: int) -> dict:
 
     functions, garment = {}, None
     for model in ("eslr-15", "mgn-15"):
-        config, params, graph, garment = load(model, size)
-        for name, network in networks(config).items():
+        network, graph, garment = load(model, size)
+        for name, build in builds_of(network.config).items():
             if name != "plain":
-                args = (params, graph, garment)
-                functions[f"{model} {name}"] = (compile_timed(network, args)[0], args)
+                args = (network, graph, garment)
+                functions[f"{model} {name}"] = (compile_timed(build, args)[0], args)
     edges = (np.asarray(garment.senders), np.asarray(garment.receivers))
     functions["torch mgn-15"] = (torch_meshgraphnet.make_forward(*edges, garment.vertex_areas.shape[0]), ())
     times = take_turns(functions, turns)

@@ -58,7 +58,7 @@ def plain_layer(latents, graph, weights, config, xp):
     num_vertices = v.shape[0]
     senders, receivers = graph.senders, graph.receivers
     has_body = "world" in graph.edges
-    moves_body = has_body and config.update_body
+    moves_body = has_body and "world_reverse" in graph.edges
     concat = lambda *rows: xp.concatenate(rows, axis=1)  # noqa: E731
     new = dict(latents)
 
@@ -135,14 +135,16 @@ def plain_features(queries, keys, projection, kernel, xp):
 
 
 def plain_block(x, embedding, mask, projection, weights, config, xp):
-    here = plain_norm(x, weights, "attention_norm", xp) if config.attention_norm else x
+    here = plain_norm(x, weights, "attention_norm", xp) if config.is_attention_normed else x
     located = xp.concatenate([here, embedding / 0.5], axis=1)
     queries, keys, values = located @ weights["query"], located @ weights["key"], here @ weights["value"]
-    phi_q, phi_k = plain_features(queries, keys, projection, config.attention_kernel, xp)
+    phi_q, phi_k = plain_features(
+        queries, keys, projection, "softmax" if config.is_attention_normed else "relu", xp
+    )
     phi_k = phi_k * mask[:, None].astype(x.dtype)
     attended = (phi_q @ (phi_k.T @ values)) / (phi_q @ phi_k.sum(axis=0)[:, None])
     x = x + attended @ weights["output"] + weights["output_bias"]
-    if config.attention_feedforward:
+    if config.is_attention_normed:
         x = x + plain_mlp(plain_norm(x, weights, "feedforward_norm", xp), weights["feedforward"], xp)
     return x
 
@@ -154,19 +156,19 @@ def plain_normalize(rows, normalizer, num_static, xp):
     return xp.concatenate([(changing - normalizer.mean) / deviation, rows[:, changing.shape[1] :]], axis=1)
 
 
-def plain_network(config, params, graph, garment, xp=np):
+def plain_network(network, graph, garment, xp=np):
     """Return the raw output of the network; everything in the floating type of its inputs."""
-    weights, statistics = params["params"], params["statistics"]
+    config, weights, statistics = network.config, network.params, network.statistics
     nodes, edges = dict(graph.nodes), dict(graph.edges)
-    if not config.edge_latents:
+    if "encoder" in weights:
         encoded = plain_encoded_vertices(nodes, edges, graph, weights, xp)
         features = encoded
-        for layer in range(config.message_passing_steps):
+        for layer in range(config.layers):
             features = plain_smoothing(features, graph, layer_weights(weights["layers"], layer), config, xp)
-        return plain_decoder(features, encoded, params, garment, config, xp)
+        return plain_mlp(features, weights["decoder"], xp)
     encoders = {name: weights[f"{name}_encoder"] for name in ("garment", "mesh", "world")}
     encoders["world_reverse"] = encoders["world"]
-    if config.features == "hood":
+    if not config.reads_gradient:
         table = weights["type_embedding"]
         for name, rows in nodes.items():
             types = table[graph.globals[f"{name}_type"]]
@@ -182,15 +184,15 @@ def plain_network(config, params, graph, garment, xp=np):
     encoded = latents["garment"]
     for layer in range(config.message_passing_steps):
         latents = plain_layer(latents, graph, layer_weights(weights["layers"], layer), config, xp)
-    return plain_decoder(latents["garment"], encoded, params, garment, config, xp)
+    return plain_decoder(latents["garment"], encoded, network, garment, xp)
 
 
 HOOD_STAGES = ("coarse0 mesh", "coarse0 coarse1", "coarse1", "coarse0 coarse1", "coarse0 mesh")
 
 
-def plain_hood(params, graph, steps_per_stage):
+def plain_hood(network, graph):
     """Return the accelerations of the hierarchical network, before the output's normaliser, in NumPy."""
-    weights, statistics = params["params"], params["statistics"]
+    weights, statistics = network.params, network.statistics
     coarse = graph.globals["coarse"]
     level = np.max([(k + 1) * edges.is_kept for k, edges in enumerate(coarse)], axis=0)
     rows = {}
@@ -218,7 +220,7 @@ def plain_hood(params, graph, steps_per_stage):
         for k, edges in enumerate(coarse):
             if f"coarse{k}" in names:
                 joined |= edges.is_kept
-        for step in range(steps_per_stage):
+        for step in range(network.config.steps_per_stage):
             layer = layer_weights(weights[f"stages_{stage}"], step)
             rows = plain_hood_step(rows, graph, layer, names.split(), joined)
     return plain_mlp(rows["garment"], weights["decoder"], np)
@@ -269,9 +271,9 @@ def plain_smoothing(v, graph, weights, config, xp):
     return v + plain_mlp(xp.concatenate(rows, axis=1), weights["vertex_mlp"], xp)
 
 
-def plain_decoder(features, encoded, params, garment, config, xp):
+def plain_decoder(features, encoded, network, garment, xp):
     """Attention beside the layers, and the decoder on both."""
-    weights = params["params"]
+    weights, config = network.params, network.config
     if config.attention_blocks:
         x = encoded
         for block in range(config.attention_blocks):
@@ -279,7 +281,7 @@ def plain_decoder(features, encoded, params, garment, config, xp):
                 x,
                 garment.geodesic_embedding,
                 garment.vertex_mask,
-                params["constants"]["projection"],
+                network.constants["projection"],
                 layer_weights(weights["blocks"], block),
                 config,
                 xp,

@@ -17,7 +17,6 @@ KERNELS = [
     "eslr_jax.terms",
     "eslr_jax.scene.build",
     "eslr_jax.simulation.frame",
-    "eslr_jax.simulation.network",
     "eslr_jax.simulation.stepper",
     "eslr_jax.simulation.rollout",
     "eslr_jax.training.loss",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eslr_jax.config import SimConfig, TrainConfig
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.step import init_train_state, make_train_step
@@ -42,12 +42,12 @@ def run_on(device, function, *arguments):
         return jax.device_get(result)
 
 
-@pytest.mark.parametrize("config", [SimConfig(iterations=30), SimConfig(model=NETWORK, iterations=10)])
-def test_a_rollout(devices, small_scene, config):
-    params = None if config.model is None else init_model(NETWORK)
+@pytest.mark.parametrize(("model", "iterations"), [(None, 30), (NETWORK, 10)])
+def test_a_rollout(devices, small_scene, model, iterations):
+    network, config = None if model is None else model.new_network(), SimConfig(iterations=iterations)
     run = jax.jit(rollout_scene, static_argnames="config")
     cpu, gpu = (
-        run_on(device, lambda params, scene: run(params, scene, config), params, small_scene)
+        run_on(device, lambda network, scene: run(network, scene, config), network, small_scene)
         for device in devices
     )
     np.testing.assert_allclose(gpu.positions[:2], cpu.positions[:2], atol=1e-5)
@@ -70,5 +70,5 @@ def test_a_training_step(devices, small_garment, energy_set):
     for name, expected in cpu_metrics.items():
         np.testing.assert_allclose(gpu_metrics[name], expected, rtol=1e-3, atol=1e-6, err_msg=name)
     np.testing.assert_allclose(gpu.pools[0].state.position, cpu.pools[0].state.position, atol=1e-4)
-    for name, expected in cpu.params["statistics"].items():
-        np.testing.assert_allclose(gpu.params["statistics"][name].mean, expected.mean, atol=1e-4)
+    for name, expected in cpu.network.statistics.items():
+        np.testing.assert_allclose(gpu.network.statistics[name].mean, expected.mean, atol=1e-4)

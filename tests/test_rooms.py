@@ -17,7 +17,7 @@ ROOMS = [
 ]  # fmt: skip
 KERNELS = {
     "numerics", "body.lbs", "contact", "graph", "models", "terms", "physics", "scene.build", "simulation.frame",
-    "simulation.network", "simulation.stepper", "simulation.rollout",
+    "simulation.stepper", "simulation.rollout",
 }  # fmt: skip
 HOST_FILES = {"physics.validate", "terms.worn"}  # inside kernel rooms
 SHARED = {"errors", "ranges", "types", "config"}  # what kernels and host both read

@@ -61,7 +61,7 @@ def load_garment(
         pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
         cache: Keep the result for the next time.
         options: Arguments of `prepare_stored` and of `prepare_garment`; those that a network asks for are its
-            `ModelConfig.garment_options`.
+            `Network.garment_options`.
 
     Returns:
         The garment on the body's rest pose. The origin of its `rest_positions` is the body's: that of the bundled

@@ -34,6 +34,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("always", category=UserWarning, module="eslr_jax")
     warnings.showwarning = _show_warning
+    sys.path.append(os.getcwd())  # last: where networks of one's own are found, as MODULE:NAME
     try:
         _refuse_repetition(sys.argv[1:])
         try:

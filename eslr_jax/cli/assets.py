@@ -176,19 +176,20 @@ class Info:
         """Print an architecture and its number of parameters."""
         from eslr_jax.assets import load_model
         from eslr_jax.assets.catalog import is_path
-        from eslr_jax.config import to_dict
-        from eslr_jax.models.registry import MODELS, count_parameters, init_model
+        from eslr_jax.models.network import describe_system
+        from eslr_jax.models.registry import MODELS
 
         try:
-            params, config = load_model(model)
+            network = load_model(model)
         except AssetError as error:
             if is_path(model):
                 raise
             if model not in MODELS:
                 raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
-            config = MODELS[model]
-            params = init_model(config)
-        values = {"model": model, "parameters": count_parameters(params), "config": to_dict(config)}
+            network = MODELS[model].new_network()
+        values = {
+            "model": model, "parameters": network.num_parameters, "config": describe_system(network.config)
+        }  # fmt: skip
         if self.json:
             print(json.dumps(values, indent=2))
             return
@@ -216,7 +217,7 @@ class Info:
             poses = pose_body(rig, load_motion(self.motion or DEFAULT_MOTION))
             cloth = load_garment(garment, vertices=self.vertices, body=rig)
             scene = prepare_scene(cloth, poses, terms=terms, integrator="bdf2")
-            parts = describe_scene(scene, poses, method.config)
+            parts = describe_scene(scene, poses, method.params)
             costs = time_parts(method.params, scene, method.config)
         if self.json:
             print(json.dumps({**dataclasses.asdict(parts), "cost_ms": costs}, indent=2))

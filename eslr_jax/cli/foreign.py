@@ -201,16 +201,14 @@ class Convert:
 
     def __call__(self) -> None:
         """Read the checkpoint and write the network."""
-        from eslr_jax.io.hood import read_hood
-        from eslr_jax.io.weights import write_weights
-        from eslr_jax.models.registry import check_params, count_parameters
+        from eslr_jax.assets.hood import read_hood
+        from eslr_jax.assets.weights import write_network
 
         out = self.out
         if out.suffix != ".npz":
             raise AssetError(
                 f"--out {out}: a network is written as an npz file; name it such as {out.stem}.npz"
             )
-        params, config = read_hood(self.checkpoint)
-        check_params(config, params)
-        write_weights(out, params, config, {"converted_from": self.checkpoint.name})
-        print(f"{out}: {count_parameters(params):,} parameters")
+        network = read_hood(self.checkpoint)
+        write_network(out, network, {"converted_from": self.checkpoint.name})
+        print(f"{out}: {network.num_parameters:,} parameters")

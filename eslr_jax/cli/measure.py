@@ -228,12 +228,11 @@ class Evaluate(EvaluationOptions):
         from eslr_jax.evaluation.evaluate import evaluate
         from eslr_jax.evaluation.report import environment
 
-        params, architecture = load_model(self.model)
+        network = load_model(self.model)
         use_compile_cache()
         with progress("evaluating", 1) as advance:
             result = evaluate(
-                params,
-                architecture,
+                network,
                 self,
                 iterations=self.iterations,
                 on_scene=lambda done, total, label: advance(done, total),

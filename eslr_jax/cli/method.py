@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from eslr_jax.cli.options import Options, parse_budget, parse_share
@@ -12,6 +12,7 @@ from eslr_jax.errors import ConfigError
 
 if TYPE_CHECKING:
     from eslr_jax.config import SimConfig
+    from eslr_jax.models.network import Network
 
 BEHIND_NETWORK = 10  # iterations of the solver after a network
 _ITERATIONS = (
@@ -26,16 +27,16 @@ _FRAME_BYTES = 240
 class Method(NamedTuple):
     """How frames are solved, and by when."""
 
-    network: str | None
-    params: Any  # weights; None without a network
+    network: str | None  # its name
+    params: Network | None
     config: SimConfig
     budget_ms: float | None = None
     pace: Callable[[int, float], int] | None = None  # of a budget
 
     @property
-    def garment_options(self) -> dict[str, Any]:
+    def garment_options(self) -> Mapping[str, Any]:
         """What the network asks of a garment."""
-        return getattr(self.config.model, "garment_options", {})
+        return {} if self.params is None else self.params.garment_options
 
     @property
     def tolerance(self) -> float | None:
@@ -114,5 +115,4 @@ def choose_method(options: Options) -> Method:
         stops = {"iterations": iterations, "tolerance": 0.0}
     elif budget_ms is not None:
         stops = {"tolerance": 0.0}
-    params, architecture = (None, None) if network is None else load_model(network)
-    return Method(network, params, SimConfig(model=architecture, **stops), budget_ms)
+    return Method(network, None if network is None else load_model(network), SimConfig(**stops), budget_ms)

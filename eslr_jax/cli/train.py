@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import tyro
 from rich.progress import (
@@ -20,7 +20,7 @@ from rich.progress import (
 )
 
 from eslr_jax.cli.console import app, say, stderr, use_compile_cache
-from eslr_jax.config import TrainConfig, from_dict, parse_override, to_dict
+from eslr_jax.config import TrainConfig, parse_override
 from eslr_jax.errors import ConfigError
 from eslr_jax.extras import require
 from eslr_jax.io.parsing import one_line
@@ -59,14 +59,13 @@ class Train:
     def __call__(self) -> None:
         """Train, draw the curves, and print where the networks are."""
         from eslr_jax.assets.models import load_model, model_record
-        from eslr_jax.models.registry import check_params
         from eslr_jax.training.loop import is_first_process, train
         from eslr_jax.training.memory import keep_memory
         from eslr_jax.training.plot import plot_curves
         from eslr_jax.training.seeds import seed_folders
 
         if self.keys:
-            _show_keys()
+            return _show_keys()
         out = self.out
         if out is None:
             raise ConfigError("no --out; name a folder for metrics, checkpoints and the network")
@@ -77,15 +76,11 @@ class Train:
             self._join_processes(self.coordinator)
         initial, earlier = None, {}
         if self.start_from is not None:
-            initial, _ = load_model(self.start_from)
-            earlier = model_record(self.start_from)
-            check_params(chosen.model, initial)
+            initial, earlier = load_model(self.start_from), model_record(self.start_from)
         with _training_progress(
             chosen.steps, out if self.tensorboard and is_first_process() else None
         ) as show:
-            state = train(
-                chosen, out, resume=self.resume, initial_params=initial, earlier=earlier, on_progress=show
-            )
+            state = train(chosen, out, resume=self.resume, initial=initial, earlier=earlier, on_progress=show)
         if not is_first_process():
             return
         folders = seed_folders(chosen, out)
@@ -105,7 +100,7 @@ class Train:
             ConfigError: There is none, or options contradict each other.
         """
         from eslr_jax.training.checkpoint import read_run_config
-        from eslr_jax.training.recipe import load_recipe
+        from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config
 
         is_alone = self.coordinator is None
         if is_alone and (self.num_processes is not None or self.process_id is not None):
@@ -119,7 +114,7 @@ class Train:
                     "--resume goes on with the run's own configuration; leave out --config, --start-from, and "
                     "every --set but steps=N, which extends the run, or start a new one in another folder"
                 )
-            return from_dict(TrainConfig, to_dict(read_run_config(out)) | changes)
+            return read_train_config(describe_train_config(read_run_config(out)) | changes)
         if self.config is None:
             raise ConfigError("no --config; give a TOML file, such as one of experiments/configs")
         return load_recipe(self.config, changes)
@@ -143,17 +138,34 @@ class Train:
             raise ConfigError(f"the processes could not be joined: {text}; check --coordinator") from error
 
 
-def _show_keys() -> NoReturn:
-    """Print the keys of a configuration with their defaults and what their comments say, and end."""
-    tyro.cli(
-        TrainConfig,
-        prog="eslr train --keys",
-        description="Keys of a recipe in TOML, and of --set: write --steps below as steps=20000.",
-        args=["--help"],
-        use_underscores=True,
-        config=(tyro.conf.FlagConversionOff,),
-    )
-    raise SystemExit
+@dataclasses.dataclass(frozen=True)
+class _Keys(TrainConfig):
+    """A recipe as it is written."""
+
+    # Network: a name, or a table [model] with that as base and keys that differ; MODULE:NAME for one's own.
+    model: str
+
+
+def _show_keys() -> None:
+    """Print the keys of a configuration and of every system, with defaults and what their comments say."""
+    from eslr_jax.models.registry import MODELS
+
+    systems = {type(model) for model in MODELS.values()}
+    described: dict[type, str] = {
+        _Keys: "Keys of a recipe in TOML, and of --set: write --steps below as steps=20000."
+    }
+    for system in sorted(systems, key=lambda system: system.__name__):
+        names = ", ".join(name for name, model in MODELS.items() if type(model) is system)
+        described[system] = f"Keys of [model] with base = {names}; of --set as model.KEY."
+    for keys, description in described.items():
+        parser = tyro.extras.get_parser(
+            keys,
+            prog="eslr train --keys",
+            description=description,
+            use_underscores=True,
+            config=(tyro.conf.FlagConversionOff,),
+        )
+        print(parser.format_help())
 
 
 @contextlib.contextmanager

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from eslr_jax.assets import load_body, load_garment, load_model, load_motion
 from eslr_jax.body.motion import pose_body
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.scene_parts import Name, time_in_turns
+from eslr_jax.models.network import Network
 from eslr_jax.scene.plan import first_frames, prepare_scene
 from eslr_jax.simulation.budget import SOLVER, Calibration, Cost, device_name
 from eslr_jax.simulation.rollout import rollout_scene
@@ -50,8 +50,8 @@ def example_scene(
 
 def read_coarse_edges(names: tuple[str, ...]) -> bool:
     """Return whether any of some methods reads coarse edges, which its garment then needs."""
-    architectures = [simulator_of(name)[1].model for name in names]
-    return any(isinstance(model, ModelConfig) and model.hierarchical for model in architectures)
+    networks = [load_model(name) for name in names if name != SOLVER]
+    return any(network.garment_options.get("has_coarse_edges") for network in networks)
 
 
 def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
@@ -91,32 +91,32 @@ def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, f
     }, iteration_ms
 
 
-def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tuple[Any, SimConfig]:
-    """Return weights and configuration of a method: the solver, or a network with the solver behind it.
+def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tuple[Network | None, SimConfig]:
+    """Return network and configuration of a method: the solver, or a network with the solver behind it.
 
     Args:
-        name: SOLVER, whose weights are None, or the name of a bundled network.
+        name: SOLVER, which has no network, or the name of a bundled network.
         iterations: Of the solver, per frame.
         tolerance: See `SimConfig`.
     """
-    params, model = (None, None) if name == SOLVER else load_model(name)
-    return params, SimConfig(model=model, iterations=iterations, tolerance=tolerance)
+    network = None if name == SOLVER else load_model(name)
+    return network, SimConfig(iterations=iterations, tolerance=tolerance)
 
 
 def time_frames(
-    runs: Mapping[Name, tuple[Any, SimConfig, int | None]], scene: Scene, turns: int = _TURNS
+    runs: Mapping[Name, tuple[Network | None, SimConfig, int | None]], scene: Scene, turns: int = _TURNS
 ) -> dict[Name, list[float]]:
     """Return milliseconds per frame of rollouts, one number per turn.
 
     Args:
-        runs: Weights, configuration and iterations by name, see `rollout_scene`; all are rolled out in turns.
+        runs: Network, configuration and iterations by name, see `rollout_scene`; all are rolled out in turns.
         scene: Its first frames are simulated.
         turns: Rollouts of each.
     """
     short = first_frames(scene, _TIMED_FRAMES)
     parts = {
-        name: (partial(rollout_scene, config=config, iterations=iterations), (params, short))
-        for name, (params, config, iterations) in runs.items()
+        name: (partial(rollout_scene, config=config, iterations=iterations), (network, short))
+        for name, (network, config, iterations) in runs.items()
     }
     return {
         name: [whole / (short.num_frames - 1) for whole in values]

@@ -3,41 +3,39 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from eslr_jax.config import Control, ModelConfig
+from eslr_jax.config import Control
 from eslr_jax.errors import ConfigError
-from eslr_jax.models.registry import init_model
+from eslr_jax.models.network import Network
 from eslr_jax.types import Garment
 
 EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 
 
-def control_params(control: Control, params: Any, config: ModelConfig) -> Any:
-    """Return weights without what a control takes away.
+def control_network(control: Control, network: Network) -> Network:
+    """Return a network without what a control takes away.
 
     Args:
         control: "untrained" has weights of a new network, on the trained one's statistics of features.
             "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
-        params: Weights of the trained network.
-        config: Architecture.
+        network: The trained network, one of this package's.
 
     Raises:
         ConfigError: The network has no such part.
     """
-    if control in EMBEDDING_CONTROLS and not config.attention_blocks:
+    if control in EMBEDDING_CONTROLS and not getattr(network.config, "attention_blocks", 0):
         raise ConfigError(f"control {control} takes geodesic coordinates away, which only attention reads")
     if control == "untrained":
-        return {**params, "params": init_model(config)["params"]}
+        return network.replace(params=network.config.new_network().params)
     if control == "no_decoder":
-        decoder, last = params["params"]["decoder"], config.hidden_layers
+        decoder, last = network.params["decoder"], network.config.hidden_layers
         names = (f"kernel_{last}", f"bias_{last}")
         zeros = {name: jnp.zeros_like(decoder[name]) for name in names}
-        return {**params, "params": {**params["params"], "decoder": {**decoder, **zeros}}}
-    return params
+        return network.replace(params={**network.params, "decoder": {**decoder, **zeros}})
+    return network
 
 
 def control_garment(control: Control, garment: Garment) -> Garment:

@@ -1,4 +1,4 @@
-"""Evaluate a model on a split: optimality gap, and free rollouts (host)."""
+"""Evaluate a network on a split: optimality gap, and free rollouts (host)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.assets import load_body, load_garment, load_motion, load_splits, split_clips
 from eslr_jax.body.motion import back_and_forth, pose_body, still_motion
-from eslr_jax.config import EvaluationOptions, ModelConfig, SimConfig
+from eslr_jax.config import EvaluationOptions, SimConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.evaluation.controls import control_garment, control_params
+from eslr_jax.evaluation.controls import control_garment, control_network
 from eslr_jax.evaluation.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
 from eslr_jax.evaluation.report import mean_energies
 from eslr_jax.geometry.prepare import pad_alike
+from eslr_jax.models.network import Network
 from eslr_jax.scene.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
 from eslr_jax.types import Scene, Trajectory
@@ -31,18 +32,16 @@ _REACH = 0.06  # [m] of cloth, within which a body vertex counts as covered
 
 
 def evaluate(
-    params: Any,
-    model: ModelConfig,
+    network: Network,
     options: EvaluationOptions,
     *,
     iterations: int = 0,
     on_scene: Callable[[int, int, str], None] = lambda done, total, label: None,
 ) -> dict[str, Any]:
-    """Evaluate a model.
+    """Evaluate a network.
 
     Args:
-        params: Weights.
-        model: Architecture.
+        network: The network.
         options: Split, garments, clips and lengths.
         iterations: Solver iterations behind the network.
         on_scene: Called after each garment and clip with the count, the total and a label.
@@ -58,16 +57,16 @@ def evaluate(
         raise ConfigError(f"iterations = {iterations}; give 0 or more")
     garments = options.garments or tuple(load_splits()["garments"]["train"])
     clips = options.clips or split_clips(options.split)
-    config = SimConfig(model=model, iterations=iterations, tolerance=0.0)
+    config = SimConfig(iterations=iterations, tolerance=0.0)
     body = load_body()
     scenes, forced, policy = [], [], []
     drifts: dict[str, float | None] = {}
     total = len(garments) * len(clips)
     # Padded to one bucket: all scenes then share one compiled rollout.
-    load = partial(load_garment, vertices=options.vertices, **model.garment_options)  # type: ignore[arg-type]
+    load = partial(load_garment, vertices=options.vertices, **network.garment_options)  # type: ignore[arg-type]
     cloths = pad_alike([load(name) for name in garments])
     if options.control is not None:
-        params = control_params(options.control, params, model)
+        network = control_network(options.control, network)
         cloths = [control_garment(options.control, cloth) for cloth in cloths]
     surface = shared_surface(cloths, body)
     for garment, cloth in zip(garments, cloths, strict=True):
@@ -79,11 +78,11 @@ def evaluate(
                 return prepare_scene(cloth, poses, surface=surface)
 
             if options.gap_frames:
-                on_truth, on_policy = _gaps(params, scene_of(options.gap_frames), config, options.every)
+                on_truth, on_policy = _gaps(network, scene_of(options.gap_frames), config, options.every)
                 forced.append(on_truth)
                 policy.append(on_policy)
             scene = scene_of(options.rollout_frames)
-            free = _roll(params, scene, config)
+            free = _roll(network, scene, config)
             optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
             apart = distance_mm(free, optimum, scene)
             row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
@@ -91,7 +90,7 @@ def evaluate(
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
         resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
-        drifts[garment] = _drift(params, resting, config)
+        drifts[garment] = _drift(network, resting, config)
     known = [drift for drift in drifts.values() if drift is not None]
     largest = max(known) if len(known) == len(drifts) else None
     return {
@@ -105,23 +104,26 @@ def evaluate(
     }
 
 
-def _gaps(params: Any, scene: Scene, config: SimConfig, every: int) -> tuple[OptimalityGap, OptimalityGap]:
+def _gaps(
+    network: Network, scene: Scene, config: SimConfig, every: int
+) -> tuple[OptimalityGap, OptimalityGap]:
     """Return the gaps from the optimum's states and from those of the network's own rollout."""
     options = GapOptions(every=every, refined=(config.iterations,))
     measured = []
-    for weights, steps in ((None, SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)), (params, config)):
-        trajectory = _roll(weights, scene, steps)
-        measured.append(jax.device_get(measure_gap(params, trajectory, scene, config.model, options)))
+    truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
+    for stepper, steps in ((None, truth), (network, config)):
+        trajectory = _roll(stepper, scene, steps)
+        measured.append(jax.device_get(measure_gap(network, trajectory, scene, options)))
     return measured[0], measured[1]
 
 
-def _roll(params: Any, scene: Scene, config: SimConfig) -> Trajectory:
+def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:
     """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on.
 
     Raises:
         EslrError: The solver's rollout goes wrong.
     """
-    simulation = simulate(params, scene, config=config, raises=params is None)
+    simulation = simulate(network, scene, config=config, raises=network is None)
     return hold_last(simulation.trajectory, scene.num_frames)
 
 
@@ -166,12 +168,12 @@ def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _drift(params: Any, scene: Scene, config: SimConfig) -> float | None:
+def _drift(network: Network, scene: Scene, config: SimConfig) -> float | None:
     """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s].
 
     None where the rollout went wrong: it stands still from there on.
     """
-    trajectory = _roll(params, scene, config)
+    trajectory = _roll(network, scene, config)
     if Status(int(trajectory.status)) != Status.OK:
         return None
     areas = np.asarray(scene.garment.vertex_areas)

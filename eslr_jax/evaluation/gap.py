@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
+from eslr_jax.models.network import Network
 from eslr_jax.physics.lbfgs import unknown_point
 from eslr_jax.physics.potential import potential
 from eslr_jax.physics.solve import Start, solve
@@ -94,12 +95,11 @@ class GapOptions(NamedTuple):
     refined: tuple[int, ...] = (0,)  # of the solver from a network's prediction
 
 
-@partial(jax.jit, static_argnames=("model", "options"))
+@partial(jax.jit, static_argnames="options")
 def measure_gap(
-    params: Any,
+    network: Network | None,
     trajectory: Trajectory,
     scene: Scene,
-    model: ModelConfig | None = None,
     options: GapOptions | None = None,
 ) -> OptimalityGap:
     """Compare a network, the solver after few iterations, and the optimum, from the states of a trajectory.
@@ -107,10 +107,9 @@ def measure_gap(
     The states are teacher-forced where the trajectory is the optimum's own, on-policy where it is the network's.
 
     Args:
-        params: Weights of the network; None without one.
+        network: The network; None compares the solver alone.
         trajectory: Supplies the states.
         scene: Its scene.
-        model: Architecture of the network; None compares the solver alone. Static.
         options: What to compare with; static.
     """
     options = options or GapOptions()
@@ -118,16 +117,16 @@ def measure_gap(
     taken = jax.tree.map(lambda leaf: leaf[1 :: options.every], (states, inputs, trajectory.positions[1:]))
     counts = [*options.iterations, _OPTIMUM_ITERATIONS]
     rows = [0] * len(counts)  # 0: from the solver's guess, 1: from the network's prediction
-    if model is not None:
+    if network is not None:
         counts += [*options.refined, _OPTIMUM_ITERATIONS]
         rows += [1] * (len(counts) - len(rows))
 
     def measure(frame):
         state, inputs, reached = frame
         problem = frame_problem(scene, state, inputs)
-        starts = [find_start(None, problem, state, SimConfig())[0]]
-        if model is not None:
-            starts.append(find_start(params, problem, state, SimConfig(model=model))[0])
+        starts = [find_start(None, problem, state)[0]]
+        if network is not None:
+            starts.append(find_start(network, problem, state)[0])
         # Stacked, so that the solver is compiled once: all have a previous point, or stand for it themselves.
         stacked = jax.tree.map(
             lambda *leaves: jnp.stack(leaves),
@@ -143,7 +142,7 @@ def measure_gap(
         split = len(options.iterations)
         solver = dict(zip(options.iterations, values[:split], strict=True))
         optimum, refined = values[split], {}
-        if model is not None:
+        if network is not None:
             refined = dict(zip(options.refined, values[split + 1 : -1], strict=True))
             # The network may begin in the basin of a deeper minimum than the solver finds.
             optimum = jnp.minimum(optimum, values[-1])
@@ -166,19 +165,19 @@ def gap_medians(ends: OptimalityGap, energy: Float[Array, " frames"]) -> dict[st
 
 @partial(jax.jit, static_argnames=("config", "every"))
 def stepped_potentials(
-    params: Any, trajectory: Trajectory, scene: Scene, config: SimConfig, every: int
+    network: Network | None, trajectory: Trajectory, scene: Scene, config: SimConfig, every: int
 ) -> Float[Array, " frames"]:
     """Return the potential [J] that a simulator's single frames end with, from the states of a trajectory.
 
     Args:
-        params: Weights of its network; None without one.
+        network: Its network, or None.
         trajectory: Supplies the states.
         scene: Its scene.
-        config: Network and iterations; static.
+        config: Iterations and tolerance; static.
         every: Take every so many frames, as `GapOptions` does; static.
     """
     frames = jax.tree.map(lambda leaf: leaf[1::every], trajectory_states(trajectory, scene))
-    stepper = make_stepper(params, config)
+    stepper = make_stepper(network, config)
 
     def measure(frame: tuple[ClothState, FrameInput]) -> Float[Array, ""]:
         state, inputs = frame
@@ -193,7 +192,7 @@ def trajectory_gap(trajectory: Trajectory, scene: Scene, *, every: int) -> Optim
 
     The arguments are those of `measure_gap`.
     """
-    return measure_gap(None, trajectory, scene, None, GapOptions(every, (), ()))
+    return measure_gap(None, trajectory, scene, GapOptions(every, (), ()))
 
 
 def map_frames(

@@ -5,19 +5,19 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Hashable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
 
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.report import describe_terms
+from eslr_jax.models.network import Network
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.physics.preconditioner import solve_stiffness, stretched_stiffness
 from eslr_jax.physics.solve import Start, solve
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.terms import Air, Damping, scene_terms
@@ -36,13 +36,13 @@ class SceneParts:
     left_out: dict[str, str]
 
 
-def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneParts:
+def describe_scene(scene: Scene, poses: BodyMotion, network: Network | None) -> SceneParts:
     """Return what a scene models.
 
     Args:
         scene: Of `prepare_scene`.
         poses: The motion it was made from.
-        config: Says whether there is a network.
+        network: Of the simulation, or None.
     """
     modelled = describe_terms(scene)
     known = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.0))
@@ -65,23 +65,23 @@ def describe_scene(scene: Scene, poses: BodyMotion, config: SimConfig) -> SceneP
         modelled["BDF2"] = "swinging cloth keeps its energy"
     if scene.substeps > 1:
         modelled["substeps"] = f"{scene.substeps} a frame"
-    sort("network", config.model is not None, "before the solver", "solver alone")
+    sort("network", network is not None, "before the solver", "solver alone")
     return SceneParts(modelled, left_out)
 
 
-def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]:
+def time_parts(network: Network | None, scene: Scene, config: SimConfig) -> dict[str, float]:
     """Return milliseconds of each part of one frame on this device; the parts are timed alternately.
 
     Args:
-        params: Weights of the network; None without one.
+        network: A network, or None.
         scene: Of `prepare_scene`.
-        config: Network, iterations and tolerance.
+        config: Iterations and tolerance.
     """
     state = scene.initial_state
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     problem = jax.jit(frame_problem)(scene, state, inputs)
     guess = jax.jit(initial_guess)(problem)
-    stepper = make_stepper(params, config)
+    stepper = make_stepper(network, config)
     parts: dict[str, tuple[Callable, tuple]] = {
         "gradient of the potential": (lambda x: evaluate(x, problem), (guess.position,)),
         "preconditioner": (lambda x: solve_stiffness(stretched_stiffness(problem, x), x), (guess.position,)),
@@ -96,9 +96,8 @@ def time_parts(params: Any, scene: Scene, config: SimConfig) -> dict[str, float]
     }
     if scene.body is not None:
         parts["searches for contacts"] = (lambda state: frame_problem(scene, state, inputs), (state,))
-    if config.model is not None:
-        model = config.model
-        parts["network"] = (lambda state: predict(params, problem, state, model).position, (state,))
+    if network is not None:
+        parts["network"] = (lambda state: network.predict(problem, state).position, (state,))
     return take_turns(parts)
 
 

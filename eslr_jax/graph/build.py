@@ -4,12 +4,12 @@ Nodes, edges, senders and receivers are dictionaries:
 
 - nodes "garment" [vertices, features] and, beside a body, "body" [vertices, features];
 - edges "mesh" [edges, features] in both directions, sorted by receiver;
-- with `ModelConfig.hierarchical`, edges "coarse0" to "coarse2" [coarse_edges, features] of the coarse levels;
-- beside a body, edges "world" [vertices, features] from body to garment, and with `ModelConfig.update_body`
+- with `GraphKind.has_coarse_edges`, edges "coarse0" to "coarse2" [coarse_edges, features] of the coarse levels;
+- beside a body, edges "world" [vertices, features] from body to garment, and with `GraphKind.has_reverse_edges`
   "world_reverse" [vertices, features] from garment to body.
 
 World edge w joins body row w to garment vertex w, so layers pair the rows and gather nothing. Vertices
-beyond `ModelConfig.world_edge_radius` have rows of zeros, and `globals["world_mask"]` leaves them out.
+beyond `GraphKind.world_edge_radius` have rows of zeros, and `globals["world_mask"]` leaves them out.
 Messages along mesh edges follow `senders["mesh"]`, `receivers["mesh"]` and the two tables in `globals` that
 go with them: `Topology` names all entries of `globals`.
 
@@ -20,20 +20,33 @@ them a graph of one set. Networks map over scenes with `jax.vmap` in the place o
 
 from __future__ import annotations
 
-from typing import TypedDict, cast
+from typing import NamedTuple, TypedDict, cast
 
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.config import COARSE_SETS, ModelConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.graph import features
 from eslr_jax.graph.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
 
+COARSE_SETS = ("coarse0", "coarse1", "coarse2")
+"""Edge sets of a garment's coarse levels, finest first (HOOD)."""
+
+NUM_LEVELS = len(COARSE_SETS) + 1  # of a vertex; 0 is on the mesh alone
+
 Rows = dict[str, Float[Array, "_ _"]]
+
+
+class GraphKind(NamedTuple):
+    """What a network reads of a frame; static."""
+
+    reads_gradient: bool  # scaled features with the potential's gradient, in the place of HOOD's
+    has_coarse_edges: bool = False
+    has_reverse_edges: bool = False  # from garment to body, for networks that update body rows
+    world_edge_radius: float = 0.03  # [m] (HOOD)
 
 
 class Topology(TypedDict, total=False):
@@ -49,7 +62,7 @@ class Topology(TypedDict, total=False):
 
 
 def build_graph(
-    garment: Garment, material: Material, inputs: GraphInputs, config: ModelConfig
+    garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
     """Return the graph of a frame, or of one refinement step.
 
@@ -57,19 +70,19 @@ def build_graph(
         garment: Rest mesh and topology.
         material: Fabric.
         inputs: State of garment and body.
-        config: Architecture, which decides on features and world edges; static.
+        kind: Features and sets of edges; static.
 
     Raises:
         ConfigError: The network is hierarchical and the garment has no coarse levels.
     """
-    graph = build_frame_graph(garment, material, inputs, config)
-    if config.features == "hood":
+    graph = build_frame_graph(garment, material, inputs, kind)
+    if not kind.reads_gradient:
         return graph
     return join_features(graph, build_refinement_graph(garment, material, inputs, graph))
 
 
 def build_frame_graph(
-    garment: Garment, material: Material, inputs: GraphInputs, config: ModelConfig
+    garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
     """Return the graph with the features that stay for a whole frame, which are all of HOOD's.
 
@@ -77,9 +90,9 @@ def build_frame_graph(
         garment: Rest mesh and topology.
         material: Fabric.
         inputs: State of garment and body.
-        config: Architecture, which decides on features and world edges; static.
+        kind: Features and sets of edges; static.
     """
-    is_hood = config.features == "hood"
+    is_hood = not kind.reads_gradient
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
         "incoming_edges": incoming_edges(garment.neighbor_mask, garment.receivers.shape[0]),
@@ -93,7 +106,7 @@ def build_frame_graph(
         spacing = topology["edge_length"] = features.mean_edge_length(garment, garment)
         nodes = {"garment": features.frame_node_features(garment, material, inputs, spacing)}
         edges = {"mesh": features.frame_mesh_features(garment, inputs.position, garment, spacing)}
-    if config.hierarchical:
+    if kind.has_coarse_edges:
         if garment.coarse is None:
             raise ConfigError(
                 "the network is hierarchical and the garment has no coarse levels; add_coarse_edges adds them"
@@ -113,14 +126,14 @@ def build_frame_graph(
         away = inputs.contacts.distances
         if is_hood:
             away = safe_norm(inputs.contacts.points - inputs.position)
-        mask = (jnp.abs(away) <= config.world_edge_radius) & garment.vertex_mask
+        mask = (jnp.abs(away) <= kind.world_edge_radius) & garment.vertex_mask
         topology["world_mask"] = mask
         if is_hood:
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
         body, world = _world_rows(inputs.contacts, inputs, is_hood)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
         senders["world"] = receivers["world"] = jnp.arange(mask.shape[0])
-        if config.update_body:
+        if kind.has_reverse_edges:
             edges["world_reverse"] = features.reverse_world_features(edges["world"])
             senders["world_reverse"] = receivers["world_reverse"] = senders["world"]
     return jraph.GraphsTuple(
@@ -193,9 +206,9 @@ def join_features(frame_graph: jraph.GraphsTuple, changing: jraph.GraphsTuple) -
     return frame_graph._replace(nodes=nodes, edges=edges)
 
 
-def feature_sizes(config: ModelConfig) -> dict[str, int]:
+def feature_sizes(kind: GraphKind) -> dict[str, int]:
     """Return the number of columns of every kind of row that `build_graph` makes."""
-    if config.features == "hood":
+    if not kind.reads_gradient:
         return {
             "garment": features.HOOD_NODE_SIZE,
             "body": features.HOOD_NODE_SIZE,

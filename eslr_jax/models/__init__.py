@@ -11,5 +11,5 @@ Symbols of the paper and where they stand:
 | p_i, f'_v: smoothed latents and their perceptron, eqs. 3 and 4 | `propagate`, `smooth_mlp` of `LsdmpLayer` |
 | E_G: geodesic embedding | `Garment.geodesic_embedding` |
 | Q, K, V and the attention of GSA | `query`, `key`, `value` of `gsa.GsaBlock`, `attention.linear_attention` |
-| A: accelerations | `registry.scale_output` of the decoder's output |
+| A: accelerations | `apply.scale_output` of the decoder's output |
 """

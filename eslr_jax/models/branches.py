@@ -1,93 +1,84 @@
-"""What every network has behind its encoders: stacks of layers, the attention branch beside them, the decoder."""
+"""What every network has behind its encoders: stacks of layers, and the decoder."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+import dataclasses
+from typing import Any, ClassVar, Literal, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import jraph
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig
-from eslr_jax.errors import ConfigError
 from eslr_jax.graph.build import Topology
-from eslr_jax.models.gsa import GsaBlock
+from eslr_jax.models.architecture import Architecture
+from eslr_jax.models.attention import orthogonal_projection
 from eslr_jax.models.mlp import MLP
 
 CORRECTION_GAIN = 0.02  # a new network hardly moves the guess that it corrects
-OUTPUT_SIZE = {"acceleration": 3, "correction": 3, "descent": 5, "subspace": 5}  # a vector, and two gates
 
 
-class Places(NamedTuple):
-    """Where the garment's vertices lie on it."""
+@dataclasses.dataclass(frozen=True)
+class TwoBranches(Architecture):
+    """Options of a network whose decoder reads a stack of LSDMP layers and one of GSA blocks.
 
-    embedding: Float[Array, "vertices embedding"]  # geodesic embedding [m]
-    mask: Bool[Array, " vertices"]  # vertices that are not padding
+    The paper is silent on the fields marked "open". Their defaults fit its parameter counts, or else follow
+    MeshGraphNet and HOOD. `models.lsdmp` lists the open points that are no options.
+    """
 
+    message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
+    smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
+    attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
+    attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
+    attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
+    embedding_size: int = 8  # open: k of the geodesic embedding
+    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
+    seed: int = 0  # of the random attention features
 
-class TwoBranches(nn.Module):
-    """A network whose decoder reads a stack of layers and, with `attention_blocks`, one of GSA blocks."""
+    is_attention_normed: ClassVar[bool] = False  # see `gsa.GsaBlock`
 
-    config: ModelConfig
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """Arguments of `assets.load_garment` for a garment that the network reads."""
+        return {"embedding_size": self.embedding_size, "embedding_mode": self.embedding_mode}
 
-    def declare_decoder(self) -> None:
-        """Declare the attention branch and the decoder; for `setup`."""
-        config, size = self.config, self.config.latent_size
-        if config.attention_blocks:
-            self.blocks = stack(GsaBlock, config, config.attention_blocks)
-            shape = (config.attention_features, config.attention_size)
-            self.projection = self.variable("constants", "projection", jnp.zeros, shape)
-        self.decoder = MLP(
-            2 * size if config.attention_blocks else size,
-            size,
-            OUTPUT_SIZE[config.output],
-            config.hidden_layers,
-            norm=False,
-            output_gain=1.0 if config.output == "acceleration" else CORRECTION_GAIN,
-            precision=config.precision,
-        )
-
-    def decode(
-        self,
-        processed: Float[Array, "vertices latent"],
-        encoded: Float[Array, "vertices latent"],
-        places: Places,
-    ) -> Float[Array, "vertices outputs"]:
-        """Run the attention branch and decode.
-
-        Args:
-            processed: Vertex latents behind the stack of layers, shape [vertices, latent].
-            encoded: Vertex latents of the encoder, from which attention starts, shape [vertices, latent].
-            places: Embedding and mask of the vertices.
-
-        Raises:
-            ConfigError: The garment has another number of geodesic coordinates than the network reads.
-        """
-        config = self.config
-        hidden = self.decoder.start(processed, 0, bias=True)
-        if config.attention_blocks:
-            size = places.embedding.shape[1]
-            if size != config.embedding_size:
-                raise ConfigError(
-                    f"the garment has {size} geodesic coordinates and the model embedding_size = "
-                    f"{config.embedding_size}; prepare the garment with that embedding_size"
-                )
-            attended, _ = self.blocks(encoded, (*places, self.projection.value))
-            hidden = hidden + self.decoder.start(attended, config.latent_size)
-        return self.decoder.finish(hidden)
+    def draw_constants(self) -> dict[str, Any]:
+        """Return the random directions of the attention."""
+        if not self.attention_blocks:
+            return {}
+        directions = orthogonal_projection(self.attention_features, self.attention_size, self.seed)
+        return {"projection": jnp.asarray(directions, jnp.float32)}
 
 
-def stack(module: type[nn.Module], config: ModelConfig, length: int, **attributes: Any) -> nn.Module:
+def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
+    """Return the decoder of latents of one or more branches, into a vector and gates.
+
+    Args:
+        config: Architecture.
+        num_branches: Whose latents stand side by side.
+    """
+    size = config.latent_size
+    return MLP(
+        num_branches * size,
+        size,
+        5 if config.has_gates else 3,
+        config.hidden_layers,
+        norm=False,
+        output_gain=CORRECTION_GAIN if config.reads_gradient else 1.0,
+        precision=config.precision,
+    )
+
+
+def stack(module: type[nn.Module], config: Architecture, length: int, **attributes: Any) -> nn.Module:
     """Return `length` copies of a module, each with its own weights, compiled once.
 
-    `ModelConfig.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
+    `Architecture.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
     results of its matrix products ("products"), or its inputs alone ("layers": a third of the memory, for a
     quarter more time).
 
     Args:
-        module: Class of the module, with `ModelConfig` as its first attribute.
+        module: Class of the module, with the configuration as its first attribute.
         config: Architecture.
         length: Number of copies.
         **attributes: Other attributes of the module.

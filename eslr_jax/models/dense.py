@@ -21,7 +21,7 @@ TALL = 512  # rows from which a weight gradient pays for a transposed copy
 def kernel_spread(gain: float | int):
     """Return an initialiser that fills a kernel with the standard deviation of its weights.
 
-    `registry.init_model` multiplies the kernels by normal numbers from NumPy. These are the same on every
+    `architecture.draw_weights` multiplies the kernels by normal numbers from NumPy. These are the same on every
     machine, and no random generator is compiled per kernel, which would take seconds.
 
     Args:

@@ -11,8 +11,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from eslr_jax.config import ModelConfig
 from eslr_jax.models import attention
+from eslr_jax.models.branches import TwoBranches
 from eslr_jax.models.dense import add_bias, kernel_spread, layer_norm, matmul
 from eslr_jax.models.mlp import MLP
 
@@ -23,11 +23,11 @@ QUERY_GAIN = 0.3  # initial size of queries and keys: random features are accura
 class GsaBlock(nn.Module):
     """x + W_o attention(W_q [x, E_G], W_k [x, E_G], W_v x), one head, linear in the vertices.
 
-    `attention_norm` puts a LayerNorm in front and `attention_feedforward` a perceptron behind. Both are off
-    in the paper's reading, whose parameter count has no room for them.
+    `is_attention_normed` puts a LayerNorm in front, which keeps q and k small for features of the softmax, and a
+    perceptron behind. The paper's parameter count has no room for them.
     """
 
-    config: ModelConfig
+    config: TwoBranches
 
     @nn.compact
     def __call__(
@@ -45,7 +45,7 @@ class GsaBlock(nn.Module):
         """
         config, (embedding, mask, projection) = self.config, inputs
         size, width, precision = config.attention_size, config.latent_size, config.precision
-        here = self._norm("attention_norm", x) if config.attention_norm else x
+        here = self._norm("attention_norm", x) if config.is_attention_normed else x
         located = jnp.concatenate([here, (embedding / EMBEDDING_UNIT).astype(x.dtype)], axis=1)
 
         def project(name: str, rows, gain: float, outputs: int):
@@ -56,14 +56,14 @@ class GsaBlock(nn.Module):
         keys = project("key", located, QUERY_GAIN, size)
         values = project("value", here, 1.0, size)
         directions = projection.astype(x.dtype)
-        if config.attention_kernel == "softmax":
+        if config.is_attention_normed:
             features = attention.softmax_features(queries, keys, directions, mask)
         else:
             features = attention.relu_features(queries, keys, directions)
         mixed = project("output", attention.linear_attention(*features, values, mask), 0.5, width)
         bias = self.param("output_bias", nn.initializers.zeros, (width,))
         x = x + add_bias(mixed, bias.astype(x.dtype))
-        if config.attention_feedforward:
+        if config.is_attention_normed:
             perceptron = MLP(width, width, width, 1, norm=False, precision=precision, name="feedforward")
             x = x + perceptron(self._norm("feedforward_norm", x))
         return x, None

@@ -18,16 +18,16 @@ Source: Grigorev, Black and Hilliges, "HOOD" (2023); its `models/core/postcvpr.p
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.config import COARSE_SETS, STAGES, ModelConfig
 from eslr_jax.graph import features
-from eslr_jax.graph.build import Rows, feature_sizes, join_features
+from eslr_jax.graph.build import COARSE_SETS, NUM_LEVELS, GraphKind, Rows, feature_sizes, join_features
 from eslr_jax.graph.operators import (
     MeshTables,
     coarse_tables,
@@ -36,13 +36,46 @@ from eslr_jax.graph.operators import (
     take_receivers,
     take_senders,
 )
-from eslr_jax.models.branches import Places, stack, world_mask
+from eslr_jax.models.apply import Places
+from eslr_jax.models.architecture import Architecture
+from eslr_jax.models.branches import make_decoder, stack, world_mask
 from eslr_jax.models.dense import kernel_spread
+from eslr_jax.models.eslr import VELOCITY_COLUMNS, GraphModule
 from eslr_jax.models.lsdmp import WorldLatents, make_mlp
 from eslr_jax.models.mlp import MLP
-from eslr_jax.models.network import VELOCITY_COLUMNS, EncodeProcessDecode, Statistics
+from eslr_jax.models.network import Statistics, network
 
-NUM_LEVELS = len(COARSE_SETS) + 1  # of a vertex; 0 is on the mesh alone
+STAGES = (
+    ("coarse0", "mesh"),
+    ("coarse0", "coarse1"),
+    ("coarse1",),
+    ("coarse0", "coarse1"),
+    ("coarse0", "mesh"),
+)
+"""Edge sets of the stages, in the order in which vertices read their sums (HOOD)."""
+
+
+@network("hood")
+@dataclasses.dataclass(frozen=True)
+class Hood(Architecture):
+    """HOOD's hierarchical network; the defaults are those of the published "postcvpr"."""
+
+    steps_per_stage: int = 3  # layers of each of the five stages
+
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """Arguments of `assets.load_garment` for a garment that the network reads."""
+        return {"has_coarse_edges": True}
+
+    @property
+    def graph(self) -> GraphKind:
+        """What the network reads of a frame."""
+        return super().graph._replace(has_coarse_edges=True, has_reverse_edges=True)
+
+    @property
+    def module(self) -> HierarchicalNetwork:
+        """The Flax module."""
+        return HierarchicalNetwork(self)
 
 
 class StageLatents(NamedTuple):
@@ -63,7 +96,7 @@ class StageTables(NamedTuple):
 class HoodLayer(nn.Module):
     """One step of message passing on some edge sets: e += f_e(v_i, v_j, e), v += f_v(v, sums of f_e by set)."""
 
-    config: ModelConfig
+    config: Hood
     sets: tuple[str, ...] = ()
 
     def setup(self) -> None:
@@ -99,13 +132,15 @@ class HoodLayer(nn.Module):
         return StageLatents(garment + vertex.finish(hidden), edges, world), None
 
 
-class HierarchicalNetwork(EncodeProcessDecode):
+class HierarchicalNetwork(GraphModule):
     """The whole network, from a graph's features to a vector per vertex."""
+
+    config: Hood
 
     def setup(self) -> None:
         """Declare embeddings, encoders, stages and decoder."""
-        config, sizes = self.config, feature_sizes(self.config)
-        size, types = config.latent_size, features.NUM_TYPES if self.config.features == "hood" else 0
+        config, sizes = self.config, feature_sizes(self.config.graph)
+        size, types = config.latent_size, 0 if config.reads_gradient else features.NUM_TYPES
 
         def encoder(input_size: int) -> MLP:
             return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
@@ -121,9 +156,8 @@ class HierarchicalNetwork(EncodeProcessDecode):
         self.mesh_encoder = encoder(sizes["mesh"])
         self.coarse_encoders = {name: encoder(sizes["mesh"]) for name in COARSE_SETS}
         self.world_encoder = encoder(sizes["world"])
-        length = config.message_passing_steps // len(STAGES)
-        self.stages = [stack(HoodLayer, config, length, sets=sets) for sets in STAGES]
-        self.declare_decoder()
+        self.stages = [stack(HoodLayer, config, config.steps_per_stage, sets=sets) for sets in STAGES]
+        self.decoder = make_decoder(config)
 
     def __call__(
         self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
@@ -150,8 +184,7 @@ class HierarchicalNetwork(EncodeProcessDecode):
         world = None
         if "world" in edges:
             toward, reverse = (self.world_encoder(edges[name]) for name in ("world", "world_reverse"))
-            is_hood = self.config.features == "hood"
-            body_encoder = self.garment_encoder if is_hood else self.body_encoder
+            body_encoder = self.body_encoder if self.config.reads_gradient else self.garment_encoder
             world = WorldLatents(body_encoder(nodes["body"]), toward, reverse)
         tables = {name: coarse_tables(graph, level) for level, name in enumerate(COARSE_SETS)}
         tables["mesh"] = mesh_tables(graph, vertices.dtype)
@@ -161,12 +194,12 @@ class HierarchicalNetwork(EncodeProcessDecode):
             state = StageLatents(garment, {name: latents[name] for name in sets}, world)
             state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
-        return self.decode(garment, vertices, places)
+        return self.decoder(garment)
 
     def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
         """Return node and edge features as the encoders read them, with the embedding of a vertex's level."""
         nodes, edges = super().normalized(graph, statistics)
-        if self.config.features == "hood":
+        if not self.config.reads_gradient:
             return nodes, edges
         levels = self.level_embedding.astype(nodes["garment"].dtype)[vertex_levels(graph)]
         return {**nodes, "garment": jnp.concatenate([nodes["garment"], levels], axis=1)}, edges

@@ -9,7 +9,7 @@ increments, for edges and vertices alike. N(i) of eq. 3 includes the body point 
 smoothing adds e_ij again. One default differs from HOOD. HOOD updates its body vertices, and garment vertices
 near the same body vertex exchange messages through it. Here every world edge has a body row of its own, which
 could only return its garment vertex's own message. So body rows keep their encoding, and a layer costs a
-quarter less. `ModelConfig.update_body` restores HOOD's update, with the same number of weights: both directions
+quarter less. `Eslr.update_body` restores HOOD's update, with the same number of weights: both directions
 share f_e, garment and body share f_v and f'_v.
 
 Source: paper, eqs. 1-4.
@@ -23,7 +23,6 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig
 from eslr_jax.graph.operators import (
     MeshTables,
     sum_neighbors,
@@ -31,6 +30,8 @@ from eslr_jax.graph.operators import (
     take_receivers,
     take_senders,
 )
+from eslr_jax.models.architecture import Architecture
+from eslr_jax.models.branches import TwoBranches
 from eslr_jax.models.mlp import MLP
 
 
@@ -61,7 +62,7 @@ class LayerTables(NamedTuple):
 class LsdmpLayer(nn.Module):
     """One layer: message passing (eqs. 1, 2), then Laplacian smoothing (eqs. 3, 4)."""
 
-    config: ModelConfig
+    config: TwoBranches
 
     def setup(self) -> None:
         """Declare the perceptrons."""
@@ -127,7 +128,7 @@ class LsdmpLayer(nn.Module):
         return latents._replace(garment=latents.garment + self.smooth_mlp(garment), world=world)
 
 
-def make_mlp(config: ModelConfig, num_pieces: int) -> MLP:
+def make_mlp(config: Architecture, num_pieces: int) -> MLP:
     """Return a perceptron from a few concatenated latents to one."""
     size = config.latent_size
     return MLP(num_pieces * size, size, size, config.hidden_layers, precision=config.precision)

@@ -1,188 +1,178 @@
-"""Encode, process, decode: ESLR, and with fewer parts MeshGraphNet.
+"""A network: its weights and its static description in one pytree; and the registry of systems.
 
-The encoders' latents go through a stack of LSDMP layers and, beside it, through a stack of GSA blocks; the
-decoder reads both. Without smoothing and attention, and with `ModelConfig.update_body`, this is MeshGraphNet as
-in HOOD's baselines; without `update_body` body rows keep their encoding.
-
-Source: paper, section on the simulation pipeline.
+A system is a class in one file, marked by `@network(name)`: its fields are the options of `[model]` in a recipe
+of `eslr train`. Files of weights name it, so that `eslr simulate --model` finds it again.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
-import jax.numpy as jnp
-import jraph
-from jaxtyping import Array, Float, Int
+import jax
+from flax import struct
+from jaxtyping import Array, Float
 
-from eslr_jax.graph import features
-from eslr_jax.graph.build import Rows, feature_sizes
-from eslr_jax.graph.normalizer import normalize
-from eslr_jax.graph.operators import mesh_tables, sum_receivers
-from eslr_jax.models.branches import Places, TwoBranches, stack, world_mask
-from eslr_jax.models.dense import kernel_spread
-from eslr_jax.models.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents
-from eslr_jax.models.mlp import MLP
-from eslr_jax.types import Normalizer
-
-VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
+from eslr_jax.errors import ConfigError
+from eslr_jax.physics.guess import InitialGuess
+from eslr_jax.physics.potential import Point
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.types import ClothState, Normalizer
 
 Statistics = dict[str, Normalizer]
+Example = Callable[[], tuple[FrameProblem, ClothState]]
 
 
-class EncodedWorld(NamedTuple):
-    """The part of `Encoded` that a body adds."""
+class Prediction(NamedTuple):
+    """What a network makes of a frame."""
 
-    body: Float[Array, "vertices latent"]  # finished: a body row has no features that change
-    edges: Float[Array, "vertices hidden"]  # body to garment
-    reverse: Float[Array, "vertices hidden"] | None  # garment to body; None where body rows are constant
+    positions: Float[Array, "steps vertices 3"]  # at t + 1, after every refinement step [m]
+    guess: InitialGuess | None = None  # that was refined; None for one acceleration
+    previous: Point | None = None  # the lowest point that a refinement step began from
 
-
-class Encoded(NamedTuple):
-    """Hidden layers of the encoders, as far as a frame's constant features decide them."""
-
-    garment: Float[Array, "vertices hidden"]
-    mesh: Float[Array, "edges hidden"]
-    tables: LayerTables
-    world: EncodedWorld | None  # None in a scene without a body
+    @property
+    def position(self) -> Float[Array, "vertices 3"]:
+        """Positions after the last step [m]."""
+        return self.positions[-1]
 
 
-class EncodeProcessDecode(TwoBranches):
-    """The whole network, from a graph's features to a vector, and gates, per vertex."""
+class System:
+    """Static description of a network: frozen and hashable, as a Flax module or a frozen dataclass is.
 
-    def setup(self) -> None:
-        """Declare encoders, stacks and decoder."""
-        config = self.config
-        size, sizes = config.latent_size, feature_sizes(config)
+    One of one's own has `apply(params, problem, state)`, which returns positions at t + 1 [m], shape
+    [vertices, 3]; pinned vertices are put in place afterwards. To be trained it has `init(key, problem, state)`
+    too, which returns weights. These are Flax's methods: `class Own(nn.Module, System)` inherits both. It may
+    have `garment_options`, arguments of `assets.load_garment` for a garment that it reads.
+    """
 
-        def encoder(input_size: int) -> MLP:
-            return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
+    apply: Callable[..., Any]
+    init: Callable[..., Any]
+    refinement_steps = 1  # predictions a frame, each from the one before
 
-        if config.features == "hood":
-            self.type_embedding = self.param(
-                "type_embedding",
-                kernel_spread(features.NUM_TYPES),
-                (features.NUM_TYPES, features.NUM_TYPES),
-            )
-            self.garment_encoder = encoder(sizes["garment"] + features.NUM_TYPES)
-        else:
-            self.garment_encoder = encoder(sizes["garment"])
-            self.body_encoder = encoder(sizes["body"])
-        self.mesh_encoder = encoder(sizes["mesh"])
-        self.world_encoder = encoder(sizes["world"])
-        self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
-        self.declare_decoder()
-
-    def __call__(
-        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
-    ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph.
+    def new_network(self, seed: int, example: Example) -> Network:
+        """Return a network with new weights.
 
         Args:
-            graph: Graph of `build_graph`.
-            places: Embedding and mask of the vertices.
-            statistics: Normalisers of the rows "garment" (and body), "mesh" and "world", for HOOD's features.
+            seed: Of the weights.
+            example: Returns a frame's problem and the state before it, from which shapes are read.
         """
-        return self.process(self.encode_frame(graph, statistics), places)
+        return Network(self.init(jax.random.key(seed), *example()), self)
 
-    def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
-        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
+    def predict(
+        self, network: Network, problem: FrameProblem, state: ClothState, *, detach: bool
+    ) -> Prediction:
+        """Return the prediction for a frame; see `Network.predict`."""
+        return Prediction(pin(problem, self.apply(network.params, problem, state))[None])
+
+    def check(self, network: Network) -> None:
+        """Raise a CheckpointError where weights do not fit."""
+
+
+@struct.dataclass
+class Network:
+    """A network: `rollout`, `simulate` and `step` take it as `params`."""
+
+    params: Any  # weights that are trained, in the form that `config.apply` takes
+    config: Any = struct.field(pytree_node=False)  # a `System`; static
+    statistics: Statistics = struct.field(default_factory=dict)  # normalisers of features and output
+    constants: dict[str, Any] = struct.field(default_factory=dict)  # random directions of the attention
+
+    def predict(self, problem: FrameProblem, state: ClothState, *, detach: bool = False) -> Prediction:
+        """Return the prediction for a frame.
 
         Args:
-            graph: Graph of `build_graph` or of `build_frame_graph`.
-            statistics: Normalisers, see `__call__`.
+            problem: The frame's problem.
+            state: Cloth at t.
+            detach: Refinement steps hand on no gradients: each is then trained to do its best from where it
+                begins.
         """
-        nodes, edges = self.normalized(graph, statistics)
-        dtype = nodes["garment"].dtype
-        world = None
-        if "world" in edges:
-            body_encoder = self.garment_encoder if self.config.features == "hood" else self.body_encoder
-            first_layers = {
-                name: self.world_encoder.start(edges[name], 0, bias=True)
-                for name in ("world", "world_reverse")
-                if name in edges
-            }
-            world = EncodedWorld(
-                body=body_encoder(nodes["body"]),
-                edges=first_layers["world"],
-                reverse=first_layers.get("world_reverse"),
-            )
-        return Encoded(
-            garment=self.garment_encoder.start(nodes["garment"], 0, bias=True),
-            mesh=self.mesh_encoder.start(edges["mesh"], 0, bias=True),
-            tables=LayerTables(mesh_tables(graph, dtype), world_mask(graph, dtype)),
-            world=world,
+        return self.config.predict(self, problem, state, detach=detach)
+
+    @property
+    def garment_options(self) -> Mapping[str, Any]:
+        """Arguments of `assets.load_garment` for a garment that the network reads."""
+        return getattr(self.config, "garment_options", {})
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """All arrays, as files hold them."""
+        return {"params": self.params, "constants": self.constants, "statistics": self.statistics}
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of trained weights."""
+        return sum(leaf.size for leaf in jax.tree.leaves(self.params))
+
+
+def check_network(network: Any) -> None:
+    """Check the argument `params` of the public functions.
+
+    Raises:
+        ConfigError: It is neither a network nor None, or its description is no `System`.
+        CheckpointError: Its weights are for another architecture.
+    """
+    if network is None:
+        return
+    if not isinstance(network, Network):
+        raise ConfigError(
+            f"params is {type(network).__name__}, not a Network; take one of load_model, or make one of weights "
+            "and their module: Network(weights, module)"
         )
+    if not isinstance(network.config, System):
+        name = type(network.config).__name__
+        raise ConfigError(f"the network's {name} is no System; declare it as class {name}(..., System)")
+    network.config.check(network)
 
-    def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
-        """Add the features of a refinement step to those of its frame.
 
-        Args:
-            encoded: Hidden layers of `encode_frame` for the frame's features.
-            changing: Graph of `build_refinement_graph`.
-        """
-        nodes, edges, world = changing.nodes, changing.edges, encoded.world
-        if world is not None:
-            rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
-            reverse = None if world.reverse is None else world.reverse + rows
-            world = world._replace(edges=world.edges + rows, reverse=reverse)
-        return encoded._replace(
-            garment=encoded.garment + self.garment_encoder.start(nodes["garment"], features.NODE_FRAME_SIZE),
-            mesh=encoded.mesh + self.mesh_encoder.start(edges["mesh"], features.MESH_FRAME_SIZE),
-            world=world,
-        )
+# --- the registry -------------------------------------------------------------------------------------------
 
-    def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
-        """Finish the encoders, run both stacks and decode."""
-        vertices = self.garment_encoder.finish(encoded.garment)
-        mesh = self.mesh_encoder.finish(encoded.mesh)
-        world = None
-        if encoded.world is not None:
-            finish, given = self.world_encoder.finish, encoded.world
-            reverse = None if given.reverse is None else finish(given.reverse)
-            world = WorldLatents(given.body, finish(given.edges), reverse)
-        latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
-        latents, _ = self.layers(latents, encoded.tables)
-        return self.decode(latents.garment, vertices, places)
+_systems: dict[str, type[System]] = {}
+_System = TypeVar("_System", bound=System)
+_PACKAGE = __package__ or ""
 
-    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
-        """Return node and edge features as the encoders read them.
 
-        Raises:
-            ValueError: The features are HOOD's and `statistics` is None.
-        """
-        if self.config.features != "hood":
-            return graph.nodes, graph.edges
-        if statistics is None:
-            raise ValueError('features = "hood" needs the statistics of its normalisers')
+def network(name: str) -> Callable[[type[_System]], type[_System]]:
+    """Register a system, so that recipes and files of weights may name it.
 
-        def scale(
-            rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
-        ) -> Float[Array, "_ features"]:
-            changing = rows.shape[1] - num_static
-            scaled = normalize(normalizer, rows[:, :changing])
-            return jnp.concatenate([scaled, rows[:, changing:]], axis=1)
+    Outside of this package its name is MODULE:NAME, and MODULE is imported when it is asked for.
+    """
 
-        nodes = {
-            name: scale(rows, statistics["garment"], features.HOOD_NODE_STATIC)
-            for name, rows in self.with_types(graph).items()
-        }
-        edges = {
-            name: scale(rows, statistics["world"], 0)
-            if name.startswith("world")
-            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
-            for name, rows in cast(Rows, graph.edges).items()
-        }
-        return nodes, edges
+    def register(system: type[_System]) -> type[_System]:
+        is_own = not system.__module__.startswith(_PACKAGE)
+        _systems[f"{system.__module__}:{name}" if is_own else name] = system
+        return system
 
-    def with_types(self, graph: jraph.GraphsTuple) -> Rows:
-        """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""
+    return register
 
-        def insert(rows: Float[Array, "_ 11"], types: Int[Array, " _"]) -> Float[Array, "_ 20"]:
-            embedding = self.type_embedding.astype(rows.dtype)[types]
-            return jnp.concatenate(
-                [rows[:, :VELOCITY_COLUMNS], embedding, rows[:, VELOCITY_COLUMNS:]], axis=1
-            )
 
-        nodes = cast(Rows, graph.nodes)
-        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in nodes.items()}
+def find_system(name: str) -> type[System] | None:
+    """Return the system of a name, or None; the module of MODULE:NAME is imported.
+
+    Raises:
+        ConfigError: There is no such module, or it can't be imported.
+    """
+    module = name.partition(":")[0]
+    if name not in _systems and module != name:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ConfigError(
+                f"model {name}: {error}; run the command where {module}.py is, or put its folder on PYTHONPATH"
+            ) from error
+    return _systems.get(name)
+
+
+def describe_system(system: Any) -> dict[str, Any]:
+    """Return a system as plain values, ready for JSON; `registry.read_system` reads them.
+
+    Raises:
+        ConfigError: Its class is not registered.
+    """
+    names = [name for name, known in _systems.items() if known is type(system)]
+    if not names:
+        raise ConfigError(f'{type(system).__name__} has no name; mark the class by @network("NAME")')
+    options = [field.name for field in dataclasses.fields(system)]
+    of_flax = ("parent", "name")  # which Flax adds to its modules' fields
+    return {"base": names[0]} | {name: getattr(system, name) for name in options if name not in of_flax}

@@ -7,20 +7,44 @@ hinges and contacts want. The features of a vertex's world edge and of its body 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Float
 
-from eslr_jax.config import ModelConfig
 from eslr_jax.graph import features
 from eslr_jax.graph.build import feature_sizes
 from eslr_jax.graph.operators import MeshTables, mesh_tables, sum_neighbors
-from eslr_jax.models.branches import Places, TwoBranches, stack, world_mask
+from eslr_jax.models.apply import Places
+from eslr_jax.models.branches import make_decoder, stack, world_mask
 from eslr_jax.models.lsdmp import make_mlp
 from eslr_jax.models.mlp import MLP
+from eslr_jax.models.network import network
+from eslr_jax.models.refinement import GatedRefinement
+
+
+@network("smoothing")
+@dataclasses.dataclass(frozen=True)
+class Smoothing(GatedRefinement):
+    """Smoothings without messages; by default one step as the solver's initial guess.
+
+    That costs three to four iterations and saves more.
+    """
+
+    latent_size: int = 32  # a quarter of the paper's
+    remat: Literal["layers", "products", "none"] = "none"  # what a backward pass computes again
+    layers: int = 1  # each a perceptron behind the smoothings
+    smoothing_steps: int = 2  # per layer
+    output: Literal["descent", "subspace"] = "descent"  # sum or best combination of a step's directions
+    refinement_steps: int = 1  # per frame, gradient recomputed between
+
+    @property
+    def module(self) -> nn.Module:
+        """The Flax module."""
+        return SmoothingNetwork(self)
 
 
 class EncodedVertices(NamedTuple):
@@ -37,7 +61,7 @@ class SmoothingLayer(nn.Module):
     Source: paper, eq. 3 without its edges; all K smoothings are read, not the last alone.
     """
 
-    config: ModelConfig
+    config: Smoothing
 
     def setup(self) -> None:
         """Declare the perceptron."""
@@ -53,12 +77,14 @@ class SmoothingLayer(nn.Module):
         return latents + self.vertex_mlp.finish(hidden), None
 
 
-class SmoothingNetwork(TwoBranches):
+class SmoothingNetwork(nn.Module):
     """The whole network, with the methods of `EncodeProcessDecode`."""
+
+    config: Smoothing
 
     def setup(self) -> None:
         """Declare encoder, stacks and decoder."""
-        config, sizes = self.config, feature_sizes(self.config)
+        config, sizes = self.config, feature_sizes(self.config.graph)
         self.body_column = sizes["garment"]  # of the encoder's input
         self.world_column = sizes["garment"] + sizes["body"]
         self.encoder = MLP(
@@ -68,8 +94,8 @@ class SmoothingNetwork(TwoBranches):
             config.hidden_layers,
             precision=config.precision,
         )
-        self.layers = stack(SmoothingLayer, config, config.message_passing_steps)
-        self.declare_decoder()
+        self.layers = stack(SmoothingLayer, config, config.layers)
+        self.decoder = make_decoder(config)
 
     def __call__(
         self, graph: jraph.GraphsTuple, places: Places, statistics: object = None
@@ -97,7 +123,7 @@ class SmoothingNetwork(TwoBranches):
         return encoded._replace(hidden=hidden)
 
     def process(self, encoded: EncodedVertices, places: Places) -> Float[Array, "vertices outputs"]:
-        """Finish the encoder, run both stacks and decode."""
+        """Finish the encoder, run the layers and decode."""
         vertices = self.encoder.finish(encoded.hidden)
         processed, _ = self.layers(vertices, encoded.tables)
-        return self.decode(processed, vertices, places)
+        return self.decoder(processed)

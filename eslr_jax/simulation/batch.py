@@ -14,9 +14,10 @@ from jax.sharding import Mesh, PartitionSpec
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.padding import choose_bucket
+from eslr_jax.models.network import Network, check_network
 from eslr_jax.scene.build import Integrator
 from eslr_jax.scene.plan import prepare_scenes
-from eslr_jax.simulation.rollout import check_network, rollout_scene
+from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, hold_last, simulate
 from eslr_jax.terms import Term
 from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
@@ -25,7 +26,7 @@ SCENES = "scenes"  # axis of the device mesh
 
 
 def simulate_batch(
-    params: Any,
+    params: Network | None,
     garments: Sequence[Garment],
     poses: Sequence[BodyMotion],
     *,
@@ -44,10 +45,10 @@ def simulate_batch(
     scene whose buffers were too small is simulated again by itself.
 
     Args:
-        params: Weights of the network; None without one.
+        params: A network, or None.
         garments: Of `load_garment` or `prepare_garment`; any sizes.
         poses: As many motions, of `pose_body`.
-        config: Network, iterations and tolerance; the solver alone by default.
+        config: Iterations and tolerance; the solver alone by default.
         material: Fabric of all, or one for each; isotropic and the same all over a garment. By default each
             garment has its own, of its file, or else cotton.
         terms: What to model where one of the scenes needs it; by default `scene_terms()`.
@@ -62,13 +63,13 @@ def simulate_batch(
         one bad scene shall not cost the others; see `raise_for_status`.
 
     Raises:
-        ConfigError: There are not as many motions or fabrics as garments; or the network lacks weights; or a
+        ConfigError: There are not as many motions or fabrics as garments; or `params` is no network; or a
             fabric, a constant or a timestep is out of its physical range.
         CheckpointError: The weights are for another architecture.
         MotionError: A motion has fewer than two frames.
     """
     config = config or SimConfig()
-    check_network(params, config)
+    check_network(params)
     materials = list(material) if isinstance(material, Sequence) else [material] * len(garments)
     if not len(garments) == len(poses) == len(materials):
         raise ConfigError(
@@ -144,20 +145,20 @@ def stack_scenes(scenes: list[Scene]) -> Scene:
 
 @partial(jax.jit, static_argnames=("config", "batch_size", "mesh"))
 def rollout_scenes(
-    params: Any, scenes: Scene, config: SimConfig, *, batch_size: int = 1, mesh: Mesh | None = None
+    params: Network | None, scenes: Scene, config: SimConfig, *, batch_size: int = 1, mesh: Mesh | None = None
 ) -> Trajectory:
     """Simulate stacked scenes; the trajectories come back stacked.
 
     Args:
-        params: Weights of the network; None without one.
+        params: A network, or None.
         scenes: Of `stack_scenes`.
-        config: Network, iterations and tolerance; static.
+        config: Iterations and tolerance; static.
         batch_size: Scenes that go through a step together (vmap); the others wait (lax.map). One is fastest
             on a CPU, whose cores one garment keeps busy; a GPU wants as many as its memory holds.
         mesh: Devices to spread the scenes over evenly, with one axis named `SCENES`; static.
     """
 
-    def run(params: Any, scenes: Scene) -> Trajectory:
+    def run(params: Network | None, scenes: Scene) -> Trajectory:
         return jax.lax.map(lambda scene: rollout_scene(params, scene, config), scenes, batch_size=batch_size)
 
     if mesh is None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.config import ModelConfig, SimConfig
-from eslr_jax.errors import ConfigError
-from eslr_jax.models.registry import check_params
+from eslr_jax.config import SimConfig
+from eslr_jax.models.network import Network, check_network
 from eslr_jax.physics.solve import SOLUTION
 from eslr_jax.scene.build import Integrator, build_scene, worn_material
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, part_of_frame
@@ -21,7 +20,7 @@ from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Tra
 
 
 def rollout(
-    params: Any,
+    params: Network | None,
     garment: Garment,
     poses: BodyMotion,
     *,
@@ -38,10 +37,10 @@ def rollout(
     `status`, or `simulate`, which checks values, shows progress and raises.
 
     Args:
-        params: Weights of the network, of `load_model`; None without one.
+        params: A network, of `load_model`; None without one.
         garment: Of `load_garment` or `prepare_garment`.
         poses: Of `pose_body`.
-        config: Network, iterations and tolerance; the solver alone by default.
+        config: Iterations and tolerance; the solver alone by default.
         material: Fabric; by default the garment's own, of its file, or else cotton.
         terms: What is modelled, of `plan_scene`, which looks at values and leaves out what they don't need. By
             default there is no ground, and layers of cloth pass through each other.
@@ -52,11 +51,11 @@ def rollout(
         The trajectory; frame 0 is the garment skinned to the first pose and pushed out of the body.
 
     Raises:
-        ConfigError: A network is asked for without weights.
-        CheckpointError: The weights are for another architecture.
+        ConfigError: `params` is no network.
+        CheckpointError: Its weights are for another architecture.
     """
     config = config or SimConfig()
-    check_network(params, config)
+    check_network(params)
     if terms is None:
         terms = scene_terms(without=(Ground, Repulsion))
     worn = garment, poses, worn_material(garment, material)
@@ -64,35 +63,16 @@ def rollout(
     return rollout_scene(params, scene, config)
 
 
-def check_network(params: Any, config: SimConfig) -> None:
-    """Check that weights and architecture are there and fit each other.
-
-    Args:
-        params: Weights of the network; None without one.
-        config: Holds the architecture.
-
-    Raises:
-        ConfigError: The network is asked for without weights.
-        CheckpointError: The weights are for another architecture.
-    """
-    if config.model is None:
-        return
-    if params is None:
-        raise ConfigError("config.model is given without weights; get both from load_model")
-    if isinstance(config.model, ModelConfig):
-        check_params(config.model, params)
-
-
 @partial(jax.jit, static_argnames="config")
 def rollout_scene(
-    params: Any, scene: Scene, config: SimConfig, iterations: Int[Array, ""] | int | None = None
+    params: Network | None, scene: Scene, config: SimConfig, iterations: Int[Array, ""] | int | None = None
 ) -> Trajectory:
     """Simulate every frame of a scene; pure.
 
     Args:
-        params: Weights of the network; None without one.
+        params: A network, or None.
         scene: Of `build_scene` or `prepare_scene`.
-        config: Network, iterations and tolerance; static.
+        config: Iterations and tolerance; static.
         iterations: Bound of iterations in place of the configuration's, see `make_stepper`.
     """
     stepper = make_stepper(params, config, iterations)
@@ -137,7 +117,7 @@ def scan_frames(
 
 
 def step(
-    params: Any,
+    params: Network | None,
     scene: Scene,
     state: ClothState,
     frame: Int[Array, ""] | int,
@@ -147,21 +127,21 @@ def step(
     """Simulate one frame of a scene; pure, as `rollout`, which repeats it.
 
     Args:
-        params: Weights of the network, of `load_model`; None without one.
+        params: A network, of `load_model`; None without one.
         scene: Of `prepare_scene`.
         state: Cloth at that frame; `scene.initial_state` at the first one.
         frame: Frame of the scene's motion at which the cloth is; the body moves from it to the next one.
-        config: Network, iterations and tolerance; the solver alone by default.
+        config: Iterations and tolerance; the solver alone by default.
 
     Returns:
         The cloth at the next frame, and how the frame went.
 
     Raises:
-        ConfigError: A network is asked for without weights.
-        CheckpointError: The weights are for another architecture.
+        ConfigError: `params` is no network.
+        CheckpointError: Its weights are for another architecture.
     """
     config = config or SimConfig()
-    check_network(params, config)
+    check_network(params)
     moving = jax.tree.map(lambda leaf: leaf[frame], frame_inputs(scene))
     return step_frame(make_stepper(params, config), scene, state, moving)
 

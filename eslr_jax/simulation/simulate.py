@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,12 @@ from jaxtyping import Array, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
+from eslr_jax.models.network import Network, check_network
 from eslr_jax.physics.validate import validate_material, validate_timestep
 from eslr_jax.scene.build import initial_state, slice_tracks
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
-from eslr_jax.simulation.rollout import Frames, check_network, join_frames, scan_frames
+from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, Scene, Trajectory
 
@@ -43,7 +44,7 @@ class Simulation(NamedTuple):
 
 
 def simulate(
-    params: Any,
+    params: Network | None,
     scene: Scene,
     *,
     config: SimConfig | None = None,
@@ -56,9 +57,9 @@ def simulate(
     """Simulate a scene; check it first, enlarge buffers that are too small, and raise what goes wrong.
 
     Args:
-        params: Weights of the network, of `load_model`; None without one.
+        params: A network, of `load_model`; None without one.
         scene: Of `prepare_scene`.
-        config: Network, iterations and tolerance; the solver alone by default.
+        config: Iterations and tolerance; the solver alone by default.
         pace: Chooses the iterations of every chunk; by default all take the configuration's.
         on_frames: Called with the number of frames done and the number in all.
         is_stopping: Asked after every chunk; the trajectory ends where it answers yes.
@@ -67,7 +68,7 @@ def simulate(
             frame and keeps its status, see `raise_for_status`.
 
     Raises:
-        ConfigError: A network is asked for without weights, or the fabric, a constant or the timestep is out of
+        ConfigError: `params` is no network, or the fabric, a constant or the timestep is out of
             its physical range.
         CheckpointError: The weights are for another architecture.
         NonFiniteError: Positions became NaN or infinite; the message names the first bad frame.
@@ -75,7 +76,7 @@ def simulate(
         MotionError: The body is too fast to follow, or the scene has fewer than two frames.
     """
     config = config or SimConfig()
-    check_network(params, config)
+    check_network(params)
     check_scene(scene)
     done = None if done is None else good_frames(done)
     larger: Scene | None = scene
@@ -122,7 +123,7 @@ class _Loop(NamedTuple):
 
 
 def _in_chunks(
-    params: Any, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
+    params: Network | None, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
 ) -> tuple[Trajectory, _Spent]:
     """Simulate a scene a few frames at a time, and time compilation apart."""
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
@@ -207,7 +208,7 @@ def state_at(trajectory: Trajectory, scene: Scene, frame: int = -1) -> ClothStat
 
 
 def _scan(
-    params: Any,
+    params: Network | None,
     scene: Scene,
     state: ClothState,
     inputs: FrameInput,
@@ -219,17 +220,19 @@ def _scan(
     return scan_frames(make_stepper(params, config, iterations), scene, state, inputs)
 
 
-def begin_compiling(params: Any, scene: Scene, config: SimConfig, *, is_paced: bool = False) -> None:
+def begin_compiling(
+    params: Network | None, scene: Scene, config: SimConfig, *, is_paced: bool = False
+) -> None:
     """Trace what `simulate` runs, and compile it in a thread; `simulate` waits for it.
 
     Args:
-        params: Weights of the network; None without one.
+        params: A network, or None.
         scene: The scene, or its shapes, of `jax.eval_shape`.
         config: As for `simulate`.
         is_paced: Whether `simulate` will get a pace.
     """
 
-    def first_chunk(params: Any, scene: Scene) -> tuple:
+    def first_chunk(params: Network | None, scene: Scene) -> tuple:
         inputs = jax.tree.map(lambda leaf: leaf[: _chunk_of(scene)], frame_inputs(scene))
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
+from eslr_jax.models.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
 from eslr_jax.physics.guess import initial_guess, separate
 from eslr_jax.physics.lbfgs import Minimum
 from eslr_jax.physics.potential import Point, contact_load, evaluate, potential_terms
 from eslr_jax.physics.solve import Start, lower_point, solve
-from eslr_jax.simulation.network import Prediction, predict
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 
@@ -53,16 +53,16 @@ def keeps_tolerance(
 
 
 def make_stepper(
-    params: Any,
+    network: Network | None,
     config: SimConfig,
     iterations: Int[Array, ""] | int | None = None,
     tolerance: Float[Array, ""] | None = None,
 ) -> Stepper:
-    """Return the stepper that a configuration describes.
+    """Return the stepper of a network, a configuration, or both.
 
     Args:
-        params: Weights of the network; None without one.
-        config: Network, iterations and tolerance; static.
+        network: A network, or None.
+        config: Iterations and tolerance; static.
         iterations: Bound of iterations per frame in place of the configuration's. It may be traced, so that all
             numbers share a program.
         tolerance: In place of the configuration's, likewise.
@@ -71,7 +71,7 @@ def make_stepper(
     def step(problem: FrameProblem, state: ClothState) -> tuple[ClothState, FrameReport]:
         if config.iterations or iterations is not None:
             # A minimum does not depend on where the solver began, and neither do its derivatives.
-            start, status = find_start(*jax.lax.stop_gradient((params, problem, state)), config)
+            start, status = find_start(*jax.lax.stop_gradient((network, problem, state)))
             minimum = solve(
                 problem,
                 start,
@@ -80,12 +80,12 @@ def make_stepper(
                 memory=config.memory,
             )
         else:
-            if config.model is not None and state.past is not None:
+            if network is not None and state.past is not None:
                 raise ConfigError(
                     'a network alone steps by implicit Euler; choose integrator "euler", or solver '
                     "iterations after the network"
                 )
-            point, _, status = _begin(params, problem, state, config)
+            point, _, status = _begin(network, problem, state)
             unknown = jnp.full_like(point.value, jnp.inf)
             minimum = Minimum(*point, iterations=jnp.int32(0), gap_bound=unknown)
         position = pin(problem, minimum.position)
@@ -103,7 +103,7 @@ def make_stepper(
 
 
 def find_start(
-    params: Any, problem: FrameProblem, state: ClothState, config: SimConfig
+    network: Network | None, problem: FrameProblem, state: ClothState
 ) -> tuple[Start, Int[Array, ""]]:
     """Return where the solver begins a frame, and status bits.
 
@@ -111,12 +111,11 @@ def find_start(
     which one of its refinement steps began, if that is lower.
 
     Args:
-        params: Weights of the network; None without one.
+        network: A network, or None.
         problem: The frame's problem.
         state: Cloth at t.
-        config: Says whether there is a network; static.
     """
-    point, prediction, status = _begin(params, problem, state, config)
+    point, prediction, status = _begin(network, problem, state)
     guess = prediction.guess
     if guess is None:
         # The solver begins elsewhere, but measures its share of the gap from the energy of the inertial guess.
@@ -125,13 +124,13 @@ def find_start(
 
 
 def _begin(
-    params: Any, problem: FrameProblem, state: ClothState, config: SimConfig
+    network: Network | None, problem: FrameProblem, state: ClothState
 ) -> tuple[Point, Prediction, Int[Array, ""]]:
     """Return the point of `find_start`, what it comes from, and status bits."""
-    if config.model is None:
+    if network is None:
         guess = initial_guess(problem)
         return evaluate(guess.position, problem), Prediction(guess.position, guess), jnp.int32(Status.OK)
-    prediction = predict(params, problem, state, config.model)
+    prediction = network.predict(problem, state)
     point = evaluate(separate(problem, prediction.position), problem)
     if prediction.previous is not None:
         point = lower_point(point, prediction.previous)

@@ -14,10 +14,11 @@ import jax
 import orbax.checkpoint as ocp
 from jax.experimental.multihost_utils import sync_global_devices
 
-from eslr_jax.config import TrainConfig, from_dict, to_dict
+from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.parsing import one_line
+from eslr_jax.training.recipe import describe_train_config, read_train_config
 from eslr_jax.training.step import TrainState
 
 FORMAT = 1
@@ -128,7 +129,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 def write_run_config(folder: Path, config: TrainConfig, earlier: Mapping[str, Any]) -> None:
     """Keep a run's configuration beside its checkpoints, and the record of the weights that it started from."""
-    record = {"format": FORMAT, "train": to_dict(config), "earlier": dict(earlier)}
+    record = {"format": FORMAT, "train": describe_train_config(config), "earlier": dict(earlier)}
     with atomic_write(folder / "config.json") as temporary:
         temporary.write_text(json.dumps(record, indent=2))
 
@@ -143,7 +144,7 @@ def read_run_config(folder: Path) -> TrainConfig:
     try:
         record = json.loads(path.read_text())
         version, values = record["format"], record["train"]
-        if not isinstance(version, int) or not isinstance(values, dict):
+        if not isinstance(version, int) or "model" not in values:
             raise TypeError("another layout")
     except FileNotFoundError as error:
         raise CheckpointError(f"{folder} holds no training run; start one without --resume") from error
@@ -154,7 +155,7 @@ def read_run_config(folder: Path) -> TrainConfig:
             f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax"
         )
     try:
-        return from_dict(TrainConfig, values)
+        return read_train_config(values)
     except ConfigError as error:
         raise CheckpointError(f"{path} is for another version: {error}") from error
 

@@ -51,7 +51,7 @@ class TrainingData:
     surface_skin_indices: Int[Array, "surface_vertices influences"]
     joint_transforms: Float[Array, "frames joints 3 4"]  # all clips, end to end
     frames_left: Int[Array, " frames"]  # frames of the same clip after this one
-    start_frames: Int[Array, " starts"]  # frames that another one follows
+    start_frames: Int[Array, " starts"]  # frames that are not the last of their clip
     shapes: Shapes | None  # None: all trajectories have the same body
 
     @property
@@ -117,7 +117,7 @@ def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
         ConfigError: The split is unknown or empty.
         AssetError: A garment does not exist.
     """
-    options = config.model.garment_options
+    options = getattr(config.model, "garment_options", {})
     unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
     motions = [load_motion(clip) for clip in split_clips(config.split)]
     return build_training_data(pad_alike(unpadded), load_body(), motions, has_shapes=config.shape_range > 0)

@@ -15,10 +15,11 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from eslr_jax.assets.weights import write_network
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, CheckpointError, ConfigError, NonFiniteError
 from eslr_jax.io.atomic import atomic_write, ensure_output_dir
-from eslr_jax.io.weights import write_weights
+from eslr_jax.models.network import Network
 from eslr_jax.simulation.interrupt import Interruption
 from eslr_jax.training.checkpoint import (
     Checkpoints,
@@ -41,7 +42,7 @@ def train(
     out: Path,
     *,
     resume: bool = False,
-    initial_params: Any = None,
+    initial: Network | None = None,
     earlier: Mapping[str, Any] | None = None,
     datasets: tuple[TrainingData, ...] | None = None,
     on_progress: Progress = lambda done, total, metrics: None,
@@ -55,8 +56,8 @@ def train(
         config: The run. A run that is resumed may have more `steps` than before.
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
-        initial_params: Weights to start from instead of random ones.
-        earlier: Training record of these weights, whose steps and core-hours the exported one counts too. A run
+        initial: Network whose weights to start from instead of random ones.
+        earlier: Training record of that network, whose steps and core-hours the exported one counts too. A run
             that is resumed knows it.
         datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
         on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
@@ -65,7 +66,7 @@ def train(
         The last state; of several seeds stacked, see `training.seeds`.
 
     Raises:
-        CheckpointError: `out` holds another run, or none to resume.
+        CheckpointError: `out` holds another run, or none to resume; or `initial` does not fit `config.model`.
         ConfigError: Several seeds would be spread over devices.
         NonFiniteError: Too many updates in a row had to be skipped; the last good checkpoint is kept.
         CapacityError: Self-contact needed more room than its buffers have.
@@ -74,8 +75,10 @@ def train(
     if config.seeds > 1 and mesh is not None:
         raise ConfigError(f"seeds = {config.seeds} share one device; take batch_size = 1, or seeds = 1")
     _check_run(config, out, resume)
+    if initial is not None:
+        config.model.check(initial)
     datasets = datasets or tuple(load_training_data(config, vertices) for vertices in config.vertices)
-    state = _first_state(config, datasets, initial_params)
+    state = _first_state(config, datasets, initial)
     datasets, state = tuple(replicate(data, mesh) for data in datasets), replicate(state, mesh)
     checkpoints = Checkpoints(ensure_output_dir(out))
     folders = [ensure_output_dir(folder) for folder in seed_folders(config, out)]
@@ -139,14 +142,14 @@ def train(
     return state
 
 
-def _first_state(config: TrainConfig, datasets: tuple[TrainingData, ...], initial_params: Any) -> TrainState:
+def _first_state(
+    config: TrainConfig, datasets: tuple[TrainingData, ...], initial: Network | None
+) -> TrainState:
     """Return the state before the first step, of several seeds stacked."""
     states = [init_train_state(one, datasets) for one in seed_configs(config)]
-    if initial_params is not None:  # copies, since a step donates its state
-        states = [
-            state.replace(params={**state.params, **jax.tree.map(jax.numpy.array, initial_params)})
-            for state in states
-        ]
+    if initial is not None:  # copies, since a step donates its state
+        initial = initial.replace(config=config.model)
+        states = [state.replace(network=jax.tree.map(jax.numpy.array, initial)) for state in states]
     return stack_seeds(states) if config.seeds > 1 else states[0]
 
 
@@ -171,7 +174,7 @@ def export(state: TrainState, config: TrainConfig, paths: list[Path], earlier: M
         if not earlier or "core_hours" in earlier:  # else nobody knows how long it took in all
             hours = core_seconds(path.parent) / 3600 / config.seeds  # seeds share the run
             training["core_hours"] = earlier.get("core_hours", 0.0) + hours
-        write_weights(path, jax.device_get(own.params), config.model, training)
+        write_network(path, jax.device_get(own.network), training)
 
 
 def core_seconds(out: Path) -> float:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from eslr_jax.config import TrainConfig
+from eslr_jax.models.network import Network
 from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential_terms
 from eslr_jax.physics.solve import Start, solve
-from eslr_jax.simulation.network import predict_acceleration, refine
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.types import ClothState
 
@@ -45,7 +45,7 @@ class _Optimum(NamedTuple):
 
 
 def physics_loss(
-    params: Any,
+    network: Network,
     problem: FrameProblem,
     state: ClothState,
     config: TrainConfig,
@@ -54,16 +54,13 @@ def physics_loss(
     """Return the loss, without unit or in joules (set "hood"), and its report.
 
     Args:
-        params: Weights of the network.
+        network: The network.
         problem: The frame's problem.
         state: Cloth at t.
-        config: Architecture, and which refinement steps count; static.
+        config: Which refinement steps count; static.
         terms_of: The set of energies.
     """
-    if config.model.output == "acceleration":
-        positions = predict_acceleration(params, problem, state, config.model)[None]
-    else:
-        positions = refine(params, problem, state, config.model, detach=True).positions
+    positions = network.predict(problem, state, detach=True).positions
     terms = jax.vmap(terms_of, in_axes=(0, None))(positions, problem)
     energies = sum(terms.values())
     guess = pushed_out_guess(problem)

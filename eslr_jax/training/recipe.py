@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from eslr_jax.config import TrainConfig, apply_overrides, from_dict, to_dict
+from eslr_jax.config import TrainConfig, apply_overrides, from_dict
 from eslr_jax.errors import ConfigError
-from eslr_jax.models.registry import MODELS
+from eslr_jax.models.network import describe_system
+from eslr_jax.models.registry import read_system
 
 
 def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> TrainConfig:
-    """Read a training configuration; `model` is a table, a name, or a table with a `base` name.
+    """Read a training configuration; see `registry.read_system` for its `model`.
 
     A file with `base`, the path of another one from where it is, changes that one's values.
 
@@ -35,15 +38,24 @@ def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> Tr
     if isinstance(values.get("model"), str):
         values["model"] = {"base": values["model"]}
     apply_overrides(values, overrides)
-    model = values.get("model")
-    if isinstance(model, dict) and "base" in model:
-        base = model.pop("base")
-        if base not in MODELS:
-            raise ConfigError(f"unknown model {base!r}; there are {', '.join(MODELS)}")
-        values["model"] = to_dict(MODELS[base]) | model
-    if not isinstance(values.get("model"), dict):
+    if "model" not in values:
         raise ConfigError(f'{path} names no model; add model = "eslr-small" or a [model] table')
-    return from_dict(TrainConfig, values)
+    return read_train_config(values)
+
+
+def read_train_config(values: Mapping[str, Any]) -> TrainConfig:
+    """Return a training configuration from plain values.
+
+    Raises:
+        ConfigError: A value is unknown or impossible.
+    """
+    return from_dict(TrainConfig, {**values, "model": read_system(values["model"])})
+
+
+def describe_train_config(config: TrainConfig) -> dict[str, Any]:
+    """Return a training configuration as plain values, ready for JSON; `read_train_config` reads them."""
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return values | {"model": describe_system(config.model)}
 
 
 def _read(path: Path) -> dict[str, Any]:

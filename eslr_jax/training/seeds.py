@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from eslr_jax.config import TrainConfig
 from eslr_jax.training.step import TrainState, make_train_step
 
-_AXES = TrainState(params=0, optimizer=0, pools=0, key=0, step=None, skipped=0)  # type: ignore[arg-type]
+_AXES = TrainState(network=0, optimizer=0, pools=0, key=0, step=None, skipped=0)  # type: ignore[arg-type]
 
 
 def seed_configs(config: TrainConfig) -> list[TrainConfig]:

@@ -12,16 +12,17 @@ import numpy as np
 import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import Criterion, TrainConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.graph.build import build_graph
 from eslr_jax.graph.normalizer import is_warming_up
-from eslr_jax.models.registry import init_model, measure_statistics, merge_statistics
+from eslr_jax.models.apply import measure_statistics, merge_statistics
+from eslr_jax.models.network import Network
+from eslr_jax.models.refine import graph_inputs
 from eslr_jax.physics.potential import potential_terms
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
-from eslr_jax.simulation.network import graph_inputs
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.terms import Collision, Ground, Repulsion, scene_terms
 from eslr_jax.terms.hood import (
@@ -37,7 +38,7 @@ from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
-from eslr_jax.types import Normalizer, Scene, SceneBody
+from eslr_jax.types import ClothState, Normalizer, Scene, SceneBody
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
@@ -47,7 +48,7 @@ BATCH = "batch"  # axis of the device mesh
 class TrainState:
     """All that a run must remember to go on bit by bit."""
 
-    params: Any
+    network: Network
     optimizer: Any
     pools: tuple[Slot, ...]  # one per resolution
     key: Array
@@ -75,10 +76,19 @@ def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 
 def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) -> TrainState:
     """Return the state before the first step."""
-    params = init_model(config.model, config.seed)
+
+    def example() -> tuple[FrameProblem, ClothState]:
+        @jax.jit
+        def first(data: TrainingData) -> tuple[FrameProblem, ClothState]:
+            slot = start_trajectory(jax.random.key(config.seed), data, jnp.int32(0), config)
+            return slot_problem(slot, data, jnp.int32(0), config), slot.state
+
+        return first(datasets[0])
+
+    network = config.model.new_network(config.seed, example)
     return TrainState(
-        params=params,
-        optimizer=make_optimizer(config).init(params["params"]),
+        network=network,
+        optimizer=make_optimizer(config).init(network.params),
         pools=tuple(empty_pool(data, _slots_per_garment(config, data)) for data in datasets),
         key=jax.random.key_data(jax.random.key(config.seed)),
         step=jnp.int32(0),
@@ -149,28 +159,28 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
                 out_specs=(PartitionSpec(), PartitionSpec(BATCH)),
                 check_vma=False,
             )
-        gradient, samples = run(state.params, data, state.step, batch)
+        gradient, samples = run(state.network, data, state.step, batch)
         norm = optax.tree.norm(gradient)
         is_good = jnp.isfinite(norm) & jnp.all(jnp.isfinite(samples.metrics["loss"]))
         # HOOD's normalisers see a hundred graphs before anything is learned on their statistics.
-        is_learning = is_good & ~is_warming_up(state.params["statistics"])
+        network = state.network
+        is_learning = is_good & ~is_warming_up(network.statistics)
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
-        updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, state.params["params"])
-        trained = optax.apply_updates(state.params["params"], updates)
-        seen = state.params
+        updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, network.params)
+        trained = optax.apply_updates(network.params, updates)
+        seen = network
         for sample in range(size if samples.statistics else 0):
             seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023
-        params = {
-            **state.params,
-            "params": _choose(is_learning, trained, state.params["params"]),
-            "statistics": _choose(is_good, seen["statistics"], state.params["statistics"]),
-        }
+        network = network.replace(
+            params=_choose(is_learning, trained, network.params),
+            statistics=_choose(is_good, seen.statistics, network.statistics),
+        )
         pool = jax.tree.map(lambda all_, some: all_.at[indices].set(some), pool, samples.slot)
         metrics = {name: jnp.mean(values) for name, values in samples.metrics.items()}
         metrics |= {"gradient_norm": norm, "skipped": (~is_good).astype(jnp.float32)}
         return (
             TrainState(
-                params=params,
+                network=network,
                 optimizer=_choose(is_learning, optimizer, state.optimizer),
                 pools=(*state.pools[:resolution], pool, *state.pools[resolution + 1 :]),
                 key=jax.random.key_data(key),
@@ -197,7 +207,7 @@ class _Entry(NamedTuple):
 
 
 def _batch_gradient(
-    params: Any,
+    network: Network,
     data: TrainingData,
     step: Int[Array, ""],
     batch: _Entry,
@@ -211,10 +221,10 @@ def _batch_gradient(
     """
 
     def add(total, entry):
-        gradient, sample = _sample_gradient(params, data, step, entry, config=config)
+        gradient, sample = _sample_gradient(network, data, step, entry, config=config)
         return jax.tree.map(jnp.add, total, gradient), sample
 
-    zeros = jax.tree.map(jnp.zeros_like, params["params"])
+    zeros = jax.tree.map(jnp.zeros_like, network.params)
     total, samples = jax.lax.scan(add, zeros, batch)
     if axis is not None:
         total = jax.lax.psum(total, axis)
@@ -222,7 +232,7 @@ def _batch_gradient(
 
 
 def _sample_gradient(
-    params: Any, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
+    network: Network, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
 ) -> tuple[Any, _Sample]:
     """Return one trajectory's gradient, and move it on by a frame.
 
@@ -237,12 +247,15 @@ def _sample_gradient(
         terms_of = _hood_terms(slot, data, progress.num_samples, config.criterion)
 
     def loss_of(trained):
-        return physics_loss({**params, "params": trained}, problem, slot.state, config, terms_of)
+        return physics_loss(network.replace(params=trained), problem, slot.state, config, terms_of)
 
-    (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(params["params"])
+    (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(network.params)
     statistics = {}
-    if params["statistics"]:
-        statistics = _statistics(params, slot, problem, data, index, config)
+    if network.statistics:
+        inputs = graph_inputs(problem, slot.state)
+        graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
+        acceleration = _skinned_acceleration(slot, data, index)
+        statistics = measure_statistics(network, graph, problem.garment, acceleration)
     horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
     moved, is_astray = _advance(slot, problem, report, data, horizon)
     overflow = moved.state.status & Status.SELF_CONTACT_OVERFLOW
@@ -382,24 +395,14 @@ def _advance(
     return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done), is_astray
 
 
-def _statistics(
-    params: Any,
-    slot: Slot,
-    problem: FrameProblem,
-    data: TrainingData,
-    index: Int[Array, ""],
-    config: TrainConfig,
-) -> dict[str, Normalizer]:
-    """Return what the normalisers see in this frame (HOOD); an acceleration is that of the skinned garment."""
-    inputs = graph_inputs(problem, slot.state)
-    graph = build_graph(problem.garment, problem.material, inputs, config.model)
-    acceleration = None
-    if config.model.output == "acceleration":
-        frames = (slot.before, slot.frame, data.next_frame(slot.frame, slot.before))
-        before, now, later = (
-            data.skinned(index, data.transforms(frame, slot.yaw, slot.shape), slot.shape) for frame in frames
-        )
-        # A trajectory at a clip's first frame has none before it, and begins with the velocity to the next.
-        is_turned = (slot.age == 0) & (frames[0] == frames[2])
-        acceleration = jnp.where(is_turned, 0.0, later - 2.0 * now + before)
-    return measure_statistics(config.model, params, graph, problem.garment, acceleration)
+def _skinned_acceleration(
+    slot: Slot, data: TrainingData, index: Int[Array, ""]
+) -> Float[Array, "vertices 3"]:
+    """Return the acceleration of the garment carried by the joints [m per frame^2], which HOOD normalises by."""
+    frames = (slot.before, slot.frame, data.next_frame(slot.frame, slot.before))
+    before, now, later = (
+        data.skinned(index, data.transforms(frame, slot.yaw, slot.shape), slot.shape) for frame in frames
+    )
+    # A trajectory at a clip's first frame has none before it, and begins with the velocity to the next.
+    is_turned = (slot.age == 0) & (frames[0] == frames[2])
+    return jnp.where(is_turned, 0.0, later - 2.0 * now + before)

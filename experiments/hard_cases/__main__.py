@@ -83,7 +83,7 @@ def find_simulator(arguments: argparse.Namespace):
             arguments.iterations, arguments.integrator, has_skin=arguments.skin, substeps=arguments.substeps
         )
     if name in ITERATIONS:
-        return network_simulator(arguments.model, *load_model(arguments.model), arguments.iterations)
+        return network_simulator(arguments.model, load_model(arguments.model), arguments.iterations)
     if arguments.iterations is not None:
         raise ConfigError(f"--iterations is for this package's simulators; {name} has its own effort")
     if name == "blender":

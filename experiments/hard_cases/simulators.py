@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from eslr_jax import ModelConfig, SimConfig, Trajectory, simulate
+from eslr_jax import Network, SimConfig, Trajectory, simulate
 from eslr_jax.scene.build import Integrator
 from eslr_jax.types import Scene
 from hard_cases.case import Simulator
@@ -24,12 +22,12 @@ def solver_simulator(
     return Simulator(name, run, integrator=integrator, has_skin=has_skin, substeps=substeps)
 
 
-def network_simulator(name: str, params: Any, model: ModelConfig, iterations: int = 0) -> Simulator:
+def network_simulator(name: str, network: Network, iterations: int = 0) -> Simulator:
     """Return a network as a simulator, with so many iterations of the solver behind it."""
 
     def run(scene: Scene) -> Trajectory:
-        config = SimConfig(model=model, iterations=iterations)
-        return simulate(params, scene, config=config, raises=False).trajectory
+        config = SimConfig(iterations=iterations)
+        return simulate(network, scene, config=config, raises=False).trajectory
 
-    options = {"embedding_size": model.embedding_size, "embedding_mode": model.embedding_mode}
-    return Simulator(f"{name}, {iterations} iterations" if iterations else name, run, options)
+    label = f"{name}, {iterations} iterations" if iterations else name
+    return Simulator(label, run, network.garment_options)

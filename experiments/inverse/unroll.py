@@ -23,7 +23,8 @@ from harness import keep, parser
 from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import environment
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.network import Network
+from eslr_jax.models.registry import MODELS
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
@@ -35,7 +36,7 @@ SIDE, SIZE = 7, 0.24  # vertices, [m]
 FRAMES, TEST_FRAMES = 9, 25
 FABRIC = COTTON.replace(bending_stiffness=8e-4)
 MODEL = dataclasses.replace(MODELS["smooth-small"], latent_size=16, refinement_steps=3)
-ALONE, SOLVER = SimConfig(model=MODEL, iterations=0), SimConfig(iterations=150)
+ALONE, SOLVER = SimConfig(iterations=0), SimConfig(iterations=150)
 ENERGY, DISTANCE = 1e-3, 1e-2  # [J], [m]: units of the losses
 LOSSES = ("per frame", "potential through time", "distance through time")
 GARMENT = square(SIDE, SIZE, [0, SIDE - 1])
@@ -50,9 +51,9 @@ def make_scene(seed: int, num_frames: int) -> Scene:
     return held_scene(GARMENT, jnp.asarray(shift), FABRIC)
 
 
-def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
+def potentials(network, scene: Scene, *, is_detached: bool) -> jax.Array:
     """Return every frame's potential [J] where the network ended it; detached: frames hand on no gradient."""
-    step = make_stepper(params, ALONE)
+    step = make_stepper(network, ALONE)
 
     def advance(state, inputs):
         if is_detached:
@@ -63,42 +64,41 @@ def potentials(params, scene: Scene, *, is_detached: bool) -> jax.Array:
     return jax.lax.scan(advance, scene.initial_state, frame_inputs(scene))[1]
 
 
-def loss(weights, others: dict, scene: Scene, solved: jax.Array, *, kind: str) -> jax.Array:
+def loss(params, network: Network, scene: Scene, solved: jax.Array, *, kind: str) -> jax.Array:
     """Return one of the three losses, without unit."""
-    params = {**others, "params": weights}
+    network = network.replace(params=params)
     if kind == "distance through time":
-        apart = rollout_scene(params, scene, ALONE).positions - solved
+        apart = rollout_scene(network, scene, ALONE).positions - solved
         return jnp.mean(jnp.sum(apart**2, axis=-1)) / DISTANCE**2
-    return jnp.mean(potentials(params, scene, is_detached=kind == "per frame")) / ENERGY
+    return jnp.mean(potentials(network, scene, is_detached=kind == "per frame")) / ENERGY
 
 
-def train(kind: str, scenes: list[Scene], solved: list[jax.Array], steps: int) -> tuple[dict, float]:
-    """Return trained parameters, and the milliseconds of a step."""
-    params = init_model(MODEL)
-    others = {name: part for name, part in params.items() if name != "params"}
-    weights = params["params"]
+def train(kind: str, scenes: list[Scene], solved: list[jax.Array], steps: int) -> tuple[Network, float]:
+    """Return a trained network, and the milliseconds of a step."""
+    network = MODEL.new_network()
+    params = network.params
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     )
 
     @jax.jit
-    def step(weights, state, scene, solved):
-        gradient = jax.grad(loss)(weights, others, scene, solved, kind=kind)
+    def step(params, state, scene, solved):
+        gradient = jax.grad(loss)(params, network, scene, solved, kind=kind)
         updates, state = optimizer.update(gradient, state)
-        return optax.apply_updates(weights, updates), state
+        return optax.apply_updates(params, updates), state
 
-    state, times = optimizer.init(weights), []
+    state, times = optimizer.init(params), []
     for index in range(steps):
         began = time.perf_counter()
         row = index % len(scenes)
-        weights, state = jax.block_until_ready(step(weights, state, scenes[row], solved[row]))
+        params, state = jax.block_until_ready(step(params, state, scenes[row], solved[row]))
         times.append(1e3 * (time.perf_counter() - began))
-    return {**others, "params": weights}, float(np.median(times))
+    return network.replace(params=params), float(np.median(times))
 
 
-def judge(params, scene: Scene, solved: jax.Array) -> dict:
+def judge(network, scene: Scene, solved: jax.Array) -> dict:
     """Return the network's distance from the solver's motion by frame [mm], and its optimality gap."""
-    trajectory = rollout_scene(params, scene, ALONE)
+    trajectory = rollout_scene(network, scene, ALONE)
     apart = jnp.sqrt(jnp.mean(jnp.sum((trajectory.positions - solved) ** 2, axis=-1), axis=-1))
     gap = trajectory_gap(trajectory, scene, every=1)
     return {
@@ -116,8 +116,8 @@ def main() -> None:
     solved = [rollout_scene(None, scene, SOLVER).positions for scene in scenes]
     test = make_scene(1000, 3 if options.smoke else TEST_FRAMES)
     truth = rollout_scene(None, test, SOLVER).positions
-    result = {"steps": steps, "untrained": judge(init_model(MODEL), test, truth)}
+    result = {"steps": steps, "untrained": judge(MODEL.new_network(), test, truth)}
     for kind in kinds:
-        params, milliseconds = train(kind, scenes, solved, steps)
-        result[kind] = {"step_ms": round(milliseconds, 2), **judge(params, test, truth)}
+        network, milliseconds = train(kind, scenes, solved, steps)
+        result[kind] = {"step_ms": round(milliseconds, 2), **judge(network, test, truth)}
     keep(options.out / "unroll.json", result | environment())

@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
 from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
+from eslr_jax.models.network import System
 from eslr_jax.terms import Collision
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene
@@ -61,7 +62,7 @@ class Seen(NamedTuple):
 
 
 @struct.dataclass
-class Network:
+class Weights:
     """Weights, means and deviations, and the garment that they are applied to."""
 
     params: Any
@@ -104,10 +105,10 @@ class Transformer(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mat:
-    """The stepper's network, as `config.Predictor` asks for it; its weights are a `Network` with a space."""
+class Mat(System):
+    """The stepper's network; its weights are `Weights` with a space."""
 
-    def apply(self, params: Network, problem: FrameProblem, state: ClothState, /) -> Any:
+    def apply(self, params: Weights, problem: FrameProblem, state: ClothState, /) -> Any:
         """Return positions at t + 1 [m]."""
         assert params.space is not None
         contacts = problem.data_of(Collision).nearest
@@ -146,7 +147,7 @@ def observe(
     return Seen(faces, jnp.append(jnp.mean(moved, axis=0, where=is_real), pull))
 
 
-def predict(network: Network, seen: Seen) -> Change:
+def predict(network: Weights, seen: Seen) -> Change:
     """Return the change of a frame."""
     assert network.space is not None
     scaled = standardise(seen, network.seen_mean, network.seen_deviation)
@@ -162,7 +163,7 @@ def standardise(values: Any, mean: Any, deviation: Any) -> Any:
     return jax.tree.map(lambda x, centre, spread: (x - centre) / spread, values, mean, deviation)
 
 
-def loss(network: Network, seen: Seen, change: Change, key: Array) -> Float[Array, ""]:
+def loss(network: Weights, seen: Seen, change: Change, key: Array) -> Float[Array, ""]:
     """Return the mean error of a frame in standard deviations; both arguments are standardised."""
     assert network.space is not None
     keys = jax.random.split(key)
@@ -190,7 +191,7 @@ def _pairs(positions: Float[Array, "frames vertices 3"], scene: Scene, space: Sp
     return jax.lax.map(pair, tracks)
 
 
-def train(truth: Truth, steps: int, seed: int = 0) -> tuple[Network, dict[str, Any]]:
+def train(truth: Truth, steps: int, seed: int = 0) -> tuple[Weights, dict[str, Any]]:
     """Train on a garment's simulated rollouts; return the network and how it was trained."""
     began = time.process_time()
     space = prepare_space(truth.worn[0].scene.garment)
@@ -207,14 +208,14 @@ def train(truth: Truth, steps: int, seed: int = 0) -> tuple[Network, dict[str, A
     )
     first = jax.tree.map(lambda x: x[0], seen)
     params = Transformer().init(jax.random.key(seed), first, space.geodesic, is_face.astype(np.float32))
-    network = Network(params, *moments[0], *moments[1], space)
+    network = Weights(params, *moments[0], *moments[1], space)
     draw = np.random.default_rng(seed)
 
-    def batch(_: int) -> tuple[Any, Network]:
+    def batch(_: int) -> tuple[Any, Weights]:
         rows = draw.integers(len(seen.whole), size=_BATCH)
         return jax.tree.map(lambda x: x[rows], (seen, change)), network
 
-    def mean_loss(params: Any, batch: tuple[Any, Network], key: Array) -> Array:
+    def mean_loss(params: Any, batch: tuple[Any, Weights], key: Array) -> Array:
         rows, network = batch
         own = partial(loss, network.replace(params=params))
         return jnp.mean(jax.lax.map(lambda row: own(*row), (*rows, jax.random.split(key, _BATCH))))
@@ -237,14 +238,14 @@ def column_moments(values: Any, is_face: np.ndarray) -> tuple[Any, Any]:
     return mean, jax.tree.map(lambda x: np.maximum(x, _LEAST), deviation)
 
 
-def untrained(network: Network) -> Network:
+def untrained(network: Weights) -> Weights:
     """Return the network with heads of zeros, which answers with the mean change of the training data."""
     weights = network.params["params"]
     still = {name: jax.tree.map(jnp.zeros_like, weights[name]) for name in ("faces", "whole")}
     return network.replace(params={"params": {**weights, **still}})
 
 
-def write_network(network: Network, path: Path, training: dict[str, Any]) -> None:
+def write_network(network: Weights, path: Path, training: dict[str, Any]) -> None:
     """Write weights, means and deviations, and how the network was trained beside them."""
     scales = {
         name: getattr(network, name)._asdict()
@@ -253,12 +254,12 @@ def write_network(network: Network, path: Path, training: dict[str, Any]) -> Non
     write_archive(path, {**network.params, **scales}, {"training": training})
 
 
-def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
+def read_network(path: Path) -> tuple[Weights, dict[str, Any]]:
     """Return a network that `write_network` wrote, without a space, and its training record."""
     arrays, record = read_archive(path)
     scales = {name: Seen(**arrays.pop(name)) for name in ("seen_mean", "seen_deviation")}
     scales |= {name: Change(**arrays.pop(name)) for name in ("change_mean", "change_deviation")}
-    return Network(arrays, **scales), record["training"]  # type: ignore[arg-type]: by name
+    return Weights(arrays, **scales), record["training"]  # type: ignore[arg-type]: by name
 
 
 def main() -> None:

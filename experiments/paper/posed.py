@@ -34,8 +34,9 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
 from eslr_jax.body import lbs
-from eslr_jax.config import ModelConfig, TrainConfig
+from eslr_jax.config import TrainConfig
 from eslr_jax.graph.features import DENSITY_SCALE, material_inputs
+from eslr_jax.models.network import System
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.potential import potential_terms
 from eslr_jax.scene.build import initial_state
@@ -156,8 +157,8 @@ def _inputs(
 
 
 @dataclasses.dataclass(frozen=True)
-class Replay:
-    """A predictor whose weights are the positions of all frames: what sees no cloth is known beforehand."""
+class Replay(System):
+    """A network whose weights are the positions of all frames: what sees no cloth is known beforehand."""
 
     def apply(self, params: Any, problem: Any, state: Any, /) -> Any:
         """Return the positions of the next frame."""
@@ -221,7 +222,7 @@ def _loss_and_gradient(
         zero = jnp.zeros(())
         state = initial_state(before, jnp.where(is_last, velocity, 0.0))
         slot = Slot(state, frame - 1, frame - 2, zero, zero, jnp.int32(0), material, jnp.zeros((), bool))
-        problem = slot_problem(slot, data, jnp.int32(0), TrainConfig(model=ModelConfig()))
+        problem = slot_problem(slot, data, jnp.int32(0), TrainConfig(model=Replay()))
 
         def loss(position):
             terms = potential_terms(position, problem)

@@ -95,8 +95,8 @@ def main() -> None:
     broken = dict.fromkeys(models, 0.0)
     for name in models:
         system = read_system(name)
-        for worn, params in scenes_of(system, setting):
-            trajectory = rollout_scene(params, worn.scene, system.config)
+        for worn, network in scenes_of(system, setting):
+            trajectory = rollout_scene(network, worn.scene, system.config)
             if name == OPTIMUM:
                 check_optimum(trajectory, worn.garment)
             broken[name] += not_finite(trajectory) / len(garments)

@@ -14,13 +14,13 @@ import numpy as np
 
 from eslr_jax.assets.models import model_record
 from eslr_jax.body.lbs import skin_garment
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
 from eslr_jax.evaluation.calibrate import simulator_of
-from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_params
+from eslr_jax.evaluation.controls import EMBEDDING_CONTROLS, Control, control_garment, control_network
 from eslr_jax.evaluation.evaluate import distance_mm
 from eslr_jax.evaluation.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.evaluation.metrics import extremes, measure_frames
-from eslr_jax.models.registry import count_parameters
+from eslr_jax.models.network import Network
 from eslr_jax.simulation.budget import SOLVER
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters
@@ -44,12 +44,12 @@ _GAPS = ("gap_mj", "gap_share", "own_gap_mj", "own_gap_share")
 class System(NamedTuple):
     """A simulator of the tables."""
 
-    params: Any  # weights; None without a network
+    network: Network | None
     config: SimConfig
     cost: Mapping[str, float] = MappingProxyType({})  # parameters, and core-hours where they are known
-    garment_options: dict[str, Any] = ModelConfig().garment_options  # of `load_garment`
+    garment_options: Mapping[str, Any] = MappingProxyType({})  # of `load_garment`
     control: Control | None = None
-    weights_on: Callable[[Worn], Any] | None = None  # made for one scene: all positions of a replay
+    network_on: Callable[[Worn], Network] | None = None  # made for one scene
 
 
 def read_system(name: str) -> System:
@@ -69,23 +69,23 @@ def read_system(name: str) -> System:
     if name in (OPTIMUM, GUESS):
         iterations = OPTIMUM_ITERATIONS if name == OPTIMUM else 0
         return System(*simulator_of(SOLVER, iterations))
-    network, _, change = name.partition("~")
-    network, _, iterations = network.partition("+")
-    params, config = simulator_of(network, int(iterations or 0))
-    assert isinstance(config.model, ModelConfig)
-    options, control = config.model.garment_options, None
+    file, _, change = name.partition("~")
+    file, _, iterations = file.partition("+")
+    network, config = simulator_of(file, int(iterations or 0))
+    assert network is not None
+    options, control = network.garment_options, None
     if change in EMBEDDINGS:
         options = {**options, "embedding_mode": change}
     elif change in CONTROLS:
         control = change
-        params = control_params(control, params, config.model)
+        network = control_network(control, network)
     elif change:
         raise SystemExit(f"{name}: no change {change!r}; there are {', '.join((*CONTROLS, *EMBEDDINGS))}")
-    cost = {"parameters": count_parameters(params)}
-    hours = model_record(network).get("core_hours")
+    cost = {"parameters": network.num_parameters}
+    hours = model_record(file).get("core_hours")
     if hours is not None and control not in CONTROLS_OF_WEIGHTS:  # those show nothing of the training
         cost["core_hours"] = hours
-    return System(params, config, cost, options, control)
+    return System(network, config, cost, options, control)
 
 
 def _read_trained(kind: str, folder: str) -> System:
@@ -105,29 +105,29 @@ def _read_trained(kind: str, folder: str) -> System:
     if simulated:
         cost["truth_core_hours"] = simulated
 
-    def network_of(worn: Worn) -> Any:
+    def weights_of(worn: Worn) -> Any:
         return reader.read_network(Path(folder) / f"{kind}_{worn.garment}.npz")[0]
 
     if kind != "mat":
 
         def positions(worn: Worn) -> Any:
-            return reader.displace(network_of(worn), worn.scene.garment, worn.poses.joint_transforms)
+            return reader.displace(weights_of(worn), worn.scene.garment, worn.poses.joint_transforms)
 
         return _replayed(positions, cost)
 
-    def stepper_of(worn: Worn) -> Any:
-        network = network_of(worn)
-        network = mat.untrained(network) if change else network
-        return network.replace(space=prepare_space(worn.scene.garment))
+    def stepper_of(worn: Worn) -> Network:
+        weights = weights_of(worn)
+        weights = mat.untrained(weights) if change else weights
+        return Network(weights.replace(space=prepare_space(worn.scene.garment)), mat.Mat())
 
-    return System(
-        None, SimConfig(model=mat.Mat(), iterations=0), {} if change else cost, weights_on=stepper_of
-    )
+    return System(None, SimConfig(iterations=0), {} if change else cost, network_on=stepper_of)
 
 
 def _replayed(positions: Callable[[Worn], Any], cost: Mapping[str, float]) -> System:
     """Return the system whose positions are known beforehand."""
-    return System(None, SimConfig(model=posed.Replay(), iterations=0), cost, weights_on=positions)
+    return System(
+        None, SimConfig(iterations=0), cost, network_on=lambda worn: Network(positions(worn), posed.Replay())
+    )
 
 
 class Reference(NamedTuple):
@@ -137,16 +137,16 @@ class Reference(NamedTuple):
     gap: OptimalityGap  # from some of its states
 
 
-def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Any]]:
-    """Yield every garment on every clip with the system's weights; all share a compiled rollout."""
+def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Network | None]]:
+    """Yield every garment on every clip with the system's network; all share a compiled rollout."""
     for worn in wear(tuple(system.garment_options.items()), setting):
-        params = system.params
+        network = system.network
         if system.control is not None:
             changed = control_garment(system.control, worn.scene.garment)
             worn = worn._replace(scene=worn.scene.replace(garment=changed))
-        if system.weights_on is not None:
-            params = system.weights_on(worn)
-        yield worn, params
+        if system.network_on is not None:
+            network = system.network_on(worn)
+        yield worn, network
 
 
 def find_references(setting: Setting) -> list[Reference]:
@@ -157,8 +157,8 @@ def find_references(setting: Setting) -> list[Reference]:
     """
     system = read_system(OPTIMUM)
     found = []
-    for worn, params in scenes_of(system, setting):
-        trajectory = rollout_scene(params, worn.scene, system.config)
+    for worn, network in scenes_of(system, setting):
+        trajectory = rollout_scene(network, worn.scene, system.config)
         check_optimum(trajectory, worn.garment)
         gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
         found.append(Reference(trajectory, gap))
@@ -179,13 +179,13 @@ def measure_system(
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
     gaps: dict[str, list[np.ndarray]] = {}
-    for (worn, params), (reference, gap) in zip(scenes_of(system, setting), references, strict=True):
+    for (worn, network), (reference, gap) in zip(scenes_of(system, setting), references, strict=True):
         garment, scene, _ = worn
-        trajectory = rollout_scene(params, scene, system.config)
+        trajectory = rollout_scene(network, scene, system.config)
         row = measure(trajectory, scene, worn.root_height())
         row["distance_mm"] = distance_mm(trajectory, reference, scene)
         row["not_finite"] = not_finite(trajectory)
-        left = stepped_potentials(params, reference, scene, system.config, every) - gap.optimum
+        left = stepped_potentials(network, reference, scene, system.config, every) - gap.optimum
         own = trajectory_gap(trajectory, scene, every=every)
         own_left = own.reached - own.optimum
         measured.setdefault(garment, []).append(row)

@@ -18,7 +18,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float
 
 from eslr_jax.assets import split_clips
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
 from eslr_jax.io.npz import read_arrays, write_arrays
 from eslr_jax.simulation.rollout import rollout_scene
 from paper.worn import OPTIMUM_ITERATIONS, Setting, Worn, check_optimum, wear
@@ -55,7 +55,7 @@ def load_truth(garment: str, folder: Path, *, is_smoke: bool = False) -> Truth:
     if is_smoke:
         clips, frames = clips[:1], 5
     setting = Setting((garment,), clips, frames, "1k")
-    worn = wear(tuple(ModelConfig().garment_options.items()), setting)
+    worn = wear((), setting)
     path = folder / f"truth_{garment}.npz"
     if not path.exists():
         began = time.process_time()

@@ -30,12 +30,13 @@ import harness
 import jax
 import numpy as np
 
-from eslr_jax import ModelConfig, SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
 from eslr_jax.assets import load_splits
 from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
 from eslr_jax.evaluation.report import environment
 from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.models.registry import MODELS, count_parameters, init_model
+from eslr_jax.models.hood import STAGES, Hood
+from eslr_jax.models.registry import MODELS
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 from paper.rollouts import (
@@ -73,6 +74,7 @@ PARTS = ("mean", "seeds", "garments", "networks", "environments", "notes")
 TABLES = ("native_garments", "unseen_garments", "new_motion", "model_cost")
 _CLIPS = 3  # of the test split, if none are given
 _NEW_MOTION_FRAMES = 60  # the clips are short
+_LAYERS = ("message_passing_steps", "steps_per_stage", "layers")  # by system, of HOOD's in each stage
 _TURNS = 7  # in which latencies are measured
 
 Rows = dict[str, tuple[str, ...]]
@@ -148,11 +150,12 @@ def with_changes(rows: Rows, table: str, has_controls: bool) -> Rows:
     """Return the rows of a table: with those of the controls, and of other embeddings for unseen garments."""
     changed = dict(rows)
     for label, (name, *_) in rows.items():
-        model = read_system(name).config.model
-        if isinstance(model, ModelConfig) and "~" not in name:  # which is a control or another mode itself
-            fitting = CONTROLS if model.attention_blocks else CONTROLS_OF_WEIGHTS
+        network = read_system(name).network
+        if network is not None and "~" not in name:  # which is a control or another mode itself
+            has_attention = getattr(network.config, "attention_blocks", 0) > 0
+            fitting = CONTROLS if has_attention else CONTROLS_OF_WEIGHTS
             changes = fitting if has_controls else fitting[:1]
-            if table == "unseen_garments" and model.attention_blocks:
+            if table == "unseen_garments" and has_attention:
                 changes = (*changes, "raw", "landmarks")
             changed |= {f"{label}, {change}": (f"{name}~{change}",) for change in changes}
     return changed
@@ -263,33 +266,35 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     Memory is what XLA allocates for the call, weights included.
     """
     read = {label: read_system(name) for label, (name, *_) in rows.items()}
-    systems = {label: system for label, system in read.items() if system.weights_on is None}
+    systems = {label: system for label, system in read.items() if system.network_on is None}
     for name in full_size(vertices, is_smoke):
         if name in systems:  # with its weights, and what they cost
             continue
-        params, config = init_model(MODELS[name]), MODELS[name]
-        cost = {"parameters": count_parameters(params)}
-        systems[name] = System(params, SimConfig(model=config, iterations=0), cost, config.garment_options)
+        network = MODELS[name].new_network()
+        cost = {"parameters": network.num_parameters}
+        systems[name] = System(network, SimConfig(iterations=0), cost, network.garment_options)
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
         scene = prepare_scene(load_garment("tshirt", vertices=vertices, **system.garment_options), poses)  # type: ignore[arg-type]
         inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
-        def forward(params, state, config=system.config, scene=scene, inputs=inputs):
-            return make_stepper(params, config)(frame_problem(scene, state, inputs), state)[0].position
+        def forward(network, state, config=system.config, scene=scene, inputs=inputs):
+            return make_stepper(network, config)(frame_problem(scene, state, inputs), state)[0].position
 
-        memory = jax.jit(forward).lower(system.params, scene.initial_state).compile().memory_analysis()
+        memory = jax.jit(forward).lower(system.network, scene.initial_state).compile().memory_analysis()
         assert memory is not None
-        parts[label] = (forward, (system.params, scene.initial_state))
+        parts[label] = (forward, (system.network, scene.initial_state))
         found[label] = {
             **system.cost,
             "memory_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
         }
-        if isinstance(system.config.model, ModelConfig):
+        if system.network is not None:
+            config = system.network.config
+            layers = next(getattr(config, name) for name in _LAYERS if hasattr(config, name))
             found[label] |= {
-                "layers": system.config.model.message_passing_steps,
-                "refinement_steps": system.config.model.refinement_steps,
+                "layers": layers * (len(STAGES) if isinstance(config, Hood) else 1),
+                "refinement_steps": config.refinement_steps,
             }
     for label, milliseconds in take_turns(parts, 1 if is_smoke else _TURNS).items():
         found[label]["latency_ms"] = milliseconds

@@ -10,11 +10,11 @@ from eslr_jax import load_body, load_garment, load_model, load_motion, pose_body
 from eslr_jax.assets import asset_names, load_garment_file, load_splits
 from eslr_jax.assets.catalog import is_intact, list_assets
 from eslr_jax.assets.garments import check_resolution
+from eslr_jax.assets.weights import read_network, write_network
 from eslr_jax.body.motion import Motion, still_motion
 from eslr_jax.cli.actor import is_moving_mesh, load_wearer
 from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError
-from eslr_jax.io.weights import read_weights, write_weights
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 
 
 def test_every_file_is_intact_and_licensed():
@@ -45,11 +45,13 @@ def test_unknown_names_list_what_exists(load):
 
 
 def test_a_network_takes_other_numbers_of_refinement_steps():
-    _, trained = load_model("eslr-small")
-    _, fewer = load_model("eslr-small:3")
-    assert fewer == dataclasses.replace(trained, refinement_steps=3)
+    trained = load_model("eslr-small")
+    fewer = load_model("eslr-small:3")
+    assert fewer.config == dataclasses.replace(trained.config, refinement_steps=3)
     with pytest.raises(AssetError, match="refinement_steps must be at least 1"):
         load_model("eslr-small:0")
+    with pytest.raises(AssetError, match="has no refinement steps"):
+        load_model("mgn-5-correction:2")
 
 
 def test_a_folder_with_an_asset_s_name_is_not_taken_for_it(tmp_path, monkeypatch):
@@ -92,27 +94,24 @@ def test_still_body_of_any_shape_stands_on_the_floor(betas):
 
 @pytest.fixture(scope="module")
 def network():
-    return init_model(MODELS["eslr-small"]), MODELS["eslr-small"]
+    return MODELS["eslr-small"].new_network()
 
 
 def test_weights_round_trip(tmp_path, network):
-    params, config = network
-    write_weights(tmp_path / "model.npz", params, config, {"description": "test"})
-    loaded, read_config, training = read_weights(tmp_path / "model.npz")
-    assert read_config == config
+    write_network(tmp_path / "model.npz", network, {"description": "test"})
+    loaded, training = read_network(tmp_path / "model.npz")
+    assert loaded.config == network.config
     assert training == {"description": "test"}
-    np.testing.assert_array_equal(
-        loaded["constants"]["projection"], np.asarray(params["constants"]["projection"])
-    )
+    np.testing.assert_array_equal(loaded.constants["projection"], network.constants["projection"])
 
 
 def test_foreign_weights_are_refused(tmp_path, network):
-    write_weights(tmp_path / "model.npz", *network, {})
+    write_network(tmp_path / "model.npz", network, {})
     path = tmp_path / "model.json"
     written = json.loads(path.read_text())
     for change, message in (
         ({"format": 99}, "update eslr-jax"),
-        ({"model": {"latent_sise": 3}}, "another architecture"),
+        ({"model": {"base": "eslr", "latent_sise": 3}}, "another architecture"),
         ({"model": None}, "damaged|architecture"),
     ):
         path.write_text(json.dumps(written | change))

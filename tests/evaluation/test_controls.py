@@ -11,24 +11,22 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.evaluation.controls import Control, control_garment, control_params
+from eslr_jax.evaluation.controls import Control, control_garment, control_network
 from eslr_jax.evaluation.gap import stepped_potentials, trajectory_gap
 from eslr_jax.geometry.padding import choose_bucket, pad_garment
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.network import Network
+from eslr_jax.models.registry import MODELS
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.network import predict
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import CLOTH
 
 SIZES = {"message_passing_steps": 1, "latent_size": 8, "attention_size": 4, "attention_features": 8}
 CONFIG = dataclasses.replace(
     MODELS["eslr-5"],
-    features="gradient",
-    output="correction",
-    output_scale=0.005,
+    correction_scale=0.005,
     attention_blocks=1,
     **SIZES,
 )
@@ -36,8 +34,8 @@ CONFIG = dataclasses.replace(
 
 @pytest.fixture(scope="module")
 def trained():
-    params = init_model(CONFIG, seed=3)
-    return {**params, "params": jax.tree.map(lambda leaf: leaf + 0.05, params["params"])}
+    network = CONFIG.new_network(seed=3)
+    return network.replace(params=jax.tree.map(lambda leaf: leaf + 0.05, network.params))
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +49,13 @@ def moves(trained, scene):
     """How far the prediction is from the solver's guess [m], by control."""
 
     @jax.jit
-    def move(params, scene):
-        prediction = predict(params, first_problem(scene), scene.initial_state, CONFIG)
+    def move(network, scene):
+        prediction = network.predict(first_problem(scene), scene.initial_state)
         return prediction.position - prediction.guess.position
 
     return {
         control: move(
-            trained if control is None else control_params(control, trained, CONFIG),
+            trained if control is None else control_network(control, trained),
             scene if control is None else scene.replace(garment=control_garment(control, scene.garment)),
         )
         for control in (None, *get_args(Control))
@@ -76,7 +74,7 @@ def test_untrained_weights_and_other_embeddings_predict_otherwise(moves):
 
 def test_a_network_without_attention_has_no_coordinates_to_lose():
     with pytest.raises(ConfigError, match="only attention reads"):
-        control_params("no_embedding", {}, ModelConfig(attention_blocks=0))
+        control_network("no_embedding", Network({}, MODELS["mgn-5"]))
 
 
 def test_random_coordinates_keep_their_spread(scene):

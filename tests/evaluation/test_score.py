@@ -6,13 +6,12 @@ import pytest
 from draped_ball import drifting_ball, square
 
 from eslr_jax import SimConfig, prepare_scene, score_trajectory, simulate
-from eslr_jax.config import ModelConfig
 from eslr_jax.errors import ConfigError, MotionError, NonFiniteError
 from eslr_jax.evaluation.evaluate import EvaluationOptions, evaluate
 from eslr_jax.evaluation.foreign import foreign_trajectory, with_energies
 from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.evaluation.report import trajectory_report
-from eslr_jax.models.registry import init_model
+from eslr_jax.models.eslr import Eslr
 from eslr_jax.terms import Repulsion, scene_terms
 from eslr_jax.terms.air import blowing
 
@@ -109,16 +108,16 @@ def test_a_network_s_rollout_scores_as_evaluate_says():
     from eslr_jax.body.motion import pose_body
     from eslr_jax.scene.plan import shared_surface
 
-    model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
-    params, frames, every = init_model(model), 6, 2
+    network = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8).new_network()
+    frames, every = 6, 2
     options = EvaluationOptions(
         garments=("tshirt",), clips=("cmu_016_32",), gap_frames=frames, every=every, rollout_frames=4
     )
-    expected = evaluate(params, model, options, iterations=5)["on_policy"]
+    expected = evaluate(network, options, iterations=5)["on_policy"]
     body, garment = load_body(), load_garment("tshirt", pad=True)
     poses = pose_body(body, load_motion("cmu_016_32"), num_frames=frames)
     scene = prepare_scene(garment, poses, surface=shared_surface([garment], body))
-    own = simulate(params, scene, config=SimConfig(model=model, iterations=5)).trajectory
+    own = simulate(network, scene, config=SimConfig(iterations=5)).trajectory
     score = score_trajectory(own, scene, every=every)
     assert score["gap_frames"] == expected["frames"]
     assert score["gap_relative_median"] == pytest.approx(expected["gap_relative_median"], rel=0.02)
@@ -127,9 +126,9 @@ def test_a_network_s_rollout_scores_as_evaluate_says():
 
 @pytest.mark.slow
 def test_an_evaluation_without_the_gap_has_the_rollouts():
-    model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
+    network = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8).new_network()
     options = EvaluationOptions(garments=("tshirt",), clips=("cmu_016_32",), gap_frames=0, rollout_frames=4)
-    result = evaluate(init_model(model), model, options)
+    result = evaluate(network, options)
     assert not {"gap_median_j", "on_policy"} & set(result)
     assert [(row["garment"], row["clip"]) for row in result["scenes"]] == [("tshirt", "cmu_016_32")]
     assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}

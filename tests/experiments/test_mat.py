@@ -10,6 +10,7 @@ from paper import mat, mat_space
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.config import SimConfig
+from eslr_jax.models.network import Network
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Contacts
 
@@ -98,7 +99,7 @@ def test_the_error_falls_on_a_frame_that_is_seen_again_and_again(space, moved):
         mat.standardise(value, *moments) for value, moments in zip((seen, change), scales, strict=True)
     )
     params = mat.Transformer().init(jax.random.key(0), seen, space.geodesic, is_face.astype(np.float32))
-    network = mat.Network(params, *scales[0], *scales[1], space)
+    network = mat.Weights(params, *scales[0], *scales[1], space)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes types
         _, losses = mat.fit(
             jax.value_and_grad(
@@ -120,12 +121,12 @@ def test_an_untrained_network_steps_the_cloth_and_comes_back_from_its_file(small
     scales += [mat.Change(0 * faces[:, :9], jnp.zeros(3)), mat.Change(0.1 * faces[:, :9], 0.01 * jnp.ones(3))]
     seen = mat.Seen(jnp.zeros((count, 34)), jnp.zeros(6))
     params = mat.Transformer().init(jax.random.key(0), seen, space.geodesic, jnp.ones(count))
-    network = mat.Network(params, *scales)
+    network = mat.Weights(params, *scales)
     mat.write_network(network, tmp_path / "mat_sleeve.npz", {})
     again, _ = mat.read_network(tmp_path / "mat_sleeve.npz")
-    config = SimConfig(model=mat.Mat(), iterations=0)
+    config = SimConfig(iterations=0)
     still, random, read = (
-        np.asarray(rollout_scene(net.replace(space=space), small_scene, config).positions)
+        np.asarray(rollout_scene(Network(net.replace(space=space), mat.Mat()), small_scene, config).positions)
         for net in (mat.untrained(network), network, again)
     )
     is_real = np.asarray(space.garment.vertex_mask)

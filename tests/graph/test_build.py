@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit, to_float64
 
-from eslr_jax.config import ModelConfig
-from eslr_jax.graph.build import build_graph, edge_set, feature_sizes, incoming_edges
+from eslr_jax.graph.build import GraphKind, build_graph, edge_set, feature_sizes, incoming_edges
 from eslr_jax.graph.features import mean_edge_length
 from eslr_jax.graph.inputs import next_refinement
 
-HOOD = ModelConfig(update_body=True)
-GRADIENT = ModelConfig(features="gradient", output="correction")
+HOOD = GraphKind(reads_gradient=False, has_reverse_edges=True)
+GRADIENT = GraphKind(reads_gradient=True)
 
 
 BOTH = [pytest.param(HOOD, id="hood", marks=pytest.mark.slow), pytest.param(GRADIENT, id="gradient")]

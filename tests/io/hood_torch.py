@@ -244,9 +244,9 @@ def write_fixtures(folder):
     arrays = {}
     for layout in ("postcvpr", "cvpr", "fine"):
         garment, material, inputs = make_scene(8, 6)
-        config = MODELS["mgn-15" if layout == "fine" else "hood"]
+        kind = MODELS["mgn-15" if layout == "fine" else "hood"].graph
         graph = build_graph(
-            add_coarse_edges(garment) if config.hierarchical else garment, material, inputs, config
+            add_coarse_edges(garment) if kind.has_coarse_edges else garment, material, inputs, kind
         )
         seen = plain_graph(graph)
         network = save(folder / f"hood_{layout}.pth", layout, size=4, steps=5, graph=seen)

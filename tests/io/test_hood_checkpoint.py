@@ -12,13 +12,14 @@ from commands import eslr_here
 from reference_models import make_scene, quick_jit
 from test_torch_archive import Tensor, write_archive
 
+from eslr_jax.assets.hood import read_hood
+from eslr_jax.assets.weights import read_network
 from eslr_jax.errors import CheckpointError
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.graph.build import build_graph
-from eslr_jax.io.hood import read_hood
 from eslr_jax.io.torch_archive import read_torch
-from eslr_jax.io.weights import read_weights
-from eslr_jax.models.registry import MODELS, apply_model, check_params, count_parameters, scale_output
+from eslr_jax.models.apply import apply_model, scale_output
+from eslr_jax.models.registry import MODELS
 
 COUNTS = {"postcvpr": 5_146_852, "cvpr": 5_076_964, "fine": 3_854_164}
 SIZE = 16
@@ -41,29 +42,27 @@ def convert(checkpoint, out):
 
 def answer_of(path, graph, garment):
     """Return the accelerations of a converted network."""
-    params, config, _ = read_weights(path)
-    run = quick_jit(
-        lambda params, graph: scale_output(config, params, apply_model(config, params, graph, garment))
-    )
-    return run(params, graph)
+    network, _ = read_network(path)
+    run = quick_jit(lambda network, graph: scale_output(network, apply_model(network, graph, garment)))
+    return run(network, graph)
 
 
 def scene_graph(config):
     """Return a tube and its graph."""
     garment, material, inputs = make_scene(8, 6)
-    garment = add_coarse_edges(garment) if config.hierarchical else garment
-    return garment, quick_jit(lambda: build_graph(garment, material, inputs, config))()
+    garment = add_coarse_edges(garment) if config.graph.has_coarse_edges else garment
+    return garment, quick_jit(lambda: build_graph(garment, material, inputs, config.graph))()
 
 
 @pytest.mark.parametrize("layout", COUNTS)
 def test_without_pytorch_its_checkpoint_computes_what_it_computed(tmp_path, layout):
     """The fixtures hold a network's input and answer; `hood_torch` wrote them."""
     convert(FIXTURES / f"hood_{layout}.pth", tmp_path / "hood.npz")
-    _, config, _ = read_weights(tmp_path / "hood.npz")
+    config = read_network(tmp_path / "hood.npz")[0].config
     garment, graph = scene_graph(config)
     with np.load(FIXTURES / "hood_answers.npz") as stored:
         given = {name.removeprefix(f"{layout}/"): stored[name] for name in stored.files if layout in name}
-    for name in ("mesh", "coarse0", "coarse1", "coarse2")[: 4 if config.hierarchical else 1]:
+    for name in ("mesh", "coarse0", "coarse1", "coarse2")[: 4 if config.graph.has_coarse_edges else 1]:
         np.testing.assert_array_equal(given[f"{name}_ends"], [graph.senders[name], graph.receivers[name]])
     graph = graph._replace(
         nodes={name: jnp.asarray(given[name]) for name in graph.nodes},
@@ -80,15 +79,16 @@ def test_a_converted_network_computes_the_same(tmp_path, layout):
     from hood_torch import plain_graph
 
     save(tmp_path / "hood.pth", layout)
-    _, config = read_hood(tmp_path / "hood.pth")
+    config = read_hood(tmp_path / "hood.pth").config
     garment, graph = scene_graph(config)
     network = save(tmp_path / "hood.pth", layout, graph=graph)
     with torch.no_grad():
         expected = network(plain_graph(graph)).numpy()
     convert(tmp_path / "hood.pth", tmp_path / "hood.npz")
-    _, config, record = read_weights(tmp_path / "hood.npz")
+    converted, record = read_network(tmp_path / "hood.npz")
     assert record == {"converted_from": "hood.pth"}
-    assert (config.latent_size, config.message_passing_steps) == (SIZE, 5)
+    assert converted.config == config
+    assert config.latent_size == SIZE
     actual = answer_of(tmp_path / "hood.npz", graph, garment)
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
@@ -96,10 +96,9 @@ def test_a_converted_network_computes_the_same(tmp_path, layout):
 @pytest.mark.parametrize("layout", COUNTS)
 def test_full_size_checkpoints_have_the_published_sizes(tmp_path, layout):
     save(tmp_path / "hood.pth", layout, size=128, steps=15)
-    params, config = read_hood(tmp_path / "hood.pth")
-    check_params(config, params)
+    network = read_hood(tmp_path / "hood.pth")
     shared = 2 * (12 * 128 + 128 + 2 * 16512 + 256)  # "cvpr" encodes all coarse levels by one perceptron
-    assert count_parameters(params) == COUNTS[layout] + (shared if layout == "cvpr" else 0)
+    assert network.num_parameters == COUNTS[layout] + (shared if layout == "cvpr" else 0)
 
 
 def test_what_is_no_network_of_hoods_is_refused(tmp_path):
@@ -135,7 +134,7 @@ def test_stages_of_unlike_length_are_refused(tmp_path):
 @pytest.mark.slow
 def test_a_converted_network_simulates(tmp_path):
     garment, material, inputs = make_scene(8, 6)
-    graph = build_graph(add_coarse_edges(garment), material, inputs, MODELS["hood"])
+    graph = build_graph(add_coarse_edges(garment), material, inputs, MODELS["hood"].graph)
     save(tmp_path / "hood.pth", "postcvpr", graph=graph)
     convert(tmp_path / "hood.pth", tmp_path / "hood.npz")
     words = ("--frames", 4, "--iterations", 20, "--no-pictures", "--out", tmp_path / "run")

@@ -10,32 +10,37 @@ import numpy as np
 import pytest
 from reference_models import make_scene, plain_hood, quick_jit, to_float64
 
-from eslr_jax.config import ModelConfig, from_dict
 from eslr_jax.errors import ConfigError
 from eslr_jax.geometry.coarse import add_coarse_edges
 from eslr_jax.graph.build import build_frame_graph, build_graph, build_refinement_graph
-from eslr_jax.models import registry
-from eslr_jax.models.registry import MODELS, apply_model, count_parameters, init_model
+from eslr_jax.models.apply import (
+    apply_model,
+    apply_refinement,
+    encode_frame,
+    measure_statistics,
+    merge_statistics,
+)
+from eslr_jax.models.registry import MODELS
 from eslr_jax.types import tree_cast
 
-SMALL = dataclasses.replace(MODELS["hood"], message_passing_steps=5, latent_size=8, remat="none")
-CORRECTING = dataclasses.replace(SMALL, features="gradient", output="correction")
+SMALL = dataclasses.replace(MODELS["hood"], steps_per_stage=1, latent_size=8, remat="none")
+CORRECTING = dataclasses.replace(SMALL, correction_scale=1.0)
 
 
-def weights(config=SMALL):
-    params, generator = init_model(config), np.random.default_rng(1)
-    scrambled = jax.tree.map(
-        lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), params["params"]
+def trained(config=SMALL):
+    network, generator = config.new_network(), np.random.default_rng(1)
+    return network.replace(
+        params=jax.tree.map(
+            lambda leaf: leaf + 0.1 * generator.standard_normal(leaf.shape, np.float32), network.params
+        )
     )
-    return {**params, "params": scrambled}
 
 
 @quick_jit
-def run(params, garment, material, inputs):
-    graph = build_graph(garment, material, inputs, SMALL)
-    measured = registry.measure_statistics(SMALL, params, graph, garment, inputs.velocity)
-    params = registry.merge_statistics(params, measured)
-    return params, graph, apply_model(SMALL, params, graph, garment)
+def run(network, garment, material, inputs):
+    graph = build_graph(garment, material, inputs, network.config.graph)
+    network = merge_statistics(network, measure_statistics(network, graph, garment, inputs.velocity))
+    return network, graph, apply_model(network, graph, garment)
 
 
 def coarse_scene(**options):
@@ -44,40 +49,40 @@ def coarse_scene(**options):
 
 
 def test_parameter_count_is_that_of_the_published_network():
-    assert count_parameters(jax.eval_shape(lambda: init_model(MODELS["hood"]))) == 5_146_852
+    assert jax.eval_shape(lambda: MODELS["hood"].new_network()).num_parameters == 5_146_852
 
 
 @pytest.mark.parametrize("body", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_network_matches_numpy(body):
-    params, graph, actual = run(weights(), *coarse_scene(body=body))
-    expected = plain_hood(*(to_float64(tree) for tree in (params, graph)), 1)
+    network, graph, actual = run(trained(), *coarse_scene(body=body))
+    expected = plain_hood(*(to_float64(tree) for tree in (network, graph)))
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_network_with_gradient_features_matches_numpy():
-    params, scene = weights(CORRECTING), coarse_scene()
+    network, scene = trained(CORRECTING), coarse_scene()
 
     @quick_jit
-    def both(params, garment, material, inputs):
-        graph = build_graph(garment, material, inputs, CORRECTING)
-        frame = build_frame_graph(garment, material, inputs, CORRECTING)
+    def both(network, garment, material, inputs):
+        graph = build_graph(garment, material, inputs, network.config.graph)
+        frame = build_frame_graph(garment, material, inputs, network.config.graph)
         changing = build_refinement_graph(garment, material, inputs, frame)
-        encoded = registry.encode_frame(CORRECTING, params, frame)
+        encoded = encode_frame(network, frame)
         return (
             graph,
-            apply_model(CORRECTING, params, graph, garment),
-            registry.apply_refinement(CORRECTING, params, encoded, changing, garment),
+            apply_model(network, graph, garment),
+            apply_refinement(network, encoded, changing, garment),
         )
 
-    graph, actual, stepwise = both(params, *scene)
-    expected = plain_hood(*(to_float64(tree) for tree in (params, graph)), 1)
+    graph, actual, stepwise = both(network, *scene)
+    expected = plain_hood(*(to_float64(tree) for tree in (network, graph)))
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_array_equal(stepwise, actual)
 
 
 def test_gradient_features_of_a_coarse_level_match_numpy():
     garment, material, inputs = coarse_scene()
-    graph = quick_jit(build_graph, static_argnums=3)(garment, material, inputs, CORRECTING)
+    graph = quick_jit(build_graph, static_argnums=3)(garment, material, inputs, CORRECTING.graph)
     for name, level in zip(("coarse0", "coarse1"), garment.coarse[:2], strict=True):
         is_real = np.asarray(level.edge_mask)
         senders, receivers = np.asarray(level.senders)[is_real], np.asarray(level.receivers)[is_real]
@@ -95,8 +100,8 @@ def test_gradient_features_of_a_coarse_level_match_numpy():
 
 @pytest.mark.slow
 def test_padding_does_not_change_the_answer():
-    expected = run(weights(), *coarse_scene())[2]
-    actual = run(weights(), *coarse_scene(pad=True))[2]
+    expected = run(trained(), *coarse_scene())[2]
+    actual = run(trained(), *coarse_scene(pad=True))[2]
     np.testing.assert_allclose(actual[: len(expected)], expected, atol=2e-6 * np.abs(expected).max())
 
 
@@ -105,7 +110,7 @@ def test_padding_does_not_change_the_answer():
 def test_gradient_matches_finite_differences():
     with jax.enable_x64(True):
         scene = tree_cast(coarse_scene(), jnp.float64)
-        params, graph, answer = run(tree_cast(weights(), jnp.float64), *scene)
+        network, graph, answer = run(tree_cast(trained(), jnp.float64), *scene)
         generator = np.random.default_rng(0)
         direction = generator.standard_normal(answer.shape)
         rows = graph.nodes["garment"]
@@ -113,7 +118,7 @@ def test_gradient_matches_finite_differences():
 
         def total(velocity):
             nodes = {**graph.nodes, "garment": rows.at[:, :3].set(velocity)}
-            answer = apply_model(SMALL, params, graph._replace(nodes=nodes), scene[0])
+            answer = apply_model(network, graph._replace(nodes=nodes), scene[0])
             return jnp.sum(direction * answer)
 
         velocity, step, value = rows[:, :3], 1e-6, quick_jit(total)
@@ -124,13 +129,4 @@ def test_gradient_matches_finite_differences():
 
 def test_a_garment_without_coarse_levels_is_refused():
     with pytest.raises(ConfigError, match="add_coarse_edges"):
-        jax.eval_shape(run, init_model(SMALL), *make_scene(8, 6))
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"hierarchical": True}, {"hierarchical": True, "smoothing_steps": 0, "message_passing_steps": 7}],
-)
-def test_impossible_hierarchies_are_refused(values):
-    with pytest.raises(ConfigError, match="hierarchical"):
-        from_dict(ModelConfig, values)
+        jax.eval_shape(run, SMALL.new_network(), *make_scene(8, 6))

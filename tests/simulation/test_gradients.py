@@ -17,7 +17,7 @@ from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.physics.rest_shape import with_rest_positions
 from eslr_jax.physics.solve import Start, solve, solve_hessian
@@ -345,19 +345,17 @@ def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so(terms):
 @pytest.mark.parametrize("output", ["subspace", "descent"])
 def test_a_refined_prediction_has_right_gradients(output):
     """Through the combination weights too, which training alone may take as constants."""
-    model = dataclasses.replace(
-        MODELS["smooth-small"], output=output, refinement_steps=2, latent_size=8, seed=0
-    )
-    params = tree_cast(jax.tree.map(jnp.asarray, init_model(model)), jnp.float64)
+    model = dataclasses.replace(MODELS["smooth-small"], output=output, refinement_steps=2, latent_size=8)
+    network = tree_cast(jax.tree.map(jnp.asarray, model.new_network()), jnp.float64)
     scene = small_scene(2, has_body=False)
-    config = SimConfig(model=model, iterations=0)
+    config = SimConfig(iterations=0)
     weights = jnp.asarray(np.random.default_rng(1).standard_normal(scene.initial_state.position.shape))
 
     @jax.jit
     def loss(factor):
         material = scene.material.replace(lame_mu=scene.material.lame_mu * factor)
         return jnp.sum(
-            weights * rollout_scene(params, scene.replace(material=material), config).positions[-1]
+            weights * rollout_scene(network, scene.replace(material=material), config).positions[-1]
         )
 
     expected = (loss(1.0 + STEP) - loss(1.0 - STEP)) / (2 * STEP)
@@ -367,20 +365,19 @@ def test_a_refined_prediction_has_right_gradients(output):
 @pytest.mark.slow
 def test_a_prediction_drops_out_where_the_solver_follows_it():
     model = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
-    params = tree_cast(jax.tree.map(jnp.asarray, init_model(model)), jnp.float64)
+    network = tree_cast(jax.tree.map(jnp.asarray, model.new_network()), jnp.float64)
     scene = small_scene(2, has_body=False)
     weights = jnp.asarray(np.random.default_rng(1).standard_normal(scene.initial_state.position.shape))
 
-    def loss(params, density, config):
+    def loss(params, density, network):
+        start = None if network is None else network.replace(params=params)
         material = scene.material.replace(density=density)
-        return jnp.sum(
-            weights * rollout_scene(params, scene.replace(material=material), config).positions[-1]
-        )
+        return jnp.sum(weights * rollout_scene(start, scene.replace(material=material), TIGHT).positions[-1])
 
-    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
-    by_weights, by_density = slopes(params, 0.2, dataclasses.replace(TIGHT, model=model))
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    by_weights, by_density = slopes(network.params, 0.2, network)
     assert all(float(jnp.abs(leaf).max()) == 0 for leaf in jax.tree.leaves(by_weights))
-    assert float(by_density) == pytest.approx(float(slopes(None, 0.2, TIGHT)[1]), rel=1e-4)
+    assert float(by_density) == pytest.approx(float(slopes(None, 0.2, None)[1]), rel=1e-4)
 
 
 @pytest.mark.slow

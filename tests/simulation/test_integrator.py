@@ -6,10 +6,10 @@ import pytest
 from draped_ball import drifting_ball, square
 from known_answers.strip import LENGTH, kept_per_period, strip
 
-from eslr_jax.config import ModelConfig, SimConfig
+from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
 from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.models.registry import init_model
+from eslr_jax.models.eslr import Eslr
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
@@ -67,6 +67,6 @@ def test_the_gap_of_a_bdf2_trajectory_is_that_of_its_own_problems(draped):
 
 
 def test_a_network_alone_refuses_bdf2(draped):
-    model = ModelConfig(message_passing_steps=1, attention_blocks=0, latent_size=8)
+    model = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8)
     with pytest.raises(ConfigError, match="implicit Euler"):
-        rollout_scene(init_model(model), draped, SimConfig(model=model, iterations=0))
+        rollout_scene(model.new_network(), draped, SimConfig(iterations=0))

@@ -8,9 +8,10 @@ from draped_ball import drifting_ball, square
 from flax import linen as nn
 from flax import struct
 
-from eslr_jax import SimConfig, plan_scene, prepare_scene, rollout, simulate
-from eslr_jax.errors import ConfigError, NonFiniteError
+from eslr_jax import Network, SimConfig, plan_scene, prepare_scene, rollout, simulate
+from eslr_jax.errors import NonFiniteError
 from eslr_jax.evaluation.report import trajectory_report
+from eslr_jax.models.network import System
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.terms import CLOTH, Term
@@ -42,7 +43,7 @@ class Root(Term):
         return jnp.sqrt(jnp.maximum(0.0 * corners[0][0], 0.0))
 
 
-class Nudge(nn.Module):
+class Nudge(nn.Module, System):
     """Moves the solver's own guess by a learned step."""
 
     @nn.compact
@@ -84,14 +85,12 @@ def test_an_own_energy_without_a_finite_gradient_is_refused():
 
 
 def test_an_own_network_goes_through_both_doors():
-    garment, poses, network = square(), drifting_ball(4), Nudge()
+    garment, poses, module = square(), drifting_ball(4), Nudge()
     scene = prepare_scene(garment, poses, terms=CLOTH)
-    params = network.init(jax.random.key(0), jax.jit(first_problem)(scene), scene.initial_state)
-    config = SimConfig(model=network, iterations=0)
-    still = simulate(params, scene, config=config).trajectory
-    params = {"params": {"step": jnp.array([1e-3, 0.0, 0.0])}}
-    moved = rollout(params, garment, poses, config=config, terms=CLOTH)
+    weights = module.init(jax.random.key(0), jax.jit(first_problem)(scene), scene.initial_state)
+    config = SimConfig(iterations=0)
+    still = simulate(Network(weights, module), scene, config=config).trajectory
+    pushing = Network({"params": {"step": jnp.array([1e-3, 0.0, 0.0])}}, module)
+    moved = rollout(pushing, garment, poses, config=config, terms=CLOTH)
     way = np.asarray(moved.positions[1] - still.positions[1])
     np.testing.assert_allclose(way, np.broadcast_to([1e-3, 0.0, 0.0], way.shape), atol=1e-6)
-    with pytest.raises(ConfigError, match="without weights"):
-        rollout(None, garment, poses, config=config)

@@ -8,7 +8,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import Status
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.physics.guess import initial_guess
 from eslr_jax.physics.potential import potential
 from eslr_jax.scene.plan import prepare_scene
@@ -26,26 +26,26 @@ def step_of():
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
     @jax.jit
-    def step(params, stretch):
+    def step(network, stretch):
         state = scene.initial_state.replace(position=scene.initial_state.position * stretch)
         problem = frame_problem(scene, state, inputs)
         guess = initial_guess(problem).position
-        after, _ = make_stepper(params, SimConfig(model=CONFIG, iterations=0))(problem, state)
+        after, _ = make_stepper(network, SimConfig(iterations=0))(problem, state)
         return guess, after, jnp.stack([potential(x, problem) for x in (guess, after.position)])
 
     return step
 
 
 def change_weights(change):
-    params = init_model(CONFIG)
-    return {**params, "params": jax.tree.map(change, params["params"])}
+    network = CONFIG.new_network()
+    return network.replace(params=jax.tree.map(change, network.params))
 
 
 def test_a_prediction_that_climbs_is_not_taken(step_of):
     """In free fall the guess is the optimum: whatever a network adds raises the potential."""
     guess, after, _ = step_of(change_weights(lambda leaf: leaf + 0.5), 1.0)
     np.testing.assert_array_equal(after.position, guess)
-    guess, after, energies = step_of(init_model(CONFIG), 1.1)  # a new one is plain preconditioned descent
+    guess, after, energies = step_of(CONFIG.new_network(), 1.1)  # a new one is plain preconditioned descent
     assert energies[1] < energies[0]
     assert np.abs(after.position - guess).max() > 1e-4
     assert int(after.status) == Status.OK

@@ -12,17 +12,17 @@ from draped_ball import TIMESTEP, drifting_ball, square
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
 from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.physics.materials import COTTON
 from eslr_jax.scene.plan import plan_scene, prepare_scene
 from eslr_jax.simulation.rollout import rollout, rollout_scene, step
-from eslr_jax.simulation.simulate import raise_for_status
+from eslr_jax.simulation.simulate import raise_for_status, simulate
 from eslr_jax.simulation.stepper import keeps_tolerance
 from eslr_jax.terms import CLOTH, Gravity
 
 SOLVER = SimConfig(iterations=15)
 SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
-NETWORK = SimConfig(model=SMALL, iterations=0)
+ALONE = SimConfig(iterations=0)
 # [m] Two programs round differently, and 15 iterations on contact amplify that to 2e-4 in three frames; in
 # float64 they differ by 5e-14.
 ROUNDING = 4e-4
@@ -44,8 +44,8 @@ def poses():
 
 
 @pytest.fixture(scope="module")
-def params():
-    return init_model(SMALL)
+def network():
+    return SMALL.new_network()
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def solved(cloth, poses):
 
 
 @pytest.fixture(scope="module")
-def learned(cloth, poses, params):
-    return rollout(params, cloth, poses, config=NETWORK)
+def learned(cloth, poses, network):
+    return rollout(network, cloth, poses, config=ALONE)
 
 
 def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
@@ -66,10 +66,10 @@ def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
     assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
 
 
-def test_jit_equals_the_plain_call(cloth, poses, params, solved, learned):
+def test_jit_equals_the_plain_call(cloth, poses, network, solved, learned):
     jitted = jax.jit(rollout, static_argnames="config")
-    for weights, config, plain in ((None, SOLVER, solved), (params, NETWORK, learned)):
-        found = jitted(weights, cloth, poses, config=config)
+    for params, config, plain in ((None, SOLVER, solved), (network, ALONE, learned)):
+        found = jitted(params, cloth, poses, config=config)
         np.testing.assert_allclose(found.positions, plain.positions, atol=ROUNDING)
 
 
@@ -100,12 +100,12 @@ def test_vmap_over_motions_equals_one_by_one(cloth):
 
 
 @pytest.mark.slow
-def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, params, learned):
+def test_vmap_over_weights_and_garments_equals_one_by_one(cloth, poses, network, learned):
     wider = cloth.replace(rest_positions=cloth.rest_positions * jnp.array([[1.1, 1.0, 1.1]], jnp.float32))
-    other = {**params, "params": jax.tree.map(lambda leaf: 0.5 * leaf, params["params"])}
-    run = partial(rollout, config=NETWORK)
-    together = jax.vmap(lambda weights, garment: run(weights, garment, poses).positions)(
-        stack([params, other]), stack([cloth, wider])
+    other = network.replace(params=jax.tree.map(lambda leaf: 0.5 * leaf, network.params))
+    run = partial(rollout, config=ALONE)
+    together = jax.vmap(lambda network, garment: run(network, garment, poses).positions)(
+        stack([network, other]), stack([cloth, wider])
     )
     np.testing.assert_allclose(together[0], learned.positions, atol=1e-5)
     np.testing.assert_allclose(together[1], run(other, wider, poses).positions, atol=1e-5)
@@ -159,15 +159,15 @@ def test_non_finite_positions_raise_with_the_frame(cloth, poses):
         raise_for_status(trajectory)
 
 
-def test_network_without_weights_is_refused(cloth, poses):
+def test_weights_without_their_description_are_refused(cloth, poses, network):
     with pytest.raises(ConfigError, match="load_model"):
-        rollout(None, cloth, poses, config=NETWORK)
+        simulate(network.params, prepare_scene(cloth, poses), config=ALONE)
 
 
-def test_weights_of_another_architecture_are_refused(cloth, poses, params):
-    wider = dataclasses.replace(NETWORK, model=dataclasses.replace(SMALL, latent_size=48))
+def test_weights_of_another_architecture_are_refused(cloth, poses, network):
+    wider = network.replace(config=dataclasses.replace(SMALL, latent_size=48))
     with pytest.raises(CheckpointError, match="another architecture"):
-        rollout(params, cloth, poses, config=wider)
+        rollout(wider, cloth, poses, config=ALONE)
 
 
 def test_single_frame_is_refused(cloth, poses):
@@ -192,20 +192,19 @@ def test_other_values_compile_nothing_anew(cloth, poses):
 def test_gradient_through_five_frames_of_the_network(cloth):
     """Along the gradient, against central differences."""
     poses = drifting_ball(6)
-    single = SimConfig(model=dataclasses.replace(SMALL, output="correction"), iterations=0)
-    weights = init_model(single.model)
+    network = dataclasses.replace(SMALL, layers=1).new_network()
 
-    def height(trained):
-        trajectory = rollout({**weights, "params": trained}, cloth, poses, config=single)
+    def height(params):
+        trajectory = rollout(network.replace(params=params), cloth, poses, config=ALONE)
         return jnp.mean(trajectory.positions[-1, :, 1])
 
     run = jax.jit(jax.value_and_grad(height))
-    _, gradient = run(weights["params"])
+    _, gradient = run(network.params)
     length = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
     ahead = jax.tree.map(lambda leaf: leaf / length, gradient)
     step = 1e-3
     ends = [
-        float(run(jax.tree.map(lambda w, d, s=sign * step: w + s * d, weights["params"], ahead))[0])
+        float(run(jax.tree.map(lambda w, d, s=sign * step: w + s * d, network.params, ahead))[0])
         for sign in (1, -1)
     ]
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(length), rel=0.05)

@@ -13,7 +13,7 @@ from eslr_jax.assets.models import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, NonFiniteError, Status
 from eslr_jax.graph.normalizer import WARMUP_UPDATES
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train, window_metrics
@@ -68,7 +68,7 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_
     bad, metrics = take_step(broken)
     assert not np.isfinite(metrics["loss"])
     assert (bad.skipped, metrics["skipped"], bad.step) == (1, 1.0, 3)
-    jax.tree.map(np.testing.assert_array_equal, bad.params, state.params)
+    jax.tree.map(np.testing.assert_array_equal, bad.network, state.network)
     jax.tree.map(np.testing.assert_array_equal, bad.optimizer, state.optimizer)
     assert metrics["resets"] == 1.0
     assert bad.pools[0].is_done[0]
@@ -80,26 +80,27 @@ def test_an_update_that_is_not_finite_is_skipped_and_counted_and_its_trajectory_
     assert (after.skipped, metrics["skipped"]) == (0, 0.0), "one bad update is none in a row"
     assert (after.pools[0].age[0], metrics["resets"]) == (1, 0.0)
     assert np.isfinite(after.pools[0].state.position).all()
-    moved = jax.tree.map(lambda new, old: np.any(new != old), after.params["params"], bad.params["params"])
+    moved = jax.tree.map(lambda new, old: np.any(new != old), after.network.params, bad.network.params)
     assert np.mean(jax.tree.leaves(moved)) > 0.8
 
 
 def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
     config, cheap_model, small_data, tmp_path
 ):
-    bad = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), init_model(cheap_model)["params"])
+    new = cheap_model.new_network()
+    bad = new.replace(params=jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), new.params))
     patient = dataclasses.replace(config, max_skipped=3)
     with pytest.raises(
         NonFiniteError, match=r"^the last 4 updates were not finite at step 4; .* --start-from "
     ):
-        train(patient, tmp_path, datasets=(small_data,), initial_params={"params": bad})
+        train(patient, tmp_path, datasets=(small_data,), initial=bad)
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [2, 4], "three updates may be skipped"
     assert not (tmp_path / "model.npz").exists()
     start = init_train_state(patient, (small_data,))
     assert Checkpoints(tmp_path).restore(start).step == 0
-    kept, _ = load_model(str(tmp_path / "last_finite.npz"))
-    jax.tree.map(np.testing.assert_array_equal, kept["params"], bad)
+    kept = load_model(str(tmp_path / "last_finite.npz"))
+    jax.tree.map(np.testing.assert_array_equal, kept, bad)
     empty = start.pools
     with np.load(tmp_path / "offending_state.npz") as arrays:
         leaves = [arrays[str(place)] for place in range(len(arrays.files))]
@@ -179,8 +180,8 @@ def test_statistics_come_first_and_then_weights_move(small_data):
     step = make_train_step(config, 0)
     start = jax.device_get(init_train_state(config, (small_data,)))
     state, _ = step(jax.tree.map(jnp.array, start), small_data)
-    jax.tree.map(np.testing.assert_array_equal, state.params["params"], start.params["params"])
-    output = state.params["statistics"]["output"]
+    jax.tree.map(np.testing.assert_array_equal, state.network.params, start.network.params)
+    output = state.network.statistics["output"]
     assert int(output.num_updates) == 1
     frames = [
         small_data.skinned(jnp.int32(0), small_data.transforms(jnp.int32(k), jnp.float32(0.0)))
@@ -191,14 +192,14 @@ def test_statistics_come_first_and_then_weights_move(small_data):
     assert 0.01 * largest < size.max() < 1.5 * largest
     bad, metrics = step(jax.tree.map(jnp.array, with_a_broken_vertex(jax.device_get(state))), small_data)
     assert not np.isfinite(metrics["loss"])
-    jax.tree.map(np.testing.assert_array_equal, bad.params, state.params)
-    for name, one in start.params["statistics"].items():
-        start.params["statistics"][name] = one.replace(num_updates=jnp.int32(WARMUP_UPDATES))
+    jax.tree.map(np.testing.assert_array_equal, bad.network, state.network)
+    for name, one in start.network.statistics.items():
+        start.network.statistics[name] = one.replace(num_updates=jnp.int32(WARMUP_UPDATES))
     moved = jax.tree.map(jnp.array, start)
     for _ in range(2):  # the first has a learning rate of zero
         moved, _ = step(moved, small_data)
     changed = jax.tree.map(
-        lambda one, other: np.any(one != other), moved.params["params"], start.params["params"]
+        lambda one, other: np.any(one != other), moved.network.params, start.network.params
     )
     assert np.mean(jax.tree.leaves(changed)) > 0.8
 

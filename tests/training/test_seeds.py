@@ -38,7 +38,7 @@ def test_seeds_together_are_each_alone(small_data, cheap_model):
     assert abs(expected[:, 0] - expected[:, 1]).min() > 0  # the seeds differ
     for place, state in enumerate(alone):
         for one, other in zip(
-            jax.tree.leaves(take_seed(together, place).params), jax.tree.leaves(state.params), strict=True
+            jax.tree.leaves(take_seed(together, place).network), jax.tree.leaves(state.network), strict=True
         ):
             np.testing.assert_allclose(one, other, atol=1e-4)
         assert int(take_seed(together, place).step) == STEPS
@@ -57,10 +57,10 @@ def test_a_run_of_two_seeds_goes_on_and_exports_both(small_data, cheap_model, tm
     for place, folder in enumerate((tmp_path / "seed-3", tmp_path / "seed-4")):
         records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
         assert [record["step"] for record in records] == [1, 2, 3, 4, 5]
-        params, _ = load_model(str(folder / "model.npz"))
+        network = load_model(str(folder / "model.npz"))
         hours = records[-1]["core_seconds"] / 3600
         assert model_record(str(folder / "model.npz"))["core_hours"] == pytest.approx(hours / 2)
         for exported, trained in zip(
-            jax.tree.leaves(params), jax.tree.leaves(take_seed(state, place).params), strict=True
+            jax.tree.leaves(network), jax.tree.leaves(take_seed(state, place).network), strict=True
         ):
             np.testing.assert_array_equal(exported, trained)

@@ -17,19 +17,18 @@ import pytest
 
 from eslr_jax.assets import load_model
 from eslr_jax.assets.models import model_record
-from eslr_jax.config import TrainConfig, from_dict, to_dict
+from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.graph.normalizer import WARMUP_UPDATES
-from eslr_jax.models.registry import MODELS, init_model
+from eslr_jax.models.registry import MODELS
 from eslr_jax.physics.guess import pushed_out_guess
 from eslr_jax.physics.potential import potential
 from eslr_jax.scene.build import initial_state
-from eslr_jax.simulation.network import refine
 from eslr_jax.training.checkpoint import Checkpoints, read_earlier, read_run_config, write_run_config
 from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loop import export, train
 from eslr_jax.training.loss import _mean_contraction, physics_loss
-from eslr_jax.training.recipe import load_recipe
+from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config
 from eslr_jax.training.step import curriculum, init_train_state, make_schedule, make_train_step
 
 RECIPES = Path(__file__).parents[2] / "experiments" / "configs"
@@ -47,9 +46,9 @@ def test_run_leaves_metrics_and_a_model(finished, config):
     assert [record["step"] for record in records] == [2, 4, 6]
     assert all(np.isfinite(list(record.values())).all() for record in records)
     assert int(state.skipped) == 0
-    params, model = load_model(folder / "model.npz")
-    assert model == config.model
-    jax.tree.map(np.testing.assert_array_equal, params["params"], state.params["params"])
+    network = load_model(folder / "model.npz")
+    assert network.config == config.model
+    jax.tree.map(np.testing.assert_array_equal, network, state.network)
 
 
 @pytest.mark.parametrize(
@@ -71,8 +70,8 @@ def test_the_record_counts_the_training_of_the_weights_that_a_run_started_from(
 
 def test_weights_move_as_far_as_adam_takes_them(finished, config):
     state, _ = finished
-    before = init_model(config.model, config.seed)["params"]
-    moved = jax.tree.map(lambda new, old: float(jnp.max(jnp.abs(new - old))), state.params["params"], before)
+    before = config.model.new_network(config.seed).params
+    moved = jax.tree.map(lambda new, old: float(jnp.max(jnp.abs(new - old))), state.network.params, before)
     rates = sum(float(make_schedule(config)(step)) for step in range(config.steps))
     largest = max(jax.tree.leaves(moved))
     # Its first step is the rate itself; a later one is at most 0.1 / sqrt(0.001) rates.
@@ -262,7 +261,7 @@ def test_the_criterion_changes_the_loss(cheap_model, small_data):
     assert abs(losses["cvpr"] - losses["postcvpr"]) > 1e-3 * abs(losses["postcvpr"])
     assert abs(losses["metric"] - losses["postcvpr"]) > 1e-3 * abs(losses["postcvpr"])
     with pytest.raises(ConfigError, match='"cvpr" needs energy_set = "hood"'):
-        from_dict(TrainConfig, {**to_dict(config), "energy_set": "consistent", "criterion": "cvpr"})
+        read_train_config({**describe_train_config(config), "energy_set": "consistent", "criterion": "cvpr"})
 
 
 def test_hoods_curriculum_counts_trajectories(config):
@@ -280,13 +279,13 @@ def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small
     """The mean share of the gap that a step leaves; the last energy stands for the optimum."""
     model = dataclasses.replace(config.model, refinement_steps=3)
     config = dataclasses.replace(config, model=model, refinement_weights="contraction")
-    params = init_model(model)
+    network = model.new_network()
     state = initial_state(small_problem.position, jnp.zeros_like(small_problem.position))
 
     @jax.jit
     def loss_and_energies(problem):
-        loss, _ = physics_loss(params, problem, state, config)
-        positions = refine(params, problem, state, model).positions
+        loss, _ = physics_loss(network, problem, state, config)
+        positions = network.predict(problem, state).positions
         points = jnp.concatenate([pushed_out_guess(problem)[None], positions])
         return loss, jax.lax.map(lambda x: potential(x, problem), points)
 
@@ -320,7 +319,7 @@ def test_a_network_for_the_solver_trains_from_optima(config, small_data, tmp_pat
     assert int(state.skipped) == 0
     assert np.mean(losses[-2:]) < losses[0] - 0.03
     with pytest.raises(ConfigError, match="iterations"):
-        from_dict(TrainConfig, {**to_dict(config), "energy_set": "hood"})
+        read_train_config({**describe_train_config(config), "energy_set": "hood"})
 
 
 @pytest.mark.slow
@@ -336,16 +335,16 @@ def test_full_size_networks_take_five_steps(name):
     )  # the normalisers see a frame; HOOD's see a hundred before anything is learned
     measured = {
         key: entry.replace(num_updates=jnp.int32(WARMUP_UPDATES))
-        for key, entry in state.params["statistics"].items()
+        for key, entry in state.network.statistics.items()
     }
-    state = state.replace(params={**state.params, "statistics": measured})
-    before = jax.device_get(state.params["params"])
+    state = state.replace(network=state.network.replace(statistics=measured))
+    before = jax.device_get(state.network.params)
     for _ in range(5):
         state, metrics = step(state, data)
         assert all(np.isfinite(float(value)) for value in metrics.values())
     assert int(state.skipped) == 0
     moved = jax.tree.map(
-        lambda new, old: float(np.max(np.abs(new - old))), jax.device_get(state.params["params"]), before
+        lambda new, old: float(np.max(np.abs(new - old))), jax.device_get(state.network.params), before
     )
     assert np.mean([value > 0 for value in jax.tree.leaves(moved)]) > 0.9
     # Adam moves a weight by at most its rate at first, 3.2 rates later.
@@ -365,5 +364,5 @@ def test_hoods_recipe_takes_finite_steps(small_data, tmp_path):
     assert config.energy_set == "hood"
     state = train(config, tmp_path, datasets=(small_data,))
     assert int(state.skipped) == 0
-    counts = [float(entry.count) for entry in state.params["statistics"].values()]
+    counts = [float(entry.count) for entry in state.network.statistics.values()]
     assert min(counts) >= 3 * 60, "three frames of sixty vertices, or more edges"

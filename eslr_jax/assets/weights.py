@@ -1,4 +1,4 @@
-"""Read and write network weights: arrays in an npz archive, and the configuration in JSON beside it."""
+"""Read and write networks: arrays in an npz archive, and the description in JSON beside it."""
 
 from __future__ import annotations
 
@@ -12,44 +12,43 @@ import numpy as np
 from flax.serialization import to_state_dict
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from eslr_jax.config import ModelConfig, from_dict, to_dict
 from eslr_jax.errors import CheckpointError, ConfigError
 from eslr_jax.io.atomic import atomic_write
 from eslr_jax.io.npz import read_arrays, write_arrays
+from eslr_jax.models.network import Network, describe_system
+from eslr_jax.models.registry import read_system
 from eslr_jax.types import Normalizer
 
 FORMAT = 1  # raise when a reader of today could not read the file
 
 
-def write_weights(
-    path: str | Path, params: Mapping[str, Any], config: ModelConfig, training: dict[str, Any]
-) -> None:
+def write_network(path: str | Path, network: Network, training: dict[str, Any]) -> None:
     """Write a network to `path`, and its description to the same name with suffix .json.
 
     Args:
-        path: The npz file to write.
-        params: Weights: nested dictionaries of arrays and normalisers. Arrays are named by their path,
-            as in "statistics/garment/mean".
-        config: Architecture.
+        path: The npz file to write. Arrays are named by their path, as in "statistics/garment/mean".
+        network: Its weights are nested dictionaries of arrays.
         training: How the network was trained and how good it is; plain values.
 
     Raises:
         AssetError: A file can't be written.
+        ConfigError: The network's system has no registered name.
     """
     path = Path(path)
-    record = {"format": FORMAT, "model": to_dict(config), "training": training}
+    record = {"format": FORMAT, "model": describe_system(network.config), "training": training}
     with atomic_write(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(record, indent=2))
-    # Last: where the archive is, the network is whole.
-    write_arrays(path, flatten_dict(to_state_dict(params), sep="/"), is_compressed=True)
+    # The archive is written last, so that an archive never stands without its description.
+    write_arrays(path, flatten_dict(to_state_dict(network.parts), sep="/"), is_compressed=True)
 
 
-def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[str, Any]]:
-    """Read a network that `write_weights` wrote: weights, architecture, and the training record.
+def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
+    """Read a network that `write_network` wrote, and its training record.
 
     Raises:
         AssetError: The archive is missing or damaged.
-        CheckpointError: The JSON is missing, damaged, of a newer format, or asks for what this version lacks.
+        CheckpointError: The JSON is missing, damaged, of a newer format, or asks for what this version lacks; or
+            the weights do not fit it.
     """
     path = Path(path)
     try:
@@ -64,21 +63,24 @@ def read_weights(path: str | Path) -> tuple[dict[str, Any], ModelConfig, dict[st
             f"{path} has format {version}, this version reads up to {FORMAT}; update eslr-jax"
         )
     try:
-        config = from_dict(ModelConfig, values)
+        system = read_system(values)
     except ConfigError as error:
         raise CheckpointError(f"{path} is for another architecture: {error}") from error
-    return _tree(read_arrays(path, content="model"), path), config, training
+    network = Network(config=system, **_parts(read_arrays(path, content="model"), path))
+    system.check(network)
+    return network, training
 
 
-def _tree(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
-    """Return nested dictionaries of arrays by path, with normalisers under "statistics"."""
+def _parts(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
+    """Return the fields of a network from arrays by path."""
     floats = {
         name: jnp.asarray(value, jnp.float32 if value.dtype.kind == "f" else value.dtype)
         for name, value in arrays.items()
     }
     try:
-        tree = {"statistics": {}} | unflatten_dict(floats, sep="/")
-        tree["statistics"] = {name: Normalizer(**fields) for name, fields in tree["statistics"].items()}
+        tree = {"params": {}} | unflatten_dict(floats, sep="/")
+        statistics = tree.pop("statistics", {})
+        tree["statistics"] = {name: Normalizer(**fields) for name, fields in statistics.items()}
     except (AttributeError, IndexError, TypeError) as error:
         raise CheckpointError(f"{path} holds no tree of weights; export the model again") from error
     return tree
