@@ -116,7 +116,7 @@ def test_a_page_is_opened_where_a_person_sits(tmp_path):
 
 
 def test_assets_lists_every_kind():
-    result = eslr("assets", "--json", "--verify")
+    result = eslr_here("assets", "--json", "--verify")
     kinds = {asset["kind"] for asset in json.loads(result.stdout)}
     assert {"body", "garment", "motion", "fabric"} <= kinds
 
@@ -147,7 +147,7 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
 
 
 def test_fabrics_are_listed_with_their_sources():
-    fabrics = json.loads(eslr("assets", "--kind", "fabric", "--json").stdout)
+    fabrics = json.loads(eslr_here("assets", "--kind", "fabric", "--json").stdout)
     assert {"cotton", "denim", "silk"} <= set(fabrics)
     assert all(fabric["source"] and fabric["density"] > 0 for fabric in fabrics.values())
     assert fabrics["cotton"]["stretch_stiffness"] == pytest.approx(32.94, abs=0.01)
@@ -284,11 +284,10 @@ def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes differ")
-@pytest.mark.parametrize("arguments", [["train", "--help"], ["assets", "--json"]])
-def test_whoever_reads_the_output_may_leave(arguments):
+def test_whoever_reads_the_output_may_leave():
     ours, end = os.pipe()
     os.close(ours)
-    command = [sys.executable, "-m", "eslr_jax.cli", *arguments]
+    command = [sys.executable, "-m", "eslr_jax.cli", "assets", "--json"]
     result = subprocess.run(command, stdout=end, stderr=subprocess.PIPE, text=True, check=False)
     os.close(end)
     assert (result.returncode, result.stderr) == (141, "")

@@ -79,6 +79,7 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('model = "mgn-5"\nschedule = "hood"\nwarmup = 5', 'warmup needs schedule = "cosine"'),
         ('model = "mgn-5"\nschedule = "hood"\nfinal_learning_rate = 0.0', "final_learning_rate needs"),
         ('model = "mgn-5"\nenergy_set = "hood"\ncollision_stiffness = 1e7', "collision_stiffness needs"),
+        ('model = "mgn-5"\ncriterion = "cvpr"', '"cvpr" needs energy_set = "hood"'),
         ('model = "mgn-5"\nwarmup = -1', "warmup must not be negative"),
         ('model = "mgn-5"\nfinal_learning_rate = -1e-5', "final_learning_rate must not be negative"),
         ('model = "mgn-5"\ncollision_stiffness = 0', "collision_stiffness must be positive"),

@@ -17,7 +17,7 @@ from eslr_jax.geometry.closest import closest_points
 from eslr_jax.physics.materials import COTTON, fabric_material
 from eslr_jax.physics.potential import evaluate
 from eslr_jax.scene.build import build_scene
-from eslr_jax.scene.plan import first_frames, prepare_scene, prepare_scenes
+from eslr_jax.scene.plan import first_frames, plan_scene, prepare_scene, prepare_scenes
 from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import CLOTH, Collision, Repulsion, scene_terms
@@ -144,8 +144,8 @@ def test_a_limb_that_comes_for_a_fifth_of_a_second_in_a_long_motion_is_searched(
     assert is_away[np.linspace(0, 299, 12).astype(int)].all()
     moved = np.array(poses.positions)
     moved[:, len(positions) :, 1] += is_away[:, None]
-    scene = prepare_scene(square(), poses.replace(positions=jnp.asarray(moved)))
-    reached = np.asarray(scene.body.surface.vertex_ids)
+    _, near = plan_scene(square(), poses.replace(positions=jnp.asarray(moved)))
+    reached = np.asarray(near.surface.vertex_ids)
     assert (reached >= len(positions)).any()
 
 
@@ -170,6 +170,12 @@ def test_cloth_touches_nothing_else_than_what_was_searched(body, name):
         np.testing.assert_array_less(-0.005, np.where(contacts.is_near, contacts.distances, 0.0))
 
 
+def layers(garment, poses, terms):
+    """Return the self-contact that is planned for a scene, or None."""
+    planned, _ = plan_scene(garment, poses, terms)
+    return next((term for term in planned if isinstance(term, Repulsion)), None)
+
+
 def test_two_pieces_that_meet_are_kept_apart(small_poses):
     from cloth import make_garment, make_sheet
 
@@ -178,8 +184,7 @@ def test_two_pieces_that_meet_are_kept_apart(small_poses):
     for gap, meets in ((0.02, True), (0.3, False)):
         rest = np.concatenate([positions, positions + np.array([0.0, gap, 0.0])])
         garment = make_garment(rest, both)
-        layers = prepare_scene(garment, small_poses, terms=(*CLOTH, Repulsion())).term(Repulsion)
-        assert (layers is not None) == meets
+        assert (layers(garment, small_poses, (*CLOTH, Repulsion())) is not None) == meets
 
 
 def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garment, small_poses):
@@ -188,12 +193,10 @@ def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garme
 
     positions, faces = make_sheet(6, 6, 0.02, jitter=0)
     loose = make_garment(positions + np.array([0.16, 0.0, 0.0]), faces)
-    folds = {"terms": scene_terms(Repulsion(where="folds"))}
-    assert prepare_scene(small_garment, small_poses, **folds).term(Repulsion) is None
-    assert prepare_scene(loose, small_poses).term(Repulsion) is None
-    scene = prepare_scene(loose, small_poses, **folds)
-    assert scene.term(Repulsion) is not None
-    assert scene.term(Repulsion).pieces is None
+    folds = scene_terms(Repulsion(where="folds"))
+    assert layers(small_garment, small_poses, folds) is None
+    assert layers(loose, small_poses, scene_terms()) is None
+    assert layers(loose, small_poses, folds).pieces is None
 
 
 def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
@@ -201,4 +204,4 @@ def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
     body = load_body()
     poses = pose_body(body, load_motion("cmu_016_29"), num_frames=6)
     shirt = load_garment("tshirt")
-    assert prepare_scene(shirt, poses, terms=(*CLOTH, Repulsion(where="folds"))).term(Repulsion) is not None
+    assert layers(shirt, poses, (*CLOTH, Repulsion(where="folds"))) is not None

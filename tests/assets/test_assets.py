@@ -10,7 +10,7 @@ from eslr_jax import load_body, load_garment, load_model, load_motion, pose_body
 from eslr_jax.assets import asset_names, load_garment_file, load_splits
 from eslr_jax.assets.catalog import is_intact, list_assets
 from eslr_jax.assets.garments import check_resolution
-from eslr_jax.assets.weights import read_network, write_network
+from eslr_jax.assets.weights import write_network
 from eslr_jax.body.motion import Motion, still_motion
 from eslr_jax.cli.actor import is_moving_mesh, load_wearer
 from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError
@@ -95,14 +95,6 @@ def test_still_body_of_any_shape_stands_on_the_floor(betas):
 @pytest.fixture(scope="module")
 def network():
     return MODELS["eslr-small"].new_network()
-
-
-def test_weights_round_trip(tmp_path, network):
-    write_network(tmp_path / "model.npz", network, {"description": "test"})
-    loaded, training = read_network(tmp_path / "model.npz")
-    assert loaded.config == network.config
-    assert training == {"description": "test"}
-    np.testing.assert_array_equal(loaded.constants["projection"], network.constants["projection"])
 
 
 def test_foreign_weights_are_refused(tmp_path, network):

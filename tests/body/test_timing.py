@@ -11,13 +11,7 @@ from eslr_jax.assets import load_motion
 from eslr_jax.body.motion import pose_body, still_motion
 from eslr_jax.body.retarget import count_resampled
 from eslr_jax.body.rig import skeleton_motion
-from eslr_jax.body.timing import (
-    check_speed,
-    cut_start,
-    loop_motion,
-    skip_start_pose,
-    with_settling,
-)
+from eslr_jax.body.timing import check_speed, cut_start, loop_motion, skip_start_pose, with_settling
 from eslr_jax.errors import MotionError
 
 

@@ -106,5 +106,5 @@ def test_a_crossing_pair_far_apart_is_left_out(size):
     garment = make_garment(size * np.concatenate([level, at_rest]), faces)
     pair = jnp.array([3]), jnp.array([[0, 1, 2]]), jnp.array([[0.25, 0.5, 0.25]])
     position = jnp.asarray(size * np.concatenate([level, upright]), jnp.float32)
-    side = sides_where_crossed(position, pair, jnp.array([1.0]), garment)
+    side = jax.jit(sides_where_crossed)(position, pair, jnp.array([1.0]), garment)
     assert float(side[0]) == (-1.0 if 0.5 * size < 0.02 else 0.0)

@@ -33,8 +33,13 @@ def rows_of(height):
         valley(height), VALLEY_FACES, skin_weights=np.ones((4, 1)), skin_indices=np.zeros((4, 1), int)
     )
     here = jnp.asarray(valley(height), jnp.float32)
+    return skin_of(here, roof, surface, garment), here
+
+
+@jax.jit
+def skin_of(here, roof, surface, garment):
     nearest = find_contacts(here, roof, roof, surface)
-    return find_skin_contacts((here, here), (roof, roof), nearest, surface, garment), here
+    return find_skin_contacts((here, here), (roof, roof), nearest, surface, garment)
 
 
 def fold_rows(skin):
@@ -63,8 +68,7 @@ def test_fine_cloth_finds_the_middle_of_a_long_edge_of_the_body():
     garment = make_garment(strip, grid_faces(4, 11))
     roof, surface = jnp.asarray(ROOF, jnp.float32), prepare_surface(ROOF, ROOF_FACES)
     here = jnp.asarray(strip, jnp.float32)
-    nearest = find_contacts(here, roof, roof, surface)
-    skin = find_skin_contacts((here, here), (roof, roof), nearest, surface, garment)
+    skin = skin_of(here, roof, surface, garment)
     is_fold = np.asarray(skin.is_near) & (np.sort(skin.corners, axis=1)[:, (0, 2)] == [16, 27]).all(axis=1)
     assert is_fold.any()
     np.testing.assert_allclose(np.asarray(skin_heights(here, skin))[is_fold], height, atol=1e-6)
@@ -72,7 +76,7 @@ def test_fine_cloth_finds_the_middle_of_a_long_edge_of_the_body():
 
 def test_a_fold_in_the_ridge_is_pushed_out():
     skin, here = rows_of(-0.001)
-    force = -jax.grad(lambda x: skin_energies(x, skin, 3.5e7, 2e-3).sum())(here)
+    force = -jax.jit(jax.grad(lambda x: skin_energies(x, skin, 3.5e7, 2e-3).sum()))(here)
     assert np.all(np.asarray(force)[:2, 1] > 0)
 
 

@@ -13,25 +13,6 @@ from eslr_jax.geometry.groups import compact_groups
 from eslr_jax.geometry.surface import prepare_surface
 
 
-@pytest.mark.parametrize("columns", [1, 32, 100])
-def test_true_entries_are_found_by_their_number(columns):
-    mask = np.random.default_rng(columns).random((40, columns)) < 0.2
-    mask[3:6], mask[7], mask[-1] = False, True, False
-    entries = jax.jit(numerics.true_entries)(jnp.asarray(mask))
-    assert int(entries.count) == mask.sum()
-    found = entries.find(jnp.arange(mask.sum(), dtype=jnp.int32))
-    np.testing.assert_array_equal(np.stack(found), np.stack(np.nonzero(mask)))
-
-
-@pytest.mark.parametrize("count", [1, 8, 9, 100])
-def test_groups_hold_every_point_once(count):
-    points = np.random.default_rng(count).random((count, 3))
-    groups = compact_groups(points, 8)
-    assert groups.shape == (-(-count // 8), 8)
-    np.testing.assert_array_equal(np.unique(groups), np.arange(count))
-    assert groups.size - count == np.sum(groups[:, 1:] == groups[:, :-1]), "only the last is repeated"
-
-
 @pytest.fixture(scope="module")
 def spheres():
     """Two balls three centimetres apart: positions, faces, search tables."""

@@ -41,7 +41,7 @@ def test_cloth_that_limbs_pinch_has_no_rows_of_skin(room, is_skin):
     )
     between = scene.garment.rest_positions.at[:, 1].set(RADIUS + room / 2)
     scene = scene.replace(initial_state=scene.initial_state.replace(position=between))
-    skin = first_problem(scene).data_of(Collision).skin
+    skin = jax.jit(first_problem)(scene).data_of(Collision).skin
     middle = 4 * 9 + 4
     rows = jnp.any((skin.corners == middle) & (skin.weights > 0.2), axis=1)
     assert bool(jnp.any(rows & skin.is_near)) == is_skin
@@ -63,7 +63,7 @@ def test_faces_are_lifted_off_the_skin():
     scene = scene_of(has_skin=True, num_frames=2)
     cut = scene.garment.rest_positions - jnp.array([[0.0, 0.006, 0.0]])
     assert height_over_top(cut) < -1e-3
-    lifted = lift_off_skin(cut, scene.body.positions[0], scene.body.surface, scene.garment)
+    lifted = jax.jit(lift_off_skin)(cut, scene.body.positions[0], scene.body.surface, scene.garment)
     assert height_over_top(lifted) >= 0
 
 
@@ -72,9 +72,16 @@ def contacts():
     scene = scene_of(has_skin=True, num_frames=2)
     body = scene.body.positions[0]
     position = scene.initial_state.position
-    nearest = find_contacts(position, body, body, scene.body.surface)
-    skin = find_skin_contacts((position,) * 2, (body,) * 2, nearest, scene.body.surface, scene.garment)
-    return scene, position, body, skin
+    return scene, position, body, skin_of(position, body, scene.body.surface, scene.garment)
+
+
+@jax.jit
+def skin_of(position, body, surface, garment):
+    nearest = find_contacts(position, body, body, surface)
+    return find_skin_contacts((position,) * 2, (body,) * 2, nearest, surface, garment)
+
+
+skin_energy = jax.jit(lambda *given: skin_energies(*given).sum())
 
 
 def test_the_rows_are_the_nearest_places_of_the_cloth(contacts):
@@ -101,15 +108,15 @@ def test_energy_pushes_the_faces_off_and_needs_no_other_force(contacts):
     assert float(jnp.min(jnp.where(skin.is_near, skin_heights(pressed, skin), 1.0))) < THICKNESS
 
     def energy(x):
-        return skin_energies(x, skin, STIFFNESS, THICKNESS).sum()
+        return skin_energy(x, skin, STIFFNESS, THICKNESS)
 
-    gradient = jax.grad(energy)(pressed)
+    gradient = jax.jit(jax.grad(energy))(pressed)
     direction = gradient / jnp.linalg.norm(gradient)
     step = 1e-4
     difference = (energy(pressed + step * direction) - energy(pressed - step * direction)) / (2 * step)
     assert float(difference) == pytest.approx(float(jnp.vdot(gradient, direction)), rel=0.02)
     assert float(jnp.sum(gradient[:, 1])) < 0  # the force, its opposite, lifts
-    diagonal = skin_diagonal(pressed, skin, STIFFNESS, THICKNESS)
+    diagonal = jax.jit(skin_diagonal)(pressed, skin, STIFFNESS, THICKNESS)
     assert float(jnp.max(diagonal)) > 0
     assert bool(jnp.all(diagonal >= 0))
 
@@ -121,13 +128,10 @@ def test_a_place_stands_for_the_coarser_of_both_meshes(contacts):
     assert float(jnp.max(scene.body.surface.vertex_areas)) < cloth
     np.testing.assert_allclose(skin.areas, cloth, rtol=1e-6)
     surface = scene.body.surface.replace(vertex_areas=scene.body.surface.vertex_areas + 2.0 * cloth)
-    nearest = find_contacts(position, body, body, surface)
-    coarse = find_skin_contacts((position,) * 2, (body,) * 2, nearest, surface, scene.garment)
+    coarse = skin_of(position, body, surface, scene.garment)
     assert float(jnp.min(coarse.areas)) >= 2.0 * cloth
     pressed = position - jnp.array([[0.0, 0.003, 0.0]])
-    heavier, own = (
-        float(skin_energies(pressed, rows, STIFFNESS, THICKNESS).sum()) for rows in (coarse, skin)
-    )
+    heavier, own = (float(skin_energy(pressed, rows, STIFFNESS, THICKNESS)) for rows in (coarse, skin))
     assert heavier > 2.0 * own > 0
 
 
@@ -147,7 +151,7 @@ def test_padding_changes_no_row_of_skin():
     rows = []
     for one in (garment, padded):
         scene = prepare_scene(one, poses, terms=scene_terms(Collision(has_skin=True)))
-        rows.append(first_problem(scene).data_of(Collision).skin)
+        rows.append(jax.jit(first_problem)(scene).data_of(Collision).skin)
     assert bool(rows[0].is_near.any())
     np.testing.assert_array_equal(rows[0].is_near, rows[1].is_near)
     is_near = np.asarray(rows[0].is_near)

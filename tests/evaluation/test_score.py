@@ -134,6 +134,7 @@ def test_an_evaluation_without_the_gap_has_the_rollouts():
     assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}
 
 
+@pytest.mark.slow
 def test_a_scene_whose_buffers_are_too_small_is_scored_with_larger_ones():
     """`prepare_scene` begins with a small buffer, which `simulate` enlarges in a scene of its own."""
     scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Repulsion(where="all")))

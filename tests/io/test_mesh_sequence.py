@@ -16,12 +16,7 @@ from eslr_jax.io.animated import AnimatedMesh, Skin
 from eslr_jax.io.garment import GarmentFile, in_outfit_order, in_vertex_order
 from eslr_jax.io.gltf import TOLERANCE, write_animated_glb
 from eslr_jax.io.mesh import read_mesh
-from eslr_jax.io.mesh_sequence import (
-    MeshSequence,
-    is_mesh_sequence,
-    read_mesh_sequence,
-    read_mesh_sequences,
-)
+from eslr_jax.io.mesh_sequence import MeshSequence, is_mesh_sequence, read_mesh_sequence, read_mesh_sequences
 from eslr_jax.io.obj import obj_text
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))

@@ -55,10 +55,7 @@ def assert_equal(found, expected):
 
 @pytest.mark.parametrize(
     "trajectory",
-    [
-        WHOLE,
-        dataclasses.replace(WHOLE, body=None, friction_loads=None, metadata={}),
-    ],
+    [WHOLE, dataclasses.replace(WHOLE, body=None, friction_loads=None, metadata={})],
     ids=["whole", "bare"],
 )
 def test_trajectory_round_trip_is_exact(tmp_path, trajectory):

@@ -1,6 +1,5 @@
 """Garments and motions that nobody here has seen: worn, pictured, and taken to other programs."""
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -14,7 +13,6 @@ from PIL import Image
 
 from eslr_jax.assets import load_motion
 from eslr_jax.body.rig import skeleton_motion
-from eslr_jax.config import TrainConfig
 from eslr_jax.evaluation.fields import run_field
 from eslr_jax.evaluation.run import read_run
 
@@ -185,11 +183,3 @@ def test_lengths_that_are_listed_are_accepted(eslr, tmp_path):
     done = eslr("simulate", *words, "--frames", count, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "out" / "report.json").read_text())["num_frames"] == count
-
-
-def test_the_help_of_training_lists_every_key(eslr):
-    text = " ".join(eslr("train", "--help").stdout.replace("│", " ").split())
-    for field in dataclasses.fields(TrainConfig):
-        assert f"{field.name}" in text
-    assert "learning_rate = 0.001: peak" in text
-    assert "model.latent_size = 128" in text

@@ -171,19 +171,3 @@ def test_a_large_mesh_tells_its_cost_before_it_is_fitted(tmp_path, eslr):
     assert result.returncode == 0, result.stderr
     assert "31,200 vertices are many" in result.stderr
     assert json.loads(result.stdout)["placement"]["origin"] == "floor"
-
-
-@pytest.mark.parametrize(("words", "cause"), [
-    (("--pin", "wais"), "is not understood"),
-    (("--pin", "none", "waist"), "'none' holds nothing"),
-    (("--units", "m", "--up", "y", "--front", "y"), "same axis"),
-    (("--units", "-1"), "positive number"),
-    (("--units", "km"), "km"),
-])  # fmt: skip
-def test_impossible_wishes_leave_nothing_behind(tmp_path, eslr, words, cause):
-    path = write_obj(tmp_path / "skirt.obj", skirt())
-    result = eslr("fit", path, "--out", tmp_path / "out.npz", *words)
-    assert result.returncode == 2
-    assert cause in result.stderr + result.stdout
-    assert "Traceback" not in result.stderr
-    assert [file.name for file in tmp_path.iterdir()] == ["skirt.obj"]

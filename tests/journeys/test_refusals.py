@@ -1,4 +1,7 @@
-"""Bad input at the command line: exit code 2, one line that names the cause, and nothing left behind."""
+"""Bad input at the command line: exit code 2, one line that names the cause, and nothing left behind.
+
+What a reader refuses in a file, `test_broken.py` and `test_fuzz.py` hold; here are a few files of every command.
+"""
 
 import json
 import pickle
@@ -33,33 +36,8 @@ Frame Time: 0.0333
 0 90 0 0 0 0 0 0 0
 0 90 0 0 0 0 0 0 0
 """
-ASF = """:units
-angle deg
-:root
-order TX TY TZ RX RY RZ
-axis XYZ
-position 0 0 0
-orientation 0 0 0
-:bonedata
-begin
-name spine
-direction 0 1 0
-length 2
-axis 0 0 20 XYZ
-dof rx rz
-end
-:hierarchy
-begin
-root spine
-end
-"""
-PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-PLY_FACES = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-
 POSES = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": np.array(30.0)}
 BODY = {"positions": np.zeros((4, 4, 3)), "faces": np.array([[0, 1, 2], [0, 2, 3]]), "fps": np.array(30.0)}
-POSITIONS, FACES = skirt()
-SKIRT = {"rest_positions": POSITIONS, "faces": FACES}
 RECIPE = 'garments = ["tshirt"]\nsteps = 2\n[model]\nbase = "mgn-small"\n'
 
 
@@ -75,64 +53,29 @@ class Danger:
 # Text, bytes, arrays of an npz, or None for a folder.
 FILES = {
     "empty.obj": "",
-    "no-faces.obj": TRIANGLE,
-    "beyond.obj": TRIANGLE + "f 1 2 9\n",
-    "zero.obj": TRIANGLE + "f 0 1 2\n",
     "nan.obj": "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
     "huge.obj": "v 1e300 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
     "large.obj": "v 2e4 0 0\nv -2e4 0 0\nv 0 2e4 0\nv 0 0 2e4\nf 1 2 3\nf 1 4 2\nf 2 4 3\n",
-    "words.obj": "v a b c\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
-    "short.obj": "v 1 2\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
-    "noise.obj": bytes(range(256)) * 9,
     "point.obj": "v 0 1 0\n" * 3 + "f 1 2 3\n",
     "fan.obj": TRIANGLE + "v 0 0 1\nv 0 -1 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n",
     "folder.obj": None,
-    "endless.ply": PLY,
-    "few.ply": PLY + PLY_FACES + "0 0 0\n1 0 0\n",
-    "beyond.ply": PLY + PLY_FACES + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
-    "cut.stl": b"\0" * 80 + (9).to_bytes(4, "little") + b"\0" * 50,
-    "magic.glb": b"glXX" + b"\0" * 60,
     "cut.glb": b"glTF" + (2).to_bytes(4, "little") + (999).to_bytes(4, "little"),
-    "bare.glb": b"glTF\2\0\0\0\x20\0\0\0\x0c\0\0\0JSON{}          ",
     "image.glb": b"\x89PNG\r\n\x1a\n" + b"\0" * 40,
-    "no-faces.npz": {"rest_positions": np.zeros((3, 3))},
-    "flat.npz": SKIRT | {"rest_positions": np.zeros((9, 2))},
-    "nan.npz": SKIRT | {"rest_positions": np.full((1920, 3), NAN)},
-    "beyond.npz": SKIRT | {"faces": np.full((9, 3), 99999)},
     "objects.npz": {"rest_positions": np.array([{}, None], dtype=object)},
     "noise.npz": "noise",
     "garment.fbx": "hello",
-    "garment": "hello",
     "noise.pkl": b"\x80\x04noise",
     "danger.pkl": pickle.dumps({"shirt": Danger()}),
     "shirt.pkl": pickle.dumps({"shirt": 1}),
     "good.bvh": BVH,
     "motion.abc": "hello",
     "empty.bvh": "",
-    "still.bvh": BVH.partition("MOTION")[0],
-    "short.bvh": BVH.replace("0 90 0 0 0 0 0 0 0\n", "0 90 0\n"),
-    "nan.bvh": BVH.replace("90", "nan"),
-    "words.bvh": BVH.replace("90", "ninety"),
-    "frozen.bvh": BVH.replace("0.0333", "0"),
-    "minus.bvh": BVH.replace("Frames: 2", "Frames: -5"),
-    "cut.bvh": BVH[:120],
-    "channel.bvh": BVH.replace("Xposition", "Wposition"),
-    "million.bvh": BVH.replace("CHANNELS 6", "CHANNELS 1000000"),
     "lone.amc": ":DEGREES\n1\nroot 0 1 0 0 20 0\n",
-    "wing.asf": ASF,
-    "wing.amc": ":DEGREES\n1\nroot 0 1 0 0 20 0\nwing 1 2\n",
-    "none.asf": ASF,
-    "none.amc": ":DEGREES\n",
-    "no-poses.npz": {"trans": np.zeros((4, 3))},
     "one-pose.npz": POSES | {key: POSES[key][:1] for key in ("poses", "trans")},
-    "odd-poses.npz": POSES | {"poses": np.zeros((4, 17))},
     "nan-poses.npz": POSES | {"poses": np.full((4, 156), NAN)},
-    "no-rate.npz": POSES | {"mocap_framerate": np.array(0.0)},
-    "two-lengths.npz": POSES | {"trans": np.zeros((3, 3))},
     "clip.glb": b"glTF" + b"\0" * 20,
     "one-frame.npz": BODY | {"positions": np.zeros((1, 4, 3))},
     "nan-body.npz": BODY | {"positions": np.full((4, 4, 3), NAN)},
-    "beyond-body.npz": BODY | {"faces": np.array([[0, 1, 9]])},
     "flat-body.npz": BODY,
     "nothing": None,
     "topologies/0.obj": TRIANGLE + "f 1 2 3\n",
@@ -149,12 +92,9 @@ FILES = {
 }
 # Each row: the rest of the command line, and what the line must name.
 FIT = {
-    "empty.obj": "empty", "no-faces.obj": "face", "beyond.obj": "outside 0..2", "zero.obj": "0",
-    "nan.obj": "finite", "huge.obj": "", "large.obj": "m, cm, mm, in", "words.obj": "", "short.obj": "",
-    "noise.obj": "", "point.obj": "", "fan.obj": "edge", "folder.obj": "", "endless.ply": "", "few.ply": "",
-    "beyond.ply": "", "cut.stl": "", "magic.glb": "", "cut.glb": "", "bare.glb": "", "no-faces.npz": "",
-    "flat.npz": "", "nan.npz": "", "beyond.npz": "", "objects.npz": "", "noise.npz": "", "garment.fbx": "obj",
-    "garment": "", "noise.pkl": "", "danger.pkl": "", "shirt.pkl#skirt": "",
+    "empty.obj": "empty", "nan.obj": "finite", "huge.obj": "", "large.obj": "m, cm, mm, in", "point.obj": "",
+    "fan.obj": "edge", "folder.obj": "", "cut.glb": "", "objects.npz": "", "noise.npz": "", "garment.fbx": "obj",
+    "noise.pkl": "", "danger.pkl": "", "shirt.pkl#skirt": "",
     "skirt.obj --units -1": "positive", "skirt.obj --edge-length 0": "edge", "skirt.obj --weld nan": "weld",
     "skirt.obj --pin vertices:99999": "99999", "skirt.obj --pin region:y>1.2.3": "y>1.2.3",
     "skirt.obj --pin part:collar": "no such part", "skirt.obj --fabric denin": "did you mean denim",
@@ -166,18 +106,13 @@ FIT = {
 }  # fmt: skip
 SIMULATE = {
     **{f"--motion {file}": cause for file, cause in {
-        "empty.bvh": "", "still.bvh": "", "short.bvh": "", "nan.bvh": "finite", "words.bvh": "",
-        "frozen.bvh": "", "minus.bvh": "", "cut.bvh": "", "channel.bvh": "", "million.bvh": "",
-        "lone.amc": "asf", "wing.amc": "wing", "none.amc": "frame", "wing.asf": "", "no-poses.npz": "no motion",
-        "one-pose.npz": "", "odd-poses.npz": "", "nan-poses.npz": "finite", "no-rate.npz": "",
-        "two-lengths.npz": "", "noise.pkl": "", "folder.obj": "", "garment.fbx": "glTF", "motion.abc": ".bvh",
-        "clip.glb#run": "",
+        "empty.bvh": "", "lone.amc": "asf", "one-pose.npz": "", "nan-poses.npz": "finite", "noise.pkl": "",
+        "folder.obj": "", "garment.fbx": "glTF", "motion.abc": ".bvh", "clip.glb#run": "",
         "moonwalk": "cmu_016_32", "turn --motion jump": "--motion is given twice",
     }.items()},
     **{f"--body {file}": cause for file, cause in {
-        "no-faces.npz": "", "one-frame.npz": "", "nan-body.npz": "finite", "beyond-body.npz": "",
-        "flat-body.npz": "", "garment.fbx": "", "nothing": "", "topologies": "", "noise.pkl": "",
-        "image.glb": "", "robot": "anny",
+        "one-frame.npz": "", "nan-body.npz": "finite", "garment.fbx": "", "nothing": "", "topologies": "",
+        "noise.pkl": "", "image.glb": "", "robot": "anny",
     }.items()},
     "--garment tshrit": "tshirt", "--garment missing.obj": "missing.obj", "--garment empty.obj": "empty",
     "--garment tshirt --garment tshirt": "worn once only",

@@ -6,12 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from reference_models import exact_attention
 
-from eslr_jax.models.attention import (
-    linear_attention,
-    orthogonal_projection,
-    relu_features,
-    softmax_features,
-)
+from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features, softmax_features
 
 ROWS, SIZE, WIDTH = 200, 16, 6
 

@@ -153,12 +153,9 @@ def shrink(config):
     return dataclasses.replace(config, **{name: few[name] for name in few if hasattr(config, name)})
 
 
-SHRUNK = {shrink(config): name for name, config in reversed(MODELS.items())}
-
-
-@pytest.mark.parametrize("config", SHRUNK, ids=SHRUNK.values())
-def test_small_weights_survive_a_round_trip(tmp_path, config):
-    assert_round_trip(tmp_path, new(config))
+@pytest.mark.parametrize("name", ["eslr-15", "eslr-small", "smooth-small", "hood-5"])
+def test_small_weights_survive_a_round_trip(tmp_path, name):
+    assert_round_trip(tmp_path, new(shrink(MODELS[name])))
 
 
 @pytest.mark.slow

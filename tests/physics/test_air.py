@@ -25,7 +25,7 @@ WEIGHT = float(COTTON.density) * GRAVITY  # [N/m^2]
 CONFIG = SimConfig(iterations=30)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+@pytest.mark.parametrize("integrator", ["euler", pytest.param("bdf2", marks=pytest.mark.slow)])
 def test_a_flat_strip_falls_as_fast_as_its_drag_lets_it(integrator):
     air = Air(jnp.zeros(3))
     scene = strip(integrator, air, frames=40, is_pinned=False, tilt=np.pi / 2)
@@ -59,7 +59,7 @@ def test_gusts_have_the_mean_and_the_strength_asked_for():
 def test_a_function_blows_where_and_when_it_is_asked():
     scene = strip(frames=2, is_pinned=True)
     shear = Air(Partial(lambda rate, points, time: rate * time * points, jnp.float32(3.0)))
-    flow = shear.prepare(first_problem(scene).replace(time=jnp.float32(2.0)))
+    flow = shear.prepare(jax.jit(first_problem)(scene).replace(time=jnp.float32(2.0)))
     real = np.asarray(scene.garment.rest_areas) > 0
     corners = np.asarray(scene.initial_state.position)[np.asarray(scene.garment.faces)]
     np.testing.assert_allclose(flow.wind[real], 6.0 * corners.mean(axis=1)[real], rtol=1e-5, atol=1e-6)

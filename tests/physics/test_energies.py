@@ -425,7 +425,7 @@ def test_cloth_without_hinges_has_forces():
     )
     assert triangle.hinges.shape[0] == 0
     scene = prepare_scene(triangle, drifting_ball(2), terms=CLOTH)
-    problem = first_problem(scene)
+    problem = jax.jit(first_problem)(scene)
     stretched = 1.1 * problem.position
     value, gradient = jax.jit(jax.value_and_grad(potential))(stretched, problem)
     assert float(value) > 0

@@ -88,12 +88,7 @@ def oracle(step, criterion, position=None):
     return np.array(
         [
             reference.stretch(
-                position,
-                rest,
-                garment.faces,
-                material.lame_mu,
-                material.lame_lambda,
-                material.thickness,
+                position, rest, garment.faces, material.lame_mu, material.lame_lambda, material.thickness
             ),
             reference.bending(position, rest, garment.faces, material.bending_stiffness, current_length=True),
             reference.inertia(position, 2 * problem.current - problem.previous, mass, TIMESTEP),

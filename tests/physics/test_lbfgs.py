@@ -8,18 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cloth import make_garment, make_sheet
 from physics_cases import make_case, pad_case
 
-from eslr_jax.config import SimConfig
 from eslr_jax.physics import lbfgs
 from eslr_jax.physics.lbfgs import Stop, minimize
 from eslr_jax.physics.potential import Point, potential
 from eslr_jax.physics.preconditioner import Stiffness, solve_stiffness, stiffness, stretched_stiffness
 from eslr_jax.physics.solve import lower_point
-from eslr_jax.scene.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import CLOTH
 from eslr_jax.terms.problem import weight_norm
 
 
@@ -272,16 +267,3 @@ def test_vmap_equals_a_loop(case32):
         alone = solve(case32._replace(position=start), 10)
         np.testing.assert_allclose(together.position[k], alone.position, atol=2e-5)
         assert int(together.iterations[k]) == int(alone.iterations)
-
-
-def test_free_fall_is_implicit_eulers_parabola(small_poses):
-    """v_k = -k g dt and y_k = -g dt^2 k (k + 1) / 2, with the minimiser inside a scan."""
-    garment = make_garment(*make_sheet(4, 4, jitter=0))
-    options = {"terms": CLOTH, "starts_at_rest": True}
-    scene = prepare_scene(garment, small_poses, **options)
-    fall = jax.jit(rollout_scene, static_argnames="config")(None, scene, SimConfig(iterations=20))
-    step = np.arange(scene.num_frames)
-    expected = -9.81 / 30**2 * step * (step + 1) / 2
-    fallen = np.asarray(fall.positions - fall.positions[:1])
-    np.testing.assert_allclose(fallen[:, :, 1], np.repeat(expected[:, None], 16, axis=1), atol=1e-5)
-    np.testing.assert_allclose(fallen[:, :, [0, 2]], 0, atol=1e-5)

@@ -48,7 +48,10 @@ def descend(problem, position):
     return minimize(lambda x: potential(x, problem), position, stiffness(problem, position), Stop(400))
 
 
-@pytest.mark.parametrize("is_pinned", [None, np.arange(30) < 6], ids=["free", "pinned"])
+@pytest.mark.parametrize(
+    "is_pinned",
+    [pytest.param(None, id="free", marks=pytest.mark.slow), pytest.param(np.arange(30) < 6, id="pinned")],
+)
 def test_newton_ends_where_lbfgs_ends(is_pinned):
     problem, position = make_case(is_pinned=is_pinned)
     found = minimize_newton(problem)

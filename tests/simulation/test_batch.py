@@ -47,14 +47,15 @@ def batch(garments, poses):
 def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses):
     surface = shared_surface(garments, poses)
     np.testing.assert_array_equal(batch[0].positions, batch[2].positions)
-    for trajectory, garment, fabric in list(zip(batch, garments, FABRICS, strict=True))[:2]:
+    for trajectory in batch:
         raise_for_status(trajectory)
-        scene = prepare_scene(garment, poses, material=fabric, surface=surface)
-        alone = rollout_scene(None, scene, QUICK)
-        assert trajectory.positions.shape == alone.positions.shape
-        np.testing.assert_allclose(trajectory.positions, alone.positions, atol=1e-5)
-        # Loads are 3 k a d^2 [N]: two micrometres, by which two programs differ, are a hundredth of them.
-        np.testing.assert_allclose(trajectory.friction_loads, alone.friction_loads, atol=1e-3)
+    padded = 1  # the smallest of the three
+    scene = prepare_scene(garments[padded], poses, material=FABRICS[padded], surface=surface)
+    alone = rollout_scene(None, scene, QUICK)
+    assert batch[padded].positions.shape == alone.positions.shape
+    np.testing.assert_allclose(batch[padded].positions, alone.positions, atol=1e-5)
+    # Loads are 3 k a d^2 [N]: two micrometres, by which two programs differ, are a hundredth of them.
+    np.testing.assert_allclose(batch[padded].friction_loads, alone.friction_loads, atol=1e-3)
 
 
 def test_bundled_garments_form_a_group(poses):

@@ -186,13 +186,13 @@ def changed(scene, change):
 
 
 def loss_by_frames(scene):
-    """Return the function from changes to a loss after every frame, shape [frames - 1]."""
+    """Return the function from changes to a loss after every frame, shape [frames - 1], and the status."""
     weights = jnp.asarray(np.random.default_rng(1).standard_normal(scene.initial_state.position.shape))
 
     def losses(change):
         trajectory = rollout_scene(None, changed(scene, change), TIGHT)
         places = jnp.sum(weights[None] * trajectory.positions, axis=(1, 2))
-        return (places + jnp.cumsum(trajectory.energies["stretch"]))[1:]
+        return (places + jnp.cumsum(trajectory.energies["stretch"]))[1:], trajectory.status
 
     return losses
 
@@ -201,13 +201,13 @@ def check_every_parameter(scene, frames=(-1,), *, step=STEP, noise=_NOISE):
     """Hold gradients of the loss after some of the frames against differences of fourth order."""
     losses, along = loss_by_frames(scene), directions(scene)
     zeros = jax.tree.map(jnp.zeros_like, along)
-    assert int(jax.jit(rollout_scene, static_argnums=2)(None, scene, TIGHT).status) == Status.OK
-    value, gradient = jax.jit(losses), jax.jit(jax.grad(lambda change, frame: losses(change)[frame]))
+    value, gradient = jax.jit(losses), jax.jit(jax.grad(lambda change, frame: losses(change)[0][frame]))
+    assert int(value(zeros)[1]) == Status.OK
     found = [gradient(zeros, frame) for frame in frames]
     unseen = []
     for name, direction in along.items():
         near, far = (
-            value({**zeros, name: size * direction}) - value({**zeros, name: -size * direction})
+            value({**zeros, name: size * direction})[0] - value({**zeros, name: -size * direction})[0]
             for size in (step, 2 * step)
         )
         for frame, slopes in zip(frames, found, strict=True):
@@ -254,8 +254,8 @@ def test_forward_mode_agrees_with_reverse_mode():
     scene = stiff(small_scene(3, has_body=True))
     losses, along = loss_by_frames(scene), directions(scene)
     zeros = jax.tree.map(jnp.zeros_like, along)
-    _, forward = jax.jit(lambda change: jax.jvp(losses, (zeros,), (change,)))(along)
-    gradient = jax.jit(jax.grad(lambda change: losses(change)[-1]))(zeros)
+    _, forward = jax.jit(lambda change: jax.jvp(lambda x: losses(x)[0], (zeros,), (change,)))(along)
+    gradient = jax.jit(jax.grad(lambda change: losses(change)[0][-1]))(zeros)
     reverse = sum(float(jnp.sum(gradient[name] * along[name])) for name in along)
     assert float(forward[-1]) == pytest.approx(reverse, rel=1e-6)
 
@@ -280,21 +280,20 @@ def test_a_scene_that_is_moved_whole_moves_the_cloth_with_it():
 def test_the_linear_system_reports_what_it_did():
     scene = small_scene(2, has_body=False)
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
-    problem = frame_problem(scene, scene.initial_state, inputs)
+    problem = jax.jit(frame_problem)(scene, scene.initial_state, inputs)
     minimum = rollout_scene(None, scene, TIGHT).positions[-1]
     force = jnp.asarray(np.random.default_rng(3).standard_normal(minimum.shape))
     force = jnp.where(scene.garment.is_pinned[:, None], 0.0, force)
-    found = jax.jit(solve_hessian)(problem, minimum, force)
+    solve_linear = jax.jit(solve_hessian)
+    found = solve_linear(problem, minimum, force)
     assert float(found.residual) < 1e-8
     assert not bool(found.is_indefinite)
     crushed = minimum * jnp.array([[0.3, 1.0, 0.3]])  # membrane under compression has negative curvature
-    assert bool(jax.jit(solve_hessian)(problem, crushed, force).is_indefinite)
+    assert bool(solve_linear(problem, crushed, force).is_indefinite)
 
 
-@pytest.mark.parametrize("is_stalled", [False, True])
-def test_a_gradient_is_refused_where_the_linear_system_stalls(is_stalled, monkeypatch):
-    if is_stalled:
-        monkeypatch.setattr("eslr_jax.physics.solve._LINEAR_STOP", {"float64": (1e-12, 2)})
+def test_a_gradient_is_refused_where_the_linear_system_stalls(monkeypatch):
+    monkeypatch.setattr("eslr_jax.physics.solve._LINEAR_STOP", {"float64": (1e-12, 2)})
     options = {"terms": CLOTH, "starts_at_rest": True}
     sheet = square(3, 0.24, is_pinned=np.array([0, 2]))
     scene = wide(prepare_scene(sheet, drifting_ball(2), **options))
@@ -307,8 +306,7 @@ def test_a_gradient_is_refused_where_the_linear_system_stalls(is_stalled, monkey
         problem = frame_problem(moved, moved.initial_state, inputs)
         return solve(problem, start, iterations=100).position[:, 1].mean()
 
-    gradient = float(jax.grad(height)(0.2))
-    assert np.isnan(gradient) if is_stalled else np.isfinite(gradient)
+    assert np.isnan(jax.grad(height)(0.2))
 
 
 @struct.dataclass
@@ -322,9 +320,8 @@ class Kink(Term):
         return sum(jnp.abs(part - was) for part, was in zip(corners[0], problem.position.T, strict=True))
 
 
-@pytest.mark.parametrize("terms", [(), (Kink(),)], ids=["rests", "kinks"])
-def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so(terms):
-    scene = small_scene(3, *terms, has_body=False)
+def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so():
+    scene = small_scene(3, Kink(), has_body=False)
 
     @jax.jit
     def height(density):
@@ -334,11 +331,10 @@ def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so(terms):
 
     assert int(height(0.2)[1].status) == Status.OK, "motion alone needs no point of rest"
     gradient, trajectory = jax.grad(height, has_aux=True)(0.2)
-    assert bool(np.isnan(gradient)) is bool(terms)
-    assert int(trajectory.status) == (Status.DERIVATIVE_REFUSED if terms else Status.OK)
-    if terms:
-        with pytest.raises(ConfigError, match="frame 1: the frame did not come to rest"):
-            raise_for_status(trajectory)
+    assert np.isnan(gradient)
+    assert int(trajectory.status) == Status.DERIVATIVE_REFUSED
+    with pytest.raises(ConfigError, match="frame 1: the frame did not come to rest"):
+        raise_for_status(trajectory)
 
 
 @pytest.mark.slow

@@ -1,9 +1,10 @@
-"""Implicit Euler and BDF2 against what is known of falling and swinging cloth."""
+"""Implicit Euler, BDF2 and substeps against what is known of falling and swinging cloth."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
+from jax.tree_util import Partial
 from known_answers.strip import LENGTH, kept_per_period, strip
 
 from eslr_jax.config import SimConfig
@@ -12,26 +13,27 @@ from eslr_jax.evaluation.gap import trajectory_gap
 from eslr_jax.models.eslr import Eslr
 from eslr_jax.scene.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import simulate
 from eslr_jax.simulation.stepper import MOST_RESIDUAL
+from eslr_jax.terms import Air, scene_terms
 
 GRAVITY = 9.81  # [m/s^2]
 
 
-def test_bdf2_keeps_a_strip_swinging_and_euler_does_not():
-    per_period = {name: kept_per_period(name) for name in ("euler", "bdf2")}
-    assert per_period["bdf2"] > 0.95, per_period
-    assert per_period["euler"] < 0.5, per_period
+def test_bdf2_keeps_a_strip_swinging_in_substeps_more_and_euler_does_not():
+    bdf2 = kept_per_period("bdf2")
+    assert kept_per_period("bdf2", substeps=2) > bdf2 > 0.95
+    assert kept_per_period("euler") < 0.5
 
 
-@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
-def test_a_free_fall_is_off_by_as_much_as_the_integrator_says(integrator):
+@pytest.mark.parametrize(("integrator", "substeps"), [("euler", 1), ("bdf2", 1), ("bdf2", 3)])
+def test_a_free_fall_is_off_by_as_much_as_the_integrator_says(integrator, substeps):
     """Euler falls g dt t / 2 too far; BDF2 3/4 g dt^2, which is what its first step by Euler becomes."""
     frames, dt = 31, 1 / 30
-    scene = strip(integrator, frames=frames, is_pinned=False)
+    scene = strip(integrator, frames=frames, is_pinned=False).replace(substeps=substeps)
     end = rollout_scene(None, scene, SimConfig(iterations=5)).positions[-1]
     fallen = float(jnp.mean(scene.initial_state.position[:, 1] - end[:, 1]))
     time = (frames - 1) * dt
+    dt = dt / substeps
     too_far = GRAVITY * dt * {"euler": time / 2, "bdf2": 0.75 * dt}[integrator]
     assert fallen == pytest.approx(GRAVITY * time**2 / 2 + too_far, abs=1e-3)
 
@@ -52,14 +54,7 @@ def draped():
     return prepare_scene(square(), drifting_ball(13), integrator="bdf2")
 
 
-def test_bdf2_goes_on_where_it_was_interrupted(draped):
-    config = SimConfig(iterations=15)
-    whole = simulate(None, draped, config=config).trajectory
-    first = simulate(None, draped, config=config, is_stopping=lambda: True).trajectory
-    joined = simulate(None, draped, config=config, done=first).trajectory
-    np.testing.assert_array_equal(joined.positions, whole.positions)
-
-
+@pytest.mark.slow
 def test_the_gap_of_a_bdf2_trajectory_is_that_of_its_own_problems(draped):
     trajectory = rollout_scene(None, draped, SimConfig(iterations=100))
     gap = trajectory_gap(trajectory, draped, every=6)
@@ -70,3 +65,38 @@ def test_a_network_alone_refuses_bdf2(draped):
     model = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8)
     with pytest.raises(ConfigError, match="implicit Euler"):
         rollout_scene(model.new_network(), draped, SimConfig(iterations=0))
+
+
+def rising_wind(points, time):
+    """A wind along x that grows by 6 m/s every second."""
+    return jnp.zeros_like(points).at[:, 0].set(6.0 * time)
+
+
+def windy(*, substeps=1, shorter=1):
+    """A square on a drifting ball that holds two of its corners, in frames that may be `shorter`."""
+    is_pinned = np.zeros(64, bool)
+    is_pinned[[0, 7]] = True
+    poses = drifting_ball(13, speed=0.3 / shorter)
+    poses = poses.replace(timestep=poses.timestep / shorter)
+    terms = scene_terms(Air(Partial(rising_wind)))
+    return prepare_scene(square(is_pinned=is_pinned), poses, terms=terms, substeps=substeps)
+
+
+@pytest.mark.slow
+def test_a_frame_in_two_substeps_is_two_frames_of_half_the_length():
+    """Of a body that moves straight, with pins, and a wind that grows with time."""
+    config = SimConfig(iterations=100)
+    whole = rollout_scene(None, windy(substeps=2), config)
+    fine = rollout_scene(None, windy(shorter=2), config)
+    once = rollout_scene(None, windy(), config)
+    # Later, rounding decides how the cloth folds.
+    np.testing.assert_allclose(whole.positions[:6], fine.positions[:12:2], atol=3e-4)
+    assert float(jnp.abs(once.positions - whole.positions).max()) > 3e-3
+    np.testing.assert_allclose(whole.velocities[1], fine.velocities[2], atol=1e-4)
+    np.testing.assert_array_equal(whole.iterations[1:], 100)  # the most of a substep
+
+
+@pytest.mark.parametrize("wrong", [0, 1.5, True])
+def test_a_number_of_substeps_that_is_none_is_refused(wrong):
+    with pytest.raises(ConfigError, match="substeps"):
+        prepare_scene(square(), drifting_ball(3), substeps=wrong)

@@ -7,14 +7,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.body.motion import there_and_back
 from eslr_jax.physics.materials import COTTON, fabric_material
-from eslr_jax.simulation.live import (
-    advance,
-    changed,
-    grasp,
-    nearest_vertex,
-    no_hand,
-    set_stage,
-)
+from eslr_jax.simulation.live import advance, changed, grasp, nearest_vertex, no_hand, set_stage
 from eslr_jax.simulation.program import _compile
 
 STILL = (0.0, 0.0, 0.0)

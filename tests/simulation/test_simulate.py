@@ -1,6 +1,5 @@
 """The host's door: checks, chunks, pace, buffers, errors."""
 
-import dataclasses
 import functools
 import time
 
@@ -113,7 +112,16 @@ def simulated(kind):
     return simulate(None, scene, config=SOLVER)
 
 
-@pytest.mark.parametrize("kind", ["euler", "bdf2", "substeps", "substeps of bdf2", "self-contact"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "euler",
+        pytest.param("bdf2", marks=pytest.mark.slow),
+        pytest.param("substeps", marks=pytest.mark.slow),
+        "substeps of bdf2",
+        "self-contact",
+    ],
+)
 def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhere(kind):
     whole, _, scene = simulated(kind)
     for count in (6, 2):
@@ -197,28 +205,34 @@ def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
     assert again.trajectory.num_frames == 12
 
 
-@pytest.mark.parametrize("is_paced", [False, True])
-def test_a_program_that_is_compiled_early_is_the_one_that_runs(is_paced):
-    config = SimConfig(iterations=14 if is_paced else 13)  # of no other test, whose programs are kept
+def compiled_early(pace):
+    """Simulate by a program that was compiled while the scene was prepared; return the trajectory."""
+    config = SimConfig(iterations=10)  # of no other test, whose programs are kept
     before = _compile.cache_info().misses
     scene = prepare_scene(
         square(),
         drifting_ball(14),
-        on_shapes=lambda shapes: begin_compiling(None, shapes, config, is_paced=is_paced),
+        on_shapes=lambda shapes: begin_compiling(None, shapes, config, is_paced=pace is not None),
     )
     assert _compile.cache_info().misses == before + 1
-    simulate(None, scene, config=config, pace=(lambda count, ms: count) if is_paced else None)
+    trajectory = simulate(None, scene, config=config, pace=pace).trajectory
     assert _compile.cache_info().misses == before + 1, "another program runs"
+    return trajectory
 
 
-def test_a_pace_sets_the_iterations_of_the_next_chunk(scene):
+@pytest.mark.slow
+def test_a_program_that_is_compiled_early_is_the_one_that_runs():
+    compiled_early(None)
+
+
+def test_a_pace_sets_the_iterations_of_the_next_chunk():
     asked = []
 
     def pace(iterations, took_ms):
         asked.append(iterations)
         return iterations + 5
 
-    paced = simulate(None, scene, config=SimConfig(iterations=10), pace=pace).trajectory
+    paced = compiled_early(pace)
     assert asked == [10, 15]
     np.testing.assert_array_equal(paced.iterations, [0] + [10] * 10 + [15] * 3)
 
@@ -235,9 +249,6 @@ def test_tolerance_stops_early_and_is_kept(scene):
     ("changes", "message"),
     [
         ({"material": COTTON.replace(density=-0.2)}, "material density = -0.2; give a value from"),
-        ({"material": COTTON.replace(density=0.0)}, "material density = 0; give a value from"),
-        ({"material": COTTON.replace(thickness=0.0)}, "material thickness = 0; give a value from"),
-        ({"material": COTTON.replace(lame_mu=1e12)}, r"material lame_mu = 1e\+12; give a value from"),
         ({"material": COTTON.replace(density=np.ones(7))}, r"one per vertex \(64\)"),
         ({"timestep": jnp.float32(0.0)}, "timestep = 0; give a value from"),
         ({"terms": (*CLOTH, Friction(-1.0))}, "friction coefficient = -1"),
@@ -321,22 +332,6 @@ def test_a_body_that_jumps_away_from_the_cloth_is_not_too_fast_to_follow(scene):
     )
     trajectory = simulate(None, fallen, config=SOLVER).trajectory
     assert (trajectory.num_frames, int(trajectory.first_bad_frame)) == (14, -1)
-
-
-def test_a_limb_that_jumps_into_its_sleeve_is_too_fast_to_follow(small_scene):
-    body = small_scene.body
-    for jump, is_followed in ((0.2, True), (0.4, False)):
-        jumped = body.replace(positions=body.positions.at[3:].add(jnp.array([jump, 0.0, 0.0])))
-        ended = simulate(None, small_scene.replace(body=jumped), config=SOLVER, raises=False).trajectory
-        assert (Status.BODY_TOO_FAST in Status(int(ended.status))) != is_followed
-    assert int(ended.first_bad_frame) == 3
-    with pytest.raises(MotionError, match="frame 3: the body moved farther in one frame than contacts can"):
-        raise_for_status(ended)
-
-
-def test_a_negative_number_of_iterations_is_refused():
-    with pytest.raises(ValueError, match="iterations must not be negative"):
-        dataclasses.replace(SOLVER, iterations=-1)
 
 
 def test_a_buffer_without_a_row_is_refused():

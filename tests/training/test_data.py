@@ -12,6 +12,7 @@ from eslr_jax.assets import split_clips
 from eslr_jax.body.motion import pose_body, shape_body
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.errors import ConfigError
+from eslr_jax.terms import Collision
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train
 from eslr_jax.training.pool import start_trajectory
@@ -30,12 +31,17 @@ def test_bodies_of_trajectories_differ_in_girth_and_cloth_starts_outside_them(co
     girths = np.array([slot.girth for slot in slots])
     assert np.ptp(girths) > 2e-3
     assert np.all(np.abs(girths) <= 0.01)
-    for slot in slots:
+
+    @jax.jit
+    def worn(slot):
         transforms = small_data.transforms(slot.frame, slot.yaw)
         thin, own = small_data.body(transforms, jnp.float32(0.0)), small_data.body(transforms, slot.girth)
-        np.testing.assert_allclose(np.linalg.norm(own - thin, axis=-1), abs(slot.girth), rtol=0.1)
-        contacts = find_contacts(slot.state.position, own, own, small_data.surface)
-        assert np.min(contacts.distances) > 0
+        return own - thin, find_contacts(slot.state.position, own, own, small_data.surface).distances
+
+    for slot in slots:
+        grown, distances = worn(slot)
+        np.testing.assert_allclose(np.linalg.norm(grown, axis=-1), abs(slot.girth), rtol=0.1)
+        assert np.min(distances) > 0
 
 
 def test_clips_are_played_back_and_forth_and_never_into_each_other(small_garment):
@@ -65,9 +71,10 @@ def test_a_body_stands_still_as_often_as_asked(config, small_data):
 
     assert all(abs(int(slot.frame - slot.before)) == 1 for slot in starts(0.0))
     assert 4 <= sum(int(slot.frame == slot.before) for slot in starts(0.5)) <= 16
+    problem = jax.jit(partial(slot_problem, data=small_data, index=jnp.int32(0), config=config))
     for slot in starts(1.0):
         np.testing.assert_array_equal(slot.state.velocity, 0.0)
-        contacts = slot_problem(slot, small_data, jnp.int32(0), config).body.nearest
+        contacts = problem(slot).data_of(Collision).nearest
         np.testing.assert_array_equal(contacts.next_points, contacts.points)
 
 
@@ -95,15 +102,20 @@ def test_a_shaped_body_moves_as_the_same_body_shaped_first(shaped_data):
     coefficients = np.array([1.5, -2.0])
     expected = pose_body(shape_body(body, coefficients), motion).positions[:, data.surface.vertex_ids]
     still = jnp.float32(0.0)
+
+    @jax.jit
+    def moved(frame, shape):
+        transforms = data.transforms(frame, still, shape)
+        found = data.body(transforms, still, shape)
+        sleeve = data.skinned(jnp.int32(0), transforms, shape)
+        return found, find_contacts(sleeve, found, found, data.surface).distances
+
     for frame in (0, 7):
         shape = jnp.asarray(coefficients, jnp.float32)
-        transforms = data.transforms(jnp.int32(frame), still, shape)
-        found = data.body(transforms, still, shape)
+        found, distances = moved(jnp.int32(frame), shape)
         np.testing.assert_allclose(found, expected[frame], atol=1e-6)
         # The sleeve lies 8 mm off the limb, whatever the limb's shape.
-        sleeve = data.skinned(jnp.int32(0), transforms, shape)
-        contacts = find_contacts(sleeve, found, found, data.surface)
-        np.testing.assert_allclose(contacts.distances, 0.008, atol=0.004)
+        np.testing.assert_allclose(distances, 0.008, atol=0.004)
 
 
 def test_bodies_of_trajectories_differ_in_shape_and_cloth_starts_outside_them(config, shaped_data):
@@ -115,13 +127,18 @@ def test_bodies_of_trajectories_differ_in_shape_and_cloth_starts_outside_them(co
     assert shapes.shape == (6, 2)
     assert np.all(np.ptp(shapes, axis=0) > 1.0)
     assert np.all(np.abs(shapes) <= 2.0)
-    for slot in slots:
+
+    @jax.jit
+    def distances(slot):
         transforms = data.transforms(slot.frame, slot.yaw, slot.shape)
         own = data.body(transforms, slot.girth, slot.shape)
-        contacts = find_contacts(slot.state.position, own, own, data.surface)
-        assert np.min(contacts.distances) > 0
+        return find_contacts(slot.state.position, own, own, data.surface).distances
+
+    for slot in slots:
+        assert np.min(distances(slot)) > 0
 
 
+@pytest.mark.slow
 def test_a_run_on_shapes_keeps_them_while_a_trajectory_lives(config, shaped_data, tmp_path):
     *_, data = shaped_data
     config = dataclasses.replace(config, shape_range=1.0, horizon_growth=1, steps=3, slots_per_garment=1)

@@ -38,12 +38,14 @@ def with_a_broken_vertex(state):
     return state.replace(pools=(state.pools[0].replace(state=cloth.replace(position=place), is_done=alive),))
 
 
+@pytest.mark.slow
 def test_of_two_data_sets_every_trajectory_is_trained(config, small_data):
     config = dataclasses.replace(config, slots_per_garment=2)
     state = init_train_state(config, (small_data, small_data))
     before = [np.array(pool.state.position) for pool in state.pools]
-    for k in range(4):
-        state, _ = make_train_step(config, k % 2)(state, small_data)
+    steps = [make_train_step(config, place) for place in range(2)]
+    for step in steps * 2:
+        state, _ = step(state, small_data)
     for pool, start in zip(state.pools, before, strict=True):
         assert np.all(np.any(np.array(pool.state.position) != start, axis=(1, 2)))
 
@@ -156,6 +158,7 @@ def advance(config, small_data):
     )
 
 
+@pytest.mark.slow
 def test_a_run_whose_cloth_needs_more_self_contact_than_fits_ends_with_a_remedy(config, tmp_path):
     """Six small sheets two millimetres apart: every vertex has more pairs than rows."""
     sheet, faces = make_sheet(4, 4, 0.015, jitter=0)
@@ -173,6 +176,7 @@ def test_a_run_whose_cloth_needs_more_self_contact_than_fits_ends_with_a_remedy(
     assert json.loads(line)["overflows"] == 1.0
 
 
+@pytest.mark.slow
 def test_statistics_come_first_and_then_weights_move(small_data):
     """HOOD: a hundred graphs for the normalisers, with the skinned garment's acceleration; then updates."""
     model = dataclasses.replace(MODELS["mgn-15"], message_passing_steps=1, latent_size=8)

@@ -20,6 +20,7 @@ from eslr_jax.training.step import init_train_state, make_train_step
 STEPS = 5
 
 
+@pytest.mark.slow
 def test_seeds_together_are_each_alone(small_data, cheap_model):
     # Trajectories of at most two frames: some start anew while others go on.
     config = TrainConfig(model=cheap_model, steps=STEPS, horizon=2, horizon_growth=1)
@@ -44,6 +45,7 @@ def test_seeds_together_are_each_alone(small_data, cheap_model):
         assert int(take_seed(together, place).step) == STEPS
 
 
+@pytest.mark.slow
 def test_a_run_of_two_seeds_goes_on_and_exports_both(small_data, cheap_model, tmp_path):
     config = TrainConfig(model=cheap_model, steps=STEPS, seeds=2, seed=3, log_every=1, checkpoint_every=2)
 
