@@ -181,7 +181,7 @@ def pose_vertices(body: dict[str, NDArray], rotations: NDArray) -> NDArray:
     """Posed vertices [m], shape [vertices, 3], with the root where it rests."""
     import jax.numpy as jnp
 
-    from eslr_jax.body import lbs
+    from eslr_jax.pose import lbs
 
     joints = jnp.asarray(body["joint_rest_positions"])
     parents = tuple(int(p) for p in body["parents"])

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.body import lbs, retarget
-from eslr_jax.body.joints import find_named_parts
+from eslr_jax.pose import lbs, retarget
+from eslr_jax.pose.joints import find_named_parts
 
 DATA = Path(__file__).resolve().parent
 MAGIC = b"EPMOCAP1"

@@ -13,43 +13,43 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "SimConfig": "eslr_jax.config",
     "TrainConfig": "eslr_jax.config",
-    "Network": "eslr_jax.models.network",
+    "Network": "eslr_jax.networks.network",
     "EslrError": "eslr_jax.errors",
     "Material": "eslr_jax.types",
     "Trajectory": "eslr_jax.types",
-    "load_body": "eslr_jax.assets",
-    "load_garment": "eslr_jax.assets",
-    "load_model": "eslr_jax.assets",
-    "load_motion": "eslr_jax.assets",
-    "load_trajectory": "eslr_jax.evaluation.run",
-    "pose_body": "eslr_jax.body.motion",
-    "prepare_garment": "eslr_jax.geometry.prepare",
-    "plan_scene": "eslr_jax.scene.plan",
-    "prepare_scene": "eslr_jax.scene.plan",
+    "load_body": "eslr_jax.pipeline.assets",
+    "load_garment": "eslr_jax.pipeline.assets",
+    "load_model": "eslr_jax.pipeline.assets",
+    "load_motion": "eslr_jax.pipeline.assets",
+    "load_trajectory": "eslr_jax.pipeline.report.run",
+    "pose_body": "eslr_jax.pose.motion",
+    "prepare_garment": "eslr_jax.mesh.prepare",
+    "plan_scene": "eslr_jax.simulation.plan",
+    "prepare_scene": "eslr_jax.simulation.plan",
     "rollout": "eslr_jax.simulation.rollout",
     "scene_terms": "eslr_jax.terms",
-    "score_trajectory": "eslr_jax.evaluation.score",
+    "score_trajectory": "eslr_jax.pipeline.report.score",
     "simulate": "eslr_jax.simulation.simulate",
     "step": "eslr_jax.simulation.rollout",
-    "load_scene": "eslr_jax.scene.archive",
-    "save_scene": "eslr_jax.scene.archive",
+    "load_scene": "eslr_jax.simulation.archive",
+    "save_scene": "eslr_jax.simulation.archive",
     "simulate_batch": "eslr_jax.simulation.batch",
 }
 
 __all__ = ["__version__", *_PUBLIC]
 
 if TYPE_CHECKING:
-    from eslr_jax.assets import load_body, load_garment, load_model, load_motion
-    from eslr_jax.body.motion import pose_body
     from eslr_jax.config import SimConfig, TrainConfig
     from eslr_jax.errors import EslrError
-    from eslr_jax.evaluation.run import load_trajectory
-    from eslr_jax.evaluation.score import score_trajectory
-    from eslr_jax.geometry.prepare import prepare_garment
-    from eslr_jax.models.network import Network
-    from eslr_jax.scene.archive import load_scene, save_scene
-    from eslr_jax.scene.plan import plan_scene, prepare_scene
+    from eslr_jax.mesh.prepare import prepare_garment
+    from eslr_jax.networks.network import Network
+    from eslr_jax.pipeline.assets import load_body, load_garment, load_model, load_motion
+    from eslr_jax.pipeline.report.run import load_trajectory
+    from eslr_jax.pipeline.report.score import score_trajectory
+    from eslr_jax.pose.motion import pose_body
+    from eslr_jax.simulation.archive import load_scene, save_scene
     from eslr_jax.simulation.batch import simulate_batch
+    from eslr_jax.simulation.plan import plan_scene, prepare_scene
     from eslr_jax.simulation.rollout import rollout, step
     from eslr_jax.simulation.simulate import simulate
     from eslr_jax.terms import scene_terms

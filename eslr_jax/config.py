@@ -14,7 +14,7 @@ Criterion = Literal["postcvpr", "cvpr", "metric"]
 """Readings of HOOD's losses, see `terms.hood`."""
 
 Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
-"""What a network may be deprived of, see `evaluation.controls`."""
+"""What a network may be deprived of, see `pipeline.report.controls`."""
 
 MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
@@ -93,7 +93,7 @@ class EvaluationOptions:
 class TrainConfig:
     """A training run; the defaults are the recipe that measured best on two CPU cores."""
 
-    # A `models.network.System`; in a recipe its name, or a table with that as `base` and values that differ.
+    # A `networks.network.System`; in a recipe its name, or a table with that as `base` and values that differ.
     model: Any
     garments: tuple[str, ...] = ("tshirt", "tank", "longsleeve", "shorts", "pants", "dress")  # bundled ones
     vertices: tuple[str, ...] = ("1k",)  # resolutions, mixed step by step

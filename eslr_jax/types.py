@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 @struct.dataclass
 class CoarseEdges:
-    """One coarse level of a garment's edges, see `geometry.coarse`."""
+    """One coarse level of a garment's edges, see `mesh.coarse`."""
 
     senders: Int[Array, " coarse_edges"]  # directed, both directions
     receivers: Int[Array, " coarse_edges"]  # sorted ascending
@@ -70,7 +70,7 @@ class Garment:
 
 @struct.dataclass
 class Plate:
-    """Bending of a thin plate on one garment's mesh, see `geometry.plate`.
+    """Bending of a thin plate on one garment's mesh, see `mesh.plate`.
 
     The energy is half the sum of squares of `rows` times the angles of the nine hinges around every face.
     """
@@ -84,7 +84,7 @@ class Plate:
 class Threads:
     """Stretch of a fabric with warp and weft on one garment's faces, see `terms.stretch`."""
 
-    warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `geometry.weave`
+    warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `mesh.weave`
     stiffness: Float[Array, "4 faces"]  # [N/m] along warp, along weft, coupling of both, shear
     limits: Float[Array, "2 faces"] | None = None  # Green strain where they begin to stiffen
 
@@ -111,7 +111,7 @@ MIN_DEVIATION = 1e-8  # floor of a feature's standard deviation (HOOD)
 
 @struct.dataclass
 class Normalizer:
-    """Mean and spread of a set of features over every row seen so far; see `graph.normalizer`."""
+    """Mean and spread of a set of features over every row seen so far; see `networks.normalizer`."""
 
     count: Float[Array, ""]  # rows seen
     mean: Float[Array, " features"]
@@ -202,7 +202,7 @@ class Contacts:
 
 
 @struct.dataclass
-class SceneBody:
+class Obstacle:
     """The body of a scene, as far as cloth can reach it."""
 
     surface: BodySurface
@@ -215,11 +215,11 @@ class Scene:
 
     garment: Garment
     material: Material
-    # `terms.term.Term`s, whose sum each frame minimises: what is modelled, see `scene.build.scene_terms`.
+    # `terms.term.Term`s, whose sum each frame minimises: what is modelled, see `simulation.scene.scene_terms`.
     terms: tuple[Any, ...]
     timestep: Float[Array, ""]  # [s]
     initial_state: ClothState
-    body: SceneBody | None
+    body: Obstacle | None
     pin_targets: Float[Array, "frames vertices 3"] | None  # positions of pinned vertices [m]
     num_frames: int = struct.field(pytree_node=False)
     substeps: int = struct.field(pytree_node=False, default=1)  # in which a frame is simulated

@@ -13,14 +13,14 @@ import numpy as np
 from harness import parser
 from PIL import Image
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.physics.materials import fabric_material
-from eslr_jax.render import render_frames, side_by_side
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.fabric.materials import fabric_material
+from eslr_jax.files.atomic import atomic_write
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
+from eslr_jax.pipeline.pictures import render_frames, side_by_side
+from eslr_jax.pose.motion import pose_body
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.terms import Collision, scene_terms
 

@@ -31,9 +31,9 @@ from jaxtyping import Float
 from newton_cloth import prepare_cloth, springs, strip_stiffness
 
 from eslr_jax.errors import EslrError, MissingExtraError
-from eslr_jax.evaluation.foreign import foreign_trajectory
-from eslr_jax.io.animated import AnimatedMesh
-from eslr_jax.io.point_cache import write_pc2
+from eslr_jax.pipeline.formats.animated import AnimatedMesh
+from eslr_jax.pipeline.formats.point_cache import write_pc2
+from eslr_jax.pipeline.report.foreign import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory

@@ -20,12 +20,12 @@ import numpy as np
 from harness import kept, machine, parser, put
 
 from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, simulate
-from eslr_jax.assets import load_splits
 from eslr_jax.config import MOST_ITERATIONS
-from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import prepare_scenes
-from eslr_jax.simulation.budget import Calibration, first_iterations, keep_budget, read_calibration
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.pipeline.assets.budget import Calibration, first_iterations, keep_budget, read_calibration
+from eslr_jax.pipeline.report.gap import trajectory_gap
+from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene
 

@@ -25,25 +25,25 @@ from other_bodies import child
 from PIL import Image
 
 from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
-from eslr_jax.assets import load_garment_file, prepare_stored
-from eslr_jax.body.lbs import skin_garment
-from eslr_jax.body.rig import make_body
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.evaluation.fields import Field, run_field
-from eslr_jax.evaluation.foreign import foreign_trajectory
-from eslr_jax.evaluation.gap import gap_medians, trajectory_gap
-from eslr_jax.evaluation.run import ClothTrack, read_run, write_run
-from eslr_jax.evaluation.score import EVERY
-from eslr_jax.fabric import garment_material
-from eslr_jax.fit.fit import fit_garment
-from eslr_jax.fit.options import FitOptions
-from eslr_jax.fit.outfit import wear_together
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.garment import read_garment_source
-from eslr_jax.io.obj import obj_text
-from eslr_jax.io.palette import outfit_colors
-from eslr_jax.physics.materials import WOVEN, fabric_names
-from eslr_jax.render import add_color_bar, color_scale, render_frames, side_by_side
+from eslr_jax.fabric.materials import WOVEN, fabric_names
+from eslr_jax.files.atomic import atomic_write
+from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
+from eslr_jax.pipeline.dressing.fit import fit_garment
+from eslr_jax.pipeline.dressing.options import FitOptions
+from eslr_jax.pipeline.dressing.outfit import wear_together
+from eslr_jax.pipeline.fabrics import garment_material
+from eslr_jax.pipeline.formats.garment import read_garment_source
+from eslr_jax.pipeline.formats.obj import obj_text
+from eslr_jax.pipeline.formats.palette import outfit_colors
+from eslr_jax.pipeline.pictures import add_color_bar, color_scale, render_frames, side_by_side
+from eslr_jax.pipeline.report.fields import Field, run_field
+from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.gap import gap_medians, trajectory_gap
+from eslr_jax.pipeline.report.run import ClothTrack, read_run, write_run
+from eslr_jax.pipeline.report.score import EVERY
+from eslr_jax.pipeline.rigs.rig import make_body
+from eslr_jax.pose.lbs import skin_garment
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.simulate import last_frames
 from eslr_jax.terms import Collision, Repulsion, Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
@@ -285,8 +285,8 @@ def play(frames: int) -> np.ndarray | None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         return None
-    from eslr_jax.viewer.live import open_live, run_live
-    from eslr_jax.viewer.live_controls import Choice
+    from eslr_jax.pipeline.page.live import open_live, run_live
+    from eslr_jax.pipeline.page.live_controls import Choice
 
     shown, end = threading.Semaphore(0), threading.Event()
     live = open_live(Choice(("tshirt",), "1k", "cmu_016_32"), out=Path("live"), port=8871)

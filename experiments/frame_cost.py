@@ -20,20 +20,20 @@ import jax.numpy as jnp
 import numpy as np
 from harness import keep, kept, machine, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import find_self_contacts
-from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.physics.guess import initial_guess
-from eslr_jax.physics.preconditioner import stretched_stiffness
-from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
+from eslr_jax.pipeline.report.gap import trajectory_states
+from eslr_jax.pipeline.report.scene_parts import time_in_turns
+from eslr_jax.pose.motion import pose_body
 from eslr_jax.simulation.frame import frame_problem
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.preconditioner import stretched_stiffness
+from eslr_jax.solver.solve import Start, solve
 from eslr_jax.terms import Repulsion, scene_terms
 from eslr_jax.types import Scene
 

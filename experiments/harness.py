@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.simulation.budget import device_name
+from eslr_jax.files.atomic import atomic_write
+from eslr_jax.pipeline.assets.budget import device_name
+from eslr_jax.pipeline.report.report import environment
 
 EXPERIMENTS = Path(__file__).parent
 RESULTS = EXPERIMENTS / "results"

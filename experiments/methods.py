@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from eslr_jax.evaluation.calibrate import measure_costs, simulator_of
-from eslr_jax.evaluation.gap import GapOptions, OptimalityGap, measure_gap
-from eslr_jax.simulation.budget import SOLVER, Cost
+from eslr_jax.pipeline.assets.budget import SOLVER, Cost
+from eslr_jax.pipeline.report.calibrate import measure_costs, simulator_of
+from eslr_jax.pipeline.report.gap import GapOptions, OptimalityGap, measure_gap
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.types import Scene, Trajectory
 

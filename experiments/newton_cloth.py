@@ -35,8 +35,8 @@ from hard_cases import Simulator
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError
-from eslr_jax.evaluation.foreign import foreign_trajectory
-from eslr_jax.extras import require
+from eslr_jax.pipeline.extras import require
+from eslr_jax.pipeline.report.foreign import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
 from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory

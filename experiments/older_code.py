@@ -26,8 +26,8 @@ COUNTS = [5, 10, 14, 17, 20, 24, 28, 33, 39, 46, 54, 64, 76, 90, 106]  # of iter
 GAPS = """
 import json, sys
 import numpy as np
-from eslr_jax.evaluation.calibrate import example_scene, simulator_of
-from eslr_jax.evaluation.gap import GapOptions, measure_gap
+from eslr_jax.pipeline.report.calibrate import example_scene, simulator_of
+from eslr_jax.pipeline.report.gap import GapOptions, measure_gap
 from eslr_jax.simulation.rollout import rollout_scene
 size, frames, garments, counts = json.loads(sys.argv[1])
 shares = []
@@ -40,7 +40,7 @@ print(json.dumps([float(np.median(row)) for row in np.concatenate(shares, axis=1
 """
 TIMES = """
 import json, sys
-from eslr_jax.evaluation.calibrate import example_scene, fit_costs, simulator_of, time_frames
+from eslr_jax.pipeline.report.calibrate import example_scene, fit_costs, simulator_of, time_frames
 size, frames = json.loads(sys.argv[1])
 scene = example_scene("tshirt", size, "cmu_016_32", frames)
 runs = {("solver", count): (*simulator_of("solver"), count) for count in (10, 60)}

@@ -17,22 +17,22 @@ import jax
 import numpy as np
 from harness import keep, kept, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.joints import find_parts
-from eslr_jax.body.motion import Motion, obstacle_surface, pose_body, shape_body, still_motion
-from eslr_jax.body.rig import UnitsWarning, body_skeleton, make_body
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.metrics import measure_frames
-from eslr_jax.evaluation.report import environment, trajectory_report
-from eslr_jax.extras import require
-from eslr_jax.fit.clearance import body_heights
-from eslr_jax.fit.postures import find_arms, rest_posture
-from eslr_jax.geometry.padding import choose_bucket, common_bucket
-from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.io.skeleton import RiggedMesh, Skeleton
-from eslr_jax.render import render_frame, side_by_side, write_png
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.mesh.padding import choose_bucket, common_bucket
+from eslr_jax.mesh.prepare import pad_alike
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
+from eslr_jax.pipeline.dressing.clearance import body_heights
+from eslr_jax.pipeline.dressing.postures import find_arms, rest_posture
+from eslr_jax.pipeline.extras import require
+from eslr_jax.pipeline.pictures import render_frame, side_by_side, write_png
+from eslr_jax.pipeline.report.metrics import measure_frames
+from eslr_jax.pipeline.report.report import environment, trajectory_report
+from eslr_jax.pipeline.rigs.rig import UnitsWarning, body_skeleton, make_body
+from eslr_jax.pose.joints import find_parts
+from eslr_jax.pose.motion import Motion, obstacle_surface, pose_body, shape_body, still_motion
+from eslr_jax.pose.skeleton import RiggedMesh, Skeleton
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import last_frames, simulate
 from eslr_jax.terms import Collision, Ground, scene_terms
 from eslr_jax.types import Body

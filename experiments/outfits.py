@@ -15,12 +15,12 @@ import numpy as np
 from harness import keep, machine, parser
 
 from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
-from eslr_jax.assets import load_garment_file, prepare_stored
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.evaluation.referee import intersecting_pairs
-from eslr_jax.fit.outfit import combine_garments
-from eslr_jax.geometry.topology import is_on_boundary
-from eslr_jax.io.garment import GarmentFile
+from eslr_jax.mesh.topology import is_on_boundary
+from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
+from eslr_jax.pipeline.dressing.outfit import combine_garments
+from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.terms import Collision, scene_terms
 
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))

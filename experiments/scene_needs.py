@@ -17,16 +17,16 @@ import numpy as np
 from hard_cases import find_case
 from harness import keep, machine, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import pose_body, still_motion
-from eslr_jax.body.retarget import ARM_ABDUCTION
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import find_both_sides
 from eslr_jax.contact.self_contact import starting_rows
-from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import first_frames, prepare_scene
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
+from eslr_jax.pipeline.report.scene_parts import take_turns
+from eslr_jax.pose.motion import pose_body, still_motion
+from eslr_jax.pose.retarget import ARM_ABDUCTION
 from eslr_jax.simulation.frame import frame_inputs
+from eslr_jax.simulation.plan import first_frames, prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.terms import CLOTH, Air, Collision, Repulsion, scene_terms

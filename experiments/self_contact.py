@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from harness import keep, machine, parser
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.referee import judge
-from eslr_jax.scene.plan import prepare_scene, shared_surface
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.pipeline.report.referee import judge
+from eslr_jax.pose.motion import pose_body
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
+from eslr_jax.simulation.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import simulate
 from eslr_jax.terms import Collision, Repulsion, scene_terms
 from eslr_jax.types import Scene

@@ -22,11 +22,11 @@ import jax
 from harness import keep, kept, parser, save
 from methods import Method, measure_methods
 
-from eslr_jax.assets import asset_names
-from eslr_jax.assets.models import START_MODEL
-from eslr_jax.evaluation.calibrate import example_scene, read_coarse_edges, simulator_of
-from eslr_jax.evaluation.report import environment, trajectory_report
-from eslr_jax.simulation.budget import SOLVER, device_name
+from eslr_jax.pipeline.assets import asset_names
+from eslr_jax.pipeline.assets.budget import SOLVER, device_name
+from eslr_jax.pipeline.assets.models import START_MODEL
+from eslr_jax.pipeline.report.calibrate import example_scene, read_coarse_edges, simulator_of
+from eslr_jax.pipeline.report.report import environment, trajectory_report
 from eslr_jax.simulation.rollout import rollout_scene
 
 CLIP = "cmu_016_32"  # of the test split

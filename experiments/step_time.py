@@ -25,11 +25,11 @@ import numpy as np
 import optax
 from harness import EXPERIMENTS, keep, parser
 
-from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.scene_parts import time_in_turns
-from eslr_jax.graph.build import build_graph
-from eslr_jax.models.apply import apply_model, measure_statistics, merge_statistics
-from eslr_jax.models.registry import MODELS
+from eslr_jax.networks.apply import apply_model, measure_statistics, merge_statistics
+from eslr_jax.networks.build import build_graph
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.report.report import environment
+from eslr_jax.pipeline.report.scene_parts import time_in_turns
 from eslr_jax.training.memory import keep_memory
 
 sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models

@@ -25,16 +25,16 @@ from harness import parser, put
 from scipy.spatial import cKDTree
 
 from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, simulate
-from eslr_jax.assets import load_splits
-from eslr_jax.body.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.cli.console import use_compile_cache
-from eslr_jax.evaluation.referee import intersecting_pairs, judge
-from eslr_jax.evaluation.report import environment
-from eslr_jax.geometry.closest import nearest_places
-from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import Integrator, start_integrator
-from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.closest import nearest_places
+from eslr_jax.mesh.topology import vertex_normals
+from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.pipeline.cli.console import use_compile_cache
+from eslr_jax.pipeline.report.referee import intersecting_pairs, judge
+from eslr_jax.pipeline.report.report import environment
+from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
+from eslr_jax.simulation.plan import prepare_scenes
+from eslr_jax.simulation.scene import Integrator, start_integrator
 from eslr_jax.terms import Collision, Repulsion, scene_terms
 from eslr_jax.types import Scene
 

@@ -15,10 +15,10 @@ import optax
 from harness import EXPERIMENTS, keep, machine, parser
 
 from eslr_jax import load_body, load_motion, pose_body, prepare_scene
-from eslr_jax.assets import split_clips
-from eslr_jax.evaluation.scene_parts import take_turns
+from eslr_jax.pipeline.assets import split_clips
+from eslr_jax.pipeline.assets.training import load_training_data
+from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.memory import keep_memory
 from eslr_jax.training.recipe import load_recipe

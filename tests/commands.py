@@ -7,12 +7,12 @@ import sys
 import warnings
 from unittest import mock
 
-from eslr_jax.cli import main
+from eslr_jax.pipeline.cli import main
 
 
 def eslr(*words, cwd=None):
     """Run a command in a process of its own."""
-    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, words)]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False, timeout=600)
 
 

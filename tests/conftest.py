@@ -56,7 +56,7 @@ def small_config():
 @pytest.fixture(scope="session")
 def small_scene(small_garment, small_poses):
     """The sleeve on the limb."""
-    from eslr_jax.scene.plan import prepare_scene
+    from eslr_jax.simulation.plan import prepare_scene
     from eslr_jax.terms import Ground, scene_terms
 
     return prepare_scene(small_garment, small_poses, terms=scene_terms(without=(Ground,)))
@@ -73,7 +73,7 @@ def small_trajectory(small_scene, small_config):
 @pytest.fixture(scope="session")
 def small_problem(small_scene, small_trajectory):
     """The scene's third frame, in motion and in contact."""
-    from eslr_jax.evaluation.gap import trajectory_states
+    from eslr_jax.pipeline.report.gap import trajectory_states
     from eslr_jax.simulation.frame import frame_problem
 
     states, inputs = jax.tree.map(lambda leaf: leaf[2], trajectory_states(small_trajectory, small_scene))
@@ -82,21 +82,21 @@ def small_problem(small_scene, small_trajectory):
 
 @pytest.fixture(scope="session")
 def body():
-    from eslr_jax.assets import load_body
+    from eslr_jax.pipeline.assets import load_body
 
     return load_body()
 
 
 @pytest.fixture(scope="session")
 def tshirt():
-    from eslr_jax.assets import load_garment
+    from eslr_jax.pipeline.assets import load_garment
 
     return load_garment("tshirt")
 
 
 @pytest.fixture(scope="session")
 def walk(body):
-    from eslr_jax.assets import load_motion
-    from eslr_jax.body.motion import pose_body
+    from eslr_jax.pipeline.assets import load_motion
+    from eslr_jax.pose.motion import pose_body
 
     return pose_body(body, load_motion("cmu_016_32"), num_frames=8)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.types import BodyMotion, Garment
 
 RADIUS = 0.1  # [m]

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from eslr_jax.assets import load_garment_file, prepare_stored
-from eslr_jax.body.motion import pose_body, still_motion
-from eslr_jax.io.garment import write_garment_npz
-from eslr_jax.io.trajectory import BodyTrack, TrajectoryFile, write_trajectory
-from eslr_jax.scene.archive import save_scene
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
+from eslr_jax.pipeline.formats.garment import write_garment_npz
+from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, write_trajectory
+from eslr_jax.pose.motion import pose_body, still_motion
+from eslr_jax.simulation.archive import save_scene
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.terms import Repulsion, scene_terms
 
 LAYERED = scene_terms(Repulsion(where="all"))

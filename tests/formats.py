@@ -7,11 +7,11 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.assets import load_motion
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.body.rig import body_skeleton, skeleton_motion
-from eslr_jax.io.garment import read_garment_npz
-from eslr_jax.io.obj import obj_text
+from eslr_jax.pipeline.assets import load_motion
+from eslr_jax.pipeline.assets.catalog import find_asset
+from eslr_jax.pipeline.formats.garment import read_garment_npz
+from eslr_jax.pipeline.formats.obj import obj_text
+from eslr_jax.pipeline.rigs.rig import body_skeleton, skeleton_motion
 
 SMPL_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from eslr_jax.assets.catalog import find_asset
-from eslr_jax.io.garment import GarmentFile, GarmentSource, read_garment_npz
-from eslr_jax.io.mesh import MeshFile
+from eslr_jax.pipeline.assets.catalog import find_asset
+from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, read_garment_npz
+from eslr_jax.pipeline.formats.mesh import MeshFile
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # Y up facing Z -> Z up facing -Y
 
@@ -23,8 +23,8 @@ def source(positions: np.ndarray, faces: np.ndarray, **fields) -> GarmentSource:
 
 def dent(garment: GarmentFile, body, depth: float) -> tuple[np.ndarray, int]:
     """Press a hand-sized piece of chest into the body to a depth [m]; return positions and vertices inside."""
-    from eslr_jax.fit.clearance import body_heights
-    from eslr_jax.fit.postures import rest_posture
+    from eslr_jax.pipeline.dressing.clearance import body_heights
+    from eslr_jax.pipeline.dressing.postures import rest_posture
 
     positions = garment.rest_positions.copy()
     heights, normals = body_heights(positions, rest_posture(body))

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.physics.guess import pushed_out_guess
-from eslr_jax.physics.potential import potential
+from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.potential import potential
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import tree_cast
 

@@ -9,13 +9,13 @@ from jaxtyping import install_import_hook
 
 KERNELS = [
     "eslr_jax.numerics",
-    "eslr_jax.body.lbs",
+    "eslr_jax.pose.lbs",
     "eslr_jax.contact",
-    "eslr_jax.graph",
-    "eslr_jax.models",
-    "eslr_jax.physics",
+    "eslr_jax.networks",
+    "eslr_jax.networks",
+    "eslr_jax.solver",
     "eslr_jax.terms",
-    "eslr_jax.scene.build",
+    "eslr_jax.simulation.scene",
     "eslr_jax.simulation.frame",
     "eslr_jax.simulation.stepper",
     "eslr_jax.simulation.rollout",

@@ -10,13 +10,13 @@ from formats import write_smpl, write_walker
 from other_bodies import smpl_female
 
 from eslr_jax import load_garment, load_motion, pose_body
-from eslr_jax.body.lbs import skin_garment
-from eslr_jax.io.obj import obj_text
-from eslr_jax.io.trajectory import read_trajectory
+from eslr_jax.pipeline.formats.obj import obj_text
+from eslr_jax.pipeline.formats.trajectory import read_trajectory
+from eslr_jax.pose.lbs import skin_garment
 
 
 def eslr(*arguments):
-    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

@@ -32,7 +32,7 @@ def run(code: str, *arguments: str) -> subprocess.CompletedProcess:
 
 
 def eslr(*arguments: str) -> subprocess.CompletedProcess:
-    return run("from eslr_jax.cli import main; main()", *arguments)
+    return run("from eslr_jax.pipeline.cli import main; main()", *arguments)
 
 
 def test_every_public_name_loads_without_extras():

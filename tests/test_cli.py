@@ -14,12 +14,12 @@ from commands import eslr, eslr_here, refused
 from formats import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 
-from eslr_jax.assets import load_body, load_garment_file, load_motion
-from eslr_jax.body.rig import skeleton_motion
-from eslr_jax.cli.method import choose_method
-from eslr_jax.cli.options import Options
 from eslr_jax.config import from_dict
-from eslr_jax.io.garment import read_garment_npz
+from eslr_jax.pipeline.assets import load_body, load_garment_file, load_motion
+from eslr_jax.pipeline.cli.method import choose_method
+from eslr_jax.pipeline.cli.options import Options
+from eslr_jax.pipeline.formats.garment import read_garment_npz
+from eslr_jax.pipeline.rigs.rig import skeleton_motion
 
 
 @pytest.mark.slow
@@ -85,7 +85,8 @@ def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
 def test_waiting_counts_its_seconds_on_a_terminal():
     import pty
 
-    code = "import time; from eslr_jax.cli.console import waiting\nwith waiting('thinking'): time.sleep(1.5)"
+    code = "import time; from eslr_jax.pipeline.cli.console import waiting\n"
+    code += "with waiting('thinking'): time.sleep(1.5)"
     command = [sys.executable, "-c", code]
     assert not subprocess.run(command, check=True, stderr=subprocess.PIPE).stderr  # a file gets nothing
     ours, terminal = pty.openpty()
@@ -104,7 +105,7 @@ def test_a_page_is_opened_where_a_person_sits(tmp_path):
     browser, opened = tmp_path / "browser", tmp_path / "opened"
     browser.write_text(f'#!/bin/sh\necho "$1" > {opened}\n')
     browser.chmod(0o755)
-    code = "from eslr_jax.cli.console import open_browser; open_browser('http://localhost:9')"
+    code = "from eslr_jax.pipeline.cli.console import open_browser; open_browser('http://localhost:9')"
     command, settings = [sys.executable, "-c", code], os.environ | {"BROWSER": str(browser)}
     subprocess.run(command, env=settings, check=True, stdout=subprocess.PIPE)
     assert not opened.exists()  # nobody watches
@@ -122,7 +123,7 @@ def test_assets_lists_every_kind():
 
 
 def test_a_file_that_differs_from_its_checksum_is_told(monkeypatch):
-    from eslr_jax.assets import catalog
+    from eslr_jax.pipeline.assets import catalog
 
     lost = dataclasses.replace(catalog.list_assets()[0], file="lost.npz")
     monkeypatch.setattr(catalog, "list_assets", lambda: (lost,))
@@ -130,7 +131,7 @@ def test_a_file_that_differs_from_its_checksum_is_told(monkeypatch):
 
 
 def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
-    from eslr_jax.assets.catalog import find_asset
+    from eslr_jax.pipeline.assets.catalog import find_asset
 
     def shown(model):
         done = eslr_here("info", "--model", model, "--json")
@@ -287,7 +288,7 @@ def test_the_map_that_is_shown_is_the_one_that_is_used(tmp_path, body):
 def test_whoever_reads_the_output_may_leave():
     ours, end = os.pipe()
     os.close(ours)
-    command = [sys.executable, "-m", "eslr_jax.cli", "assets", "--json"]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", "assets", "--json"]
     result = subprocess.run(command, stdout=end, stderr=subprocess.PIPE, text=True, check=False)
     os.close(end)
     assert (result.returncode, result.stderr) == (141, "")

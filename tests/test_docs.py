@@ -65,7 +65,7 @@ def name(value):
 
 def help_text(*command):
     """Return what `eslr COMMAND --help` prints, in one line."""
-    from eslr_jax.cli import app
+    from eslr_jax.pipeline.cli import app
 
     stream = io.StringIO()
     with contextlib.redirect_stdout(stream), contextlib.suppress(SystemExit):
@@ -143,14 +143,26 @@ def workplace(tmp_path_factory, body):
 @pytest.mark.example
 @pytest.mark.parametrize(("page", "words"), RUN, ids=name)
 def test_documented_commands_run(workplace, page, words):
-    command = [sys.executable, "-m", "eslr_jax.cli", *shorter(words)[1:]]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *shorter(words)[1:]]
     result = subprocess.run(command, cwd=workplace, capture_output=True, text=True, timeout=900, check=False)
     assert result.returncode == 0, f"{page.name}: {' '.join(words)}\n{result.stderr}"
 
 
+ESLR = [sys.executable, "-m", "eslr_jax.pipeline.cli"]
+
+
 def simulate_missing(folder, runs):
     """Simulate the runs that a snippet reads, whatever was simulated before it."""
-    simulate = [sys.executable, "-m", "eslr_jax.cli", "simulate", "--frames", "3", "--no-pictures", "--out"]
+    simulate = [
+        sys.executable,
+        "-m",
+        "eslr_jax.pipeline.cli",
+        "simulate",
+        "--frames",
+        "3",
+        "--no-pictures",
+        "--out",
+    ]
     for run in runs:
         if not (folder / run).exists():
             subprocess.run([*simulate, run], cwd=folder, capture_output=True, timeout=900, check=True)
@@ -162,7 +174,7 @@ def simulate_missing(folder, runs):
 def test_documented_views_serve_a_page(workplace, page, words):
     pytest.importorskip("viser")
     simulate_missing(workplace, words[2:])
-    command = [sys.executable, "-m", "eslr_jax.cli", *words[1:]]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *words[1:]]
     with subprocess.Popen(command, cwd=workplace, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:

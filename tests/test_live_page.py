@@ -9,10 +9,10 @@ import trimesh
 from chromium import CHROMIUM, launch
 
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.run import read_run, run_trajectory
-from eslr_jax.physics.materials import fabric_material
-from eslr_jax.viewer.live import let_go, open_live, restart, run_live, take_hold
-from eslr_jax.viewer.live_controls import Choice
+from eslr_jax.fabric.materials import fabric_material
+from eslr_jax.pipeline.page.live import let_go, open_live, restart, run_live, take_hold
+from eslr_jax.pipeline.page.live_controls import Choice
+from eslr_jax.pipeline.report.run import read_run, run_trajectory
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
@@ -191,7 +191,7 @@ def test_a_recording_that_a_hand_pulled_at_is_not_scored(player):
 
 
 def test_a_minute_is_recorded_at_most(player, monkeypatch):
-    monkeypatch.setattr("eslr_jax.viewer.live.MOST_RECORDED", 4)
+    monkeypatch.setattr("eslr_jax.pipeline.page.live.MOST_RECORDED", 4)
     player.live.controls["record"].value = True
     player.until(lambda: not player.live.controls["record"].value)
     player.wait(1)

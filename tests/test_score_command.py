@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import eslr, refused
 
-from eslr_jax.body.lbs import skin_garment
+from eslr_jax.pose.lbs import skin_garment
 
 
 @pytest.fixture(scope="module")

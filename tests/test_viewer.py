@@ -8,13 +8,13 @@ import pytest
 from chromium import CHROMIUM, launch
 from example_runs import write_run
 
-from eslr_jax.assets import load_garment_file
 from eslr_jax.errors import AssetError
-from eslr_jax.evaluation.fields import FIELDS
-from eslr_jax.evaluation.run import read_run
-from eslr_jax.io.garment import write_garment_npz
+from eslr_jax.pipeline.assets import load_garment_file
+from eslr_jax.pipeline.formats.garment import write_garment_npz
+from eslr_jax.pipeline.page import go_to_worst, open_view, play, show
+from eslr_jax.pipeline.report.fields import FIELDS
+from eslr_jax.pipeline.report.run import read_run
 from eslr_jax.terms import Repulsion, scene_terms
-from eslr_jax.viewer import go_to_worst, open_view, play, show
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
@@ -185,7 +185,7 @@ def test_page_in_headless_chromium(view, tmp_path):
 
 
 def test_play_gives_a_frame_the_iterations_that_it_has_time_for():
-    from eslr_jax.viewer.live import next_iterations
+    from eslr_jax.pipeline.page.live import next_iterations
 
     def after_forty_frames(iterations, seconds):
         """Return the iterations of every frame, given the time that one takes with so many [s]."""

@@ -13,11 +13,11 @@ from jax.sharding import Mesh, PartitionSpec
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.geometry.padding import choose_bucket
-from eslr_jax.models.network import Network, check_network
-from eslr_jax.scene.build import Integrator
-from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.mesh.padding import choose_bucket
+from eslr_jax.networks.network import Network, check_network
+from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.scene import Integrator
 from eslr_jax.simulation.simulate import check_scene, enlarge_buffers, hold_last, simulate
 from eslr_jax.terms import Term
 from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.models.network import Network, check_network
-from eslr_jax.physics.solve import SOLUTION
-from eslr_jax.scene.build import Integrator, build_scene, worn_material
+from eslr_jax.networks.network import Network, check_network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, part_of_frame
+from eslr_jax.simulation.scene import Integrator, build_scene, worn_material
 from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper, past_state
+from eslr_jax.solver.solve import SOLUTION
 from eslr_jax.terms import Ground, Repulsion, Term, scene_terms
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
 

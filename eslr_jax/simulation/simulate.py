@@ -13,12 +13,12 @@ from jaxtyping import Array, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
-from eslr_jax.models.network import Network, check_network
-from eslr_jax.physics.validate import validate_material, validate_timestep
-from eslr_jax.scene.build import initial_state, slice_tracks
+from eslr_jax.fabric.validate import validate_material, validate_timestep
+from eslr_jax.networks.network import Network, check_network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import begin_program, find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
+from eslr_jax.simulation.scene import initial_state, slice_tracks
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, Scene, Trajectory
 

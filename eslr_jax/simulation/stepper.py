@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.models.network import Network, Prediction
+from eslr_jax.networks.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
-from eslr_jax.physics.guess import initial_guess, separate
-from eslr_jax.physics.lbfgs import Minimum
-from eslr_jax.physics.potential import Point, contact_load, evaluate, potential_terms
-from eslr_jax.physics.solve import Start, lower_point, solve
+from eslr_jax.solver.guess import initial_guess, separate
+from eslr_jax.solver.lbfgs import Minimum
+from eslr_jax.solver.potential import Point, contact_load, evaluate, potential_terms
+from eslr_jax.solver.solve import Start, lower_point, solve
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 

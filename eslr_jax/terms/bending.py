@@ -4,7 +4,7 @@ A material gives its bending in one of two ways. `bending_stiffness` k [J] is HO
 its own, and the flexural rigidity D [N m] of a sheet depends on its mesh. D is k / 4 for equilateral triangles,
 and for a grid that is bent across its rows; for a grid that is bent across its diagonals it is up to 3 k / 4.
 Measured on a cantilever, D is .82 times k / 4 for a grid, and .88 to 1.09 times k / 4 for irregular triangles
-of 20 to 5 mm. A `plate` has the same, given flexural rigidity on any mesh, see `geometry.plate`.
+of 20 to 5 mm. A `plate` has the same, given flexural rigidity on any mesh, see `mesh.plate`.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from eslr_jax.terms.repulsion import push_apart, repulsion_diagonal, repulsion_e
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term, sum_elements
 from eslr_jax.terms.worn import Worn
-from eslr_jax.types import Contacts, Garment, SceneBody
+from eslr_jax.types import Contacts, Garment, Obstacle
 
 
 class BodyContact(NamedTuple):
@@ -61,7 +61,7 @@ class Collision(Term):
         return self if worn.surface is not None else None
 
     def start(
-        self, position: Float[Array, "vertices 3"], garment: Garment, body: SceneBody | None
+        self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None
     ) -> Float[Array, "vertices 3"]:
         """Return positions [m] pushed out of the body and, if that is modelled, lifted off the skin."""
         if body is None:

@@ -20,7 +20,7 @@ from eslr_jax.terms.problem import STIFFNESS_RANGE, THICKNESS_RANGE, FrameProble
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Term
 from eslr_jax.terms.worn import Worn
-from eslr_jax.types import Contacts, Garment, SceneBody
+from eslr_jax.types import Contacts, Garment, Obstacle
 
 
 class GroundContact(NamedTuple):
@@ -70,7 +70,7 @@ class Ground(Term):
         return self.replace(height=np.float32(worn.lowest_point if self.height is None else self.height))
 
     def start(
-        self, position: Float[Array, "vertices 3"], garment: Garment, body: SceneBody | None
+        self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None
     ) -> Float[Array, "vertices 3"]:
         """Return positions [m] lifted off the ground."""
         height = jnp.asarray(self.height, position.dtype)

@@ -17,7 +17,7 @@ from eslr_jax.ranges import Range, check_number
 if TYPE_CHECKING:
     from eslr_jax.terms.problem import FrameProblem
     from eslr_jax.terms.worn import Worn
-    from eslr_jax.types import Contacts, Garment, SceneBody
+    from eslr_jax.types import Contacts, Garment, Obstacle
 
 
 class Elements(NamedTuple):
@@ -71,7 +71,7 @@ class Term:
         return planned[0]
 
     def start(
-        self, position: Float[Array, "vertices 3"], garment: Garment, body: SceneBody | None
+        self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None
     ) -> Float[Array, "vertices 3"]:
         """Return the positions of frame 0 [m], moved out of what the term forbids."""
         return position

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.body.lbs import skin_garment
-from eslr_jax.body.motion import SHOULDERS
 from eslr_jax.contact.self_contact import SEARCH_RADIUS
-from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.geometry.topology import vertex_components
+from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.mesh.topology import vertex_components
+from eslr_jax.pose.lbs import skin_garment
+from eslr_jax.pose.motion import SHOULDERS
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment
 
 # [m] that cloth may be away from its skinned place, besides its distance from the body at rest. Body faces that

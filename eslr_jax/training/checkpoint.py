@@ -16,8 +16,8 @@ from jax.experimental.multihost_utils import sync_global_devices
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError
-from eslr_jax.io.atomic import atomic_write
-from eslr_jax.io.parsing import one_line
+from eslr_jax.files.atomic import atomic_write
+from eslr_jax.files.parsing import one_line
 from eslr_jax.training.recipe import describe_train_config, read_train_config
 from eslr_jax.training.step import TrainState
 

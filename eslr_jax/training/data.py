@@ -8,17 +8,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
-from eslr_jax.body import lbs
-from eslr_jax.body.motion import Motion, joint_transforms
-from eslr_jax.body.retarget import abduct_arms, resample
-from eslr_jax.config import TrainConfig
 from eslr_jax.errors import ConfigError
-from eslr_jax.geometry.closest import closest_points
-from eslr_jax.geometry.prepare import pad_alike
-from eslr_jax.geometry.skinning import smooth
+from eslr_jax.mesh.closest import closest_points
+from eslr_jax.mesh.skinning import smooth
 from eslr_jax.numerics import product, vertex_normals
-from eslr_jax.scene.plan import shared_surface
+from eslr_jax.pose import lbs
+from eslr_jax.pose.motion import Motion, joint_transforms
+from eslr_jax.pose.retarget import abduct_arms, resample
+from eslr_jax.simulation.plan import shared_surface
 from eslr_jax.types import Body, BodySurface, Garment
 
 FPS = 30.0  # frames per second of training
@@ -108,19 +105,6 @@ class TrainingData:
         if self.shapes is not None and shape is not None:
             rest = rest + product(self.shapes.garments[index], shape)
         return lbs.skin(rest, garment.skin_weights, garment.skin_indices, transforms)
-
-
-def load_training_data(config: TrainConfig, vertices: str) -> TrainingData:
-    """Load the garments at one resolution and the clips of a training run.
-
-    Raises:
-        ConfigError: The split is unknown or empty.
-        AssetError: A garment does not exist.
-    """
-    options = getattr(config.model, "garment_options", {})
-    unpadded = [load_garment(name, vertices=vertices, **options) for name in config.garments]  # type: ignore[arg-type]
-    motions = [load_motion(clip) for clip in split_clips(config.split)]
-    return build_training_data(pad_alike(unpadded), load_body(), motions, has_shapes=config.shape_range > 0)
 
 
 def build_training_data(

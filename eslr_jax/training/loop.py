@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from eslr_jax.assets.weights import write_network
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, CheckpointError, ConfigError, NonFiniteError
-from eslr_jax.io.atomic import atomic_write, ensure_output_dir
-from eslr_jax.models.network import Network
+from eslr_jax.files.atomic import atomic_write, ensure_output_dir
+from eslr_jax.networks.network import Network
+from eslr_jax.networks.weights import write_network
 from eslr_jax.simulation.interrupt import Interruption
 from eslr_jax.training.checkpoint import (
     Checkpoints,
@@ -28,7 +28,7 @@ from eslr_jax.training.checkpoint import (
     read_run_config,
     write_run_config,
 )
-from eslr_jax.training.data import TrainingData, load_training_data
+from eslr_jax.training.data import TrainingData
 from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
@@ -44,7 +44,7 @@ def train(
     resume: bool = False,
     initial: Network | None = None,
     earlier: Mapping[str, Any] | None = None,
-    datasets: tuple[TrainingData, ...] | None = None,
+    datasets: tuple[TrainingData, ...],
     on_progress: Progress = lambda done, total, metrics: None,
 ) -> TrainState:
     """Train a network, or go on with a run.
@@ -54,12 +54,13 @@ def train(
 
     Args:
         config: The run. A run that is resumed may have more `steps` than before.
+        datasets: What to train on, one per resolution: of `build_training_data`, or the bundled garments and
+            clips that `config` names, of `pipeline.assets.training.load_training_data`.
         out: Folder of metrics, checkpoints and, at the end, the exported model.
         resume: Go on from the newest checkpoint of `out`.
         initial: Network whose weights to start from instead of random ones.
         earlier: Training record of that network, whose steps and core-hours the exported one counts too. A run
             that is resumed knows it.
-        datasets: What to train on, one per resolution; the bundled garments and clips of `config` by default.
         on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
 
     Returns:
@@ -77,7 +78,6 @@ def train(
     _check_run(config, out, resume)
     if initial is not None:
         config.model.check(initial)
-    datasets = datasets or tuple(load_training_data(config, vertices) for vertices in config.vertices)
     state = _first_state(config, datasets, initial)
     datasets, state = tuple(replicate(data, mesh) for data in datasets), replicate(state, mesh)
     checkpoints = Checkpoints(ensure_output_dir(out))

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from eslr_jax.config import TrainConfig
-from eslr_jax.io.atomic import atomic_write
+from eslr_jax.files.atomic import atomic_write
 
 _TERMS = ("stretch", "bending", "inertia", "collision", "friction")
 

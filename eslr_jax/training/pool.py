@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.contact.nearest import clear_of_body
-from eslr_jax.graph.features import BENDING_RANGE, DENSITY_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.features import BENDING_RANGE, DENSITY_RANGE, LAME_LAMBDA_RANGE, LAME_MU_RANGE
+from eslr_jax.simulation.scene import initial_state
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.types import ClothState, Material
 

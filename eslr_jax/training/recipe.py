@@ -10,8 +10,8 @@ from typing import Any
 
 from eslr_jax.config import TrainConfig, apply_overrides, from_dict
 from eslr_jax.errors import ConfigError
-from eslr_jax.models.network import describe_system
-from eslr_jax.models.registry import read_system
+from eslr_jax.networks.network import describe_system
+from eslr_jax.networks.registry import read_system
 
 
 def load_recipe(path: str | Path, overrides: dict[str, Any] | None = None) -> TrainConfig:

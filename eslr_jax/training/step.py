@@ -16,14 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import Criterion, TrainConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.graph.build import build_graph
-from eslr_jax.graph.normalizer import is_warming_up
-from eslr_jax.models.apply import measure_statistics, merge_statistics
-from eslr_jax.models.network import Network
-from eslr_jax.models.refine import graph_inputs
-from eslr_jax.physics.potential import potential_terms
+from eslr_jax.networks.apply import measure_statistics, merge_statistics
+from eslr_jax.networks.build import build_graph
+from eslr_jax.networks.network import Network
+from eslr_jax.networks.normalizer import is_warming_up
+from eslr_jax.networks.refine import graph_inputs
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
+from eslr_jax.solver.potential import potential_terms
 from eslr_jax.terms import Collision, Ground, Repulsion, scene_terms
 from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
@@ -38,7 +38,7 @@ from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.training.data import FPS, TrainingData
 from eslr_jax.training.loss import EnergyTerms, LossReport, physics_loss
 from eslr_jax.training.pool import Slot, empty_pool, start_trajectory
-from eslr_jax.types import ClothState, Normalizer, Scene, SceneBody
+from eslr_jax.types import ClothState, Normalizer, Obstacle, Scene
 
 _HOOD_HALVING, _HOOD_LEAST = 50_000, 0.01  # optimiser steps; share of the rate that stays (HOOD)
 BATCH = "batch"  # axis of the device mesh
@@ -301,7 +301,7 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
     frames = (slot.frame, data.next_frame(slot.frame, slot.before))
     transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
-    searched = SceneBody(data.surface, body.start[None, :0])
+    searched = Obstacle(data.surface, body.start[None, :0])
     left_out = (Ground,) if config.self_contact else (Ground, Repulsion)
     scene = Scene(
         garment=garment,

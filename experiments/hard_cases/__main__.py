@@ -63,8 +63,8 @@ def find_simulator(arguments: argparse.Namespace):
     Raises:
         EslrError: It is not installed, or the network is unknown.
     """
-    from eslr_jax.assets import load_model
     from eslr_jax.errors import ConfigError
+    from eslr_jax.pipeline.assets import load_model
     from hard_cases import network_simulator, solver_simulator
 
     name = arguments.simulator
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> None:
     Raises:
         EslrError: Something is not installed, or a name is unknown.
     """
-    from eslr_jax.extras import require
+    from eslr_jax.pipeline.extras import require
 
     require("ipctk", extra="dev", purpose="the referee of the hard cases")
     if arguments.sheet:
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     import harness
 
-    from eslr_jax.render import write_png
+    from eslr_jax.pipeline.pictures import write_png
     from hard_cases import CASES, find_case, run_case
     from hard_cases.report import draw_sheet, merge_summaries, summarize
 

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from eslr_jax.evaluation.gap import trajectory_states
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.pipeline.report.gap import trajectory_states
 from eslr_jax.types import Material
 from hard_cases.build import FRAME, icosphere, make_cloth, make_scene, sheet
 from hard_cases.case import CaseScene, HardCase, Measure, Runs, Scenes

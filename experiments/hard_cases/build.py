@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
 from eslr_jax.contact.self_contact import starting_rows
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.geometry.topology import face_cross_products
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.mesh.topology import face_cross_products
+from eslr_jax.simulation.scene import initial_state
 from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Repulsion, Stretch, Term
-from eslr_jax.types import Garment, Material, Scene, SceneBody
+from eslr_jax.types import Garment, Material, Obstacle, Scene
 
 FRAME = 1.0 / 30.0  # [s]
 Mesh = tuple[np.ndarray, np.ndarray]  # positions [vertices, 3] in metres, faces [faces, 3]
@@ -210,7 +210,7 @@ def make_scene(
     if body is not None:
         terms += [Collision(has_tips=has_tips), Friction(friction)]
         track = body[0][None] if body_positions is None else body_positions
-        obstacle = SceneBody(
+        obstacle = Obstacle(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
         )

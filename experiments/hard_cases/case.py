@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError, Status
-from eslr_jax.scene.build import Integrator, start_integrator
+from eslr_jax.simulation.scene import Integrator, start_integrator
 from eslr_jax.terms import Collision
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.colliders import Collider

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.geometry.topology import face_cross_products
+from eslr_jax.mesh.topology import face_cross_products
 from eslr_jax.terms import Gravity
 from eslr_jax.types import Garment
 from hard_cases.build import FRAME, corners_of, hanging_sheet, make_cloth, make_scene, sheet, turn_about_x

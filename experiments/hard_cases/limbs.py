@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax import load_body, load_garment, pose_body, prepare_garment, prepare_scene
-from eslr_jax.body.motion import still_motion
-from eslr_jax.body.retarget import ARM_ABDUCTION
-from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.scene.plan import first_frames
+from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.pose.motion import still_motion
+from eslr_jax.pose.retarget import ARM_ABDUCTION
+from eslr_jax.simulation.plan import first_frames
 from eslr_jax.types import Garment, Scene
 from hard_cases.build import (
     FRAME,

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from eslr_jax.evaluation.report import environment
-from eslr_jax.io.palette import GARMENT_COLORS, SKIN_COLOR
-from eslr_jax.render import render_frame, side_by_side
+from eslr_jax.pipeline.formats.palette import GARMENT_COLORS, SKIN_COLOR
+from eslr_jax.pipeline.pictures import render_frame, side_by_side
+from eslr_jax.pipeline.report.report import environment
 from hard_cases import CASES
 from hard_cases.case import Outcome, Run
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eslr_jax import Network, SimConfig, Trajectory, simulate
-from eslr_jax.scene.build import Integrator
+from eslr_jax.simulation.scene import Integrator
 from eslr_jax.types import Scene
 from hard_cases.case import Simulator
 

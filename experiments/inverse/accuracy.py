@@ -21,12 +21,12 @@ import numpy as np
 from harness import keep, machine, parser
 
 from eslr_jax import SimConfig, Trajectory, load_body, load_garment, load_motion, pose_body
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.solve import Start, solve
-from eslr_jax.scene.build import build_scene
+from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.scene import build_scene
 from eslr_jax.simulation.stepper import next_state
+from eslr_jax.solver.solve import Start, solve
 from eslr_jax.terms import CLOTH, Collision, Friction
 from eslr_jax.types import Scene, tree_cast
 from inverse.sheet import RESULTS

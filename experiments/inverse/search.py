@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from scipy.optimize import minimize
 
-from eslr_jax.evaluation.scene_parts import time_in_turns
+from eslr_jax.pipeline.report.scene_parts import time_in_turns
 
 _STEP = 0.5  # bound of a parameter's change in a step: the loss is no parabola far from its minimum
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from hard_cases.build import make_cloth, same_way_faces
 
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.simulation.scene import initial_state
 from eslr_jax.terms import CLOTH
 from eslr_jax.types import Garment, Material, Scene
 

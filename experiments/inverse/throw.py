@@ -15,7 +15,7 @@ import numpy as np
 from harness import keep, parser
 
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.report import environment
+from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.rollout import rollout_scene
 from inverse.search import descend, gradient_cost, search_simplex
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square

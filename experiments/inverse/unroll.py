@@ -21,11 +21,11 @@ import optax
 from harness import keep, parser
 
 from eslr_jax.config import SimConfig
-from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.evaluation.report import environment
-from eslr_jax.models.network import Network
-from eslr_jax.models.registry import MODELS
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.network import Network
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.report.gap import trajectory_gap
+from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.stepper import make_stepper

@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
     arguments = parser.parse_args()
 
-    from eslr_jax.evaluation.report import environment
+    from eslr_jax.pipeline.report.report import environment
 
     path = arguments.out / "known_answers.json"
     result = harness.kept(path)

@@ -6,8 +6,8 @@ import numpy as np
 from hard_cases.build import make_cloth, make_scene, same_way_faces
 
 from eslr_jax import SimConfig
-from eslr_jax.scene.build import start_integrator
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.scene import start_integrator
 
 LENGTH = 0.5  # [m]
 

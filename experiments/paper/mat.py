@@ -30,8 +30,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_contacts
-from eslr_jax.models.attention import linear_attention, orthogonal_projection, relu_features
-from eslr_jax.models.network import System
+from eslr_jax.networks.attention import linear_attention, orthogonal_projection, relu_features
+from eslr_jax.networks.network import System
 from eslr_jax.terms import Collision
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, Contacts, Scene

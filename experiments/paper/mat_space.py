@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from eslr_jax.geometry.geodesic import geodesic_distances, geodesic_graph
+from eslr_jax.mesh.geodesic import geodesic_distances, geodesic_graph
 from eslr_jax.numerics import safe_normalize
 from eslr_jax.terms.collision import penetration
 from eslr_jax.types import Contacts, Garment

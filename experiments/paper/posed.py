@@ -32,14 +32,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.assets import load_body, load_garment, load_motion, split_clips
-from eslr_jax.body import lbs
 from eslr_jax.config import TrainConfig
-from eslr_jax.graph.features import DENSITY_SCALE, material_inputs
-from eslr_jax.models.network import System
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.potential import potential_terms
-from eslr_jax.scene.build import initial_state
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.features import DENSITY_SCALE, material_inputs
+from eslr_jax.networks.network import System
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, split_clips
+from eslr_jax.pose import lbs
+from eslr_jax.simulation.scene import initial_state
+from eslr_jax.solver.potential import potential_terms
 from eslr_jax.training.data import TrainingData, build_training_data
 from eslr_jax.training.pool import FPS, Slot, sample_material
 from eslr_jax.training.step import slot_problem

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from eslr_jax.assets import load_body, load_splits
-from eslr_jax.evaluation.report import environment
-from eslr_jax.render import color_scale, render_frame, side_by_side, write_png
+from eslr_jax.pipeline.assets import load_body, load_splits
+from eslr_jax.pipeline.pictures import color_scale, render_frame, side_by_side, write_png
+from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.types import Scene

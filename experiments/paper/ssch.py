@@ -25,9 +25,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.assets import load_body, load_garment
-from eslr_jax.body import lbs
 from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.pipeline.assets import load_body, load_garment
+from eslr_jax.pose import lbs
 from eslr_jax.terms.collision import penetration
 from eslr_jax.types import BodySurface, Garment
 from paper.posed import carried_joints, carry, pose_features

@@ -31,12 +31,12 @@ import jax
 import numpy as np
 
 from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene
-from eslr_jax.assets import load_splits
-from eslr_jax.assets.models import DEFAULT_MODEL, START_MODEL
-from eslr_jax.evaluation.report import environment
-from eslr_jax.evaluation.scene_parts import take_turns
-from eslr_jax.models.hood import STAGES, Hood
-from eslr_jax.models.registry import MODELS
+from eslr_jax.networks.hood import STAGES, Hood
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.pipeline.assets.models import DEFAULT_MODEL, START_MODEL
+from eslr_jax.pipeline.report.report import environment
+from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
 from paper.rollouts import (

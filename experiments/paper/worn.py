@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eslr_jax.assets import load_body, load_garment, load_motion
-from eslr_jax.body.motion import back_and_forth, pose_body
 from eslr_jax.errors import NonFiniteError, Status
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import prepare_scenes
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
+from eslr_jax.pose.motion import back_and_forth, pose_body
+from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.03 % of the initial gap

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from eslr_jax import load_body, load_garment, load_model, load_motion, pose_body
-from eslr_jax.assets import asset_names, load_garment_file, load_splits
-from eslr_jax.assets.catalog import is_intact, list_assets
-from eslr_jax.assets.garments import check_resolution
-from eslr_jax.assets.weights import write_network
-from eslr_jax.body.motion import Motion, still_motion
-from eslr_jax.cli.actor import is_moving_mesh, load_wearer
 from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError
-from eslr_jax.models.registry import MODELS
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.networks.weights import write_network
+from eslr_jax.pipeline.assets import asset_names, load_garment_file, load_splits
+from eslr_jax.pipeline.assets.catalog import is_intact, list_assets
+from eslr_jax.pipeline.assets.garments import check_resolution
+from eslr_jax.pipeline.cli.actor import is_moving_mesh, load_wearer
+from eslr_jax.pose.motion import Motion, still_motion
 
 
 def test_every_file_is_intact_and_licensed():

@@ -12,10 +12,10 @@ import pytest
 from flax import struct
 from garment_files import bundled, scanned_tshirt
 
-from eslr_jax.assets import cache, garments, load_garment, load_garment_file
-from eslr_jax.assets.cache import cache_folder, cached_arrays, cached_struct, content_key
-from eslr_jax.fit.options import FitOptions
-from eslr_jax.io.garment import write_garment_npz
+from eslr_jax.pipeline.assets import cache, garments, load_garment, load_garment_file
+from eslr_jax.pipeline.assets.cache import cache_folder, cached_arrays, cached_struct, content_key
+from eslr_jax.pipeline.dressing.options import FitOptions
+from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.types import Garment
 
 
@@ -127,7 +127,7 @@ def test_keys_tell_contents_apart():
 @pytest.mark.slow
 def test_two_processes_may_make_the_same_entry(empty_cache):
     code = (
-        "import numpy as np; from eslr_jax.assets.cache import cached_arrays\n"
+        "import numpy as np; from eslr_jax.pipeline.assets.cache import cached_arrays\n"
         "for k in range(40):\n"
         "    a = cached_arrays(f'{k:064d}', lambda: {'a': np.full((200, 200), k, float)})['a']\n"
         "    assert a.shape == (200, 200) and (a == k).all()"
@@ -165,7 +165,7 @@ def test_4k_garment_is_quick(empty_cache, tmp_path, body):
 
 def test_all_that_computes_an_entry_is_part_of_its_name():
     """Whatever geometry and fit import makes their results; errors and options make none."""
-    package = Path(cache.__file__).parents[1]
+    package = Path(cache.__file__).parents[2]
     listed = {file for name in cache._CODE for file in (package / name).glob("*.py")} | {
         package / name for name in cache._CODE if name.endswith(".py")
     }

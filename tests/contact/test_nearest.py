@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from eslr_jax.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import (
     CONTACT_RADIUS,
@@ -14,9 +12,11 @@ from eslr_jax.contact.nearest import (
     find_contacts,
     nearest_point,
 )
-from eslr_jax.geometry.closest import closest_points
-from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.mesh.closest import closest_points
+from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, load_splits
+from eslr_jax.pose.motion import pose_body
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene
 
 find = jax.jit(find_contacts)

@@ -8,7 +8,7 @@ from hard_cases.build import capsule, icosphere, join_meshes, make_cloth, make_s
 
 from eslr_jax.config import SimConfig
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides
-from eslr_jax.geometry.surface import prepare_surface
+from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.simulation.rollout import rollout_scene
 
 SPEED = 13.0  # [m/s], 43 cm in a frame

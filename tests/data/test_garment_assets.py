@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial import KDTree
 
 from eslr_jax import load_body
-from eslr_jax.assets import data_folder, load_garment_file
-from eslr_jax.fit.clearance import body_heights
-from eslr_jax.fit.postures import rest_posture
-from eslr_jax.geometry.topology import boundary_loops, unique_edges
-from eslr_jax.geometry.validate import validate_mesh
+from eslr_jax.mesh.topology import boundary_loops, unique_edges
+from eslr_jax.mesh.validate import validate_mesh
+from eslr_jax.pipeline.assets import data_folder, load_garment_file
+from eslr_jax.pipeline.dressing.clearance import body_heights
+from eslr_jax.pipeline.dressing.postures import rest_posture
 
 NUM_LOOPS = {
     "tshirt": 4, "tank": 4, "longsleeve": 4, "shorts": 3, "pants": 3,

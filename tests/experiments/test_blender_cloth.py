@@ -9,7 +9,7 @@ from hard_cases.build import hanging_sheet, make_cloth, make_scene, sheet
 from newton_cloth import prepare_cloth, strip_stiffness
 
 from eslr_jax.errors import EslrError
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.fabric.materials import COTTON
 
 EFFORT = (10, 2)
 needs_blender = pytest.mark.skipif(blender_python() is None, reason="BLENDER_PYTHON names no Python with bpy")

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from paper.hood_metrics import hood_metrics
 
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.geometry.surface import prepare_surface
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.build import initial_state
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.simulation.scene import initial_state
 from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms
 from eslr_jax.terms.problem import vertex_masses
-from eslr_jax.types import Scene, SceneBody
+from eslr_jax.types import Obstacle, Scene
 
 TIMESTEP = 1 / 30
 FRAMES = 4
@@ -48,7 +48,7 @@ def worn():
         material=COTTON,
         timestep=jnp.float32(TIMESTEP),
         initial_state=initial_state(positions[0], jnp.zeros_like(positions[0])),
-        body=SceneBody(surface, body),
+        body=Obstacle(surface, body),
         pin_targets=None,
         terms=(),
         num_frames=FRAMES,

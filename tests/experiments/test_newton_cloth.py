@@ -20,7 +20,7 @@ from newton_cloth import (
 )
 
 from eslr_jax.config import SimConfig
-from eslr_jax.physics.materials import COTTON
+from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import Collision
 from eslr_jax.terms.bending import bending_energy

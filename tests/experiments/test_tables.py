@@ -24,8 +24,8 @@ from paper.tables import (
     with_totals,
 )
 
-from eslr_jax.assets.catalog import asset_names
 from eslr_jax.errors import NonFiniteError, Status
+from eslr_jax.pipeline.assets.catalog import asset_names
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")
 ROW = {"stretch": 0.1, "gap_share": 0.1}

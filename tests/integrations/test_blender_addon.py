@@ -17,10 +17,10 @@ import pytest
 from formats import write_walker
 from scipy.spatial import cKDTree
 
-from eslr_jax.geometry.closest import closest_points
-from eslr_jax.geometry.topology import vertex_normals
-from eslr_jax.io.gltf_rig import read_gltf_body
-from eslr_jax.io.mesh import read_mesh_file
+from eslr_jax.mesh.closest import closest_points
+from eslr_jax.mesh.topology import vertex_normals
+from eslr_jax.pipeline.formats.gltf_rig import read_gltf_body
+from eslr_jax.pipeline.formats.mesh import read_mesh_file
 
 ROOT = Path(__file__).parents[2]
 ADDON = ROOT / "integrations" / "blender"

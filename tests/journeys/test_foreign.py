@@ -11,10 +11,10 @@ from formats import smpl_parameters, write_amass, write_hood
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
 from PIL import Image
 
-from eslr_jax.assets import load_motion
-from eslr_jax.body.rig import skeleton_motion
-from eslr_jax.evaluation.fields import run_field
-from eslr_jax.evaluation.run import read_run
+from eslr_jax.pipeline.assets import load_motion
+from eslr_jax.pipeline.report.fields import run_field
+from eslr_jax.pipeline.report.run import read_run
+from eslr_jax.pipeline.rigs.rig import skeleton_motion
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 

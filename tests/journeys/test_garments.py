@@ -8,10 +8,10 @@ import trimesh
 from garment_files import TO_Z_UP, bundled, scanned_tshirt
 from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress, write_obj
 
-from eslr_jax.assets import load_garment, load_garment_file
-from eslr_jax.fit.options import FitOptions
-from eslr_jax.geometry.repair import largest_component
-from eslr_jax.geometry.topology import boundary_loops
+from eslr_jax.mesh.topology import boundary_loops
+from eslr_jax.pipeline.assets import load_garment, load_garment_file
+from eslr_jax.pipeline.dressing.options import FitOptions
+from eslr_jax.pipeline.dressing.repair import largest_component
 
 GIVEN = ("--keep-place", "--units", "m", "--up", "y", "--front", "z", "--arms", "rest")
 

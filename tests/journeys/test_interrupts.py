@@ -28,7 +28,7 @@ latent_size = 16
 
 
 def start(*words):
-    command = [sys.executable, "-m", "eslr_jax.cli", *map(str, words)]
+    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *map(str, words)]
     # A shell without job control starts its background commands, such as this suite, deaf to Ctrl-C.
     hear = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -84,8 +84,8 @@ def test_a_simulation_interrupted_again_and_again_ends_as_the_whole_one(tmp_path
 
 STOPPED_WHILE_IT_IS_MEASURED = """
 import os, signal, sys
-from eslr_jax.cli import main
-from eslr_jax.evaluation import report
+from eslr_jax.pipeline.cli import main
+from eslr_jax.pipeline.report import report
 
 measure = report.environment
 def stop():

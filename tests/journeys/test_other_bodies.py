@@ -6,7 +6,7 @@
 import pytest
 from other_bodies import BODIES, measure
 
-from eslr_jax.body.rig import make_body
+from eslr_jax.pipeline.rigs.rig import make_body
 
 
 @pytest.mark.parametrize(("name", "garment"), [("figure", "longsleeve"), ("smpl_female", "pants")])

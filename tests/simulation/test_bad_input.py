@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from draped_ball import ball, square
 
-from eslr_jax.assets import load_body
 from eslr_jax.config import SimConfig, from_dict
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.geometry.validate import validate_body
+from eslr_jax.mesh.validate import validate_body
+from eslr_jax.pipeline.assets import load_body
 
 
 def test_pins_are_a_mask_or_indices_of_vertices_that_exist():
@@ -39,7 +39,7 @@ def test_an_open_body_is_refused():
 
 
 def test_an_open_body_file_is_refused(tmp_path):
-    from eslr_jax.assets.catalog import find_asset
+    from eslr_jax.pipeline.assets.catalog import find_asset
 
     arrays = dict(np.load(find_asset("body", "anny")))
     first = int(np.argmax(arrays["obstacle_faces"]))

@@ -12,19 +12,19 @@ import pytest
 from draped_ball import drifting_ball, square
 from flax import struct
 
-from eslr_jax.assets import load_motion
-from eslr_jax.body.motion import pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.geometry.prepare import prepare_garment
-from eslr_jax.models.registry import MODELS
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.physics.rest_shape import with_rest_positions
-from eslr_jax.physics.solve import Start, solve, solve_hessian
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.assets import load_motion
+from eslr_jax.pose.motion import pose_body
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout, rollout_scene
 from eslr_jax.simulation.simulate import raise_for_status
+from eslr_jax.solver.solve import Start, solve, solve_hessian
 from eslr_jax.terms import (
     CLOTH,
     Air,
@@ -293,7 +293,7 @@ def test_the_linear_system_reports_what_it_did():
 
 
 def test_a_gradient_is_refused_where_the_linear_system_stalls(monkeypatch):
-    monkeypatch.setattr("eslr_jax.physics.solve._LINEAR_STOP", {"float64": (1e-12, 2)})
+    monkeypatch.setattr("eslr_jax.solver.solve._LINEAR_STOP", {"float64": (1e-12, 2)})
     options = {"terms": CLOTH, "starts_at_rest": True}
     sheet = square(3, 0.24, is_pinned=np.array([0, 2]))
     scene = wide(prepare_scene(sheet, drifting_ball(2), **options))

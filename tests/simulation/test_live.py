@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.body.motion import there_and_back
-from eslr_jax.physics.materials import COTTON, fabric_material
-from eslr_jax.simulation.live import advance, changed, grasp, nearest_vertex, no_hand, set_stage
+from eslr_jax.fabric.materials import COTTON, fabric_material
+from eslr_jax.pipeline.page.stage import advance, changed, grasp, nearest_vertex, no_hand, set_stage
+from eslr_jax.pose.motion import there_and_back
 from eslr_jax.simulation.program import _compile
 
 STILL = (0.0, 0.0, 0.0)

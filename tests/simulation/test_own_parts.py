@@ -10,10 +10,10 @@ from flax import struct
 
 from eslr_jax import Network, SimConfig, plan_scene, prepare_scene, rollout, simulate
 from eslr_jax.errors import NonFiniteError
-from eslr_jax.evaluation.report import trajectory_report
-from eslr_jax.models.network import System
-from eslr_jax.physics.guess import initial_guess
+from eslr_jax.networks.network import System
+from eslr_jax.pipeline.report.report import trajectory_report
 from eslr_jax.simulation.frame import first_problem
+from eslr_jax.solver.guess import initial_guess
 from eslr_jax.terms import CLOTH, Term
 
 DENSITY = 0.20022  # [kg/m2] of cotton

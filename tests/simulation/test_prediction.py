@@ -8,12 +8,12 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import Status
-from eslr_jax.models.registry import MODELS
-from eslr_jax.physics.guess import initial_guess
-from eslr_jax.physics.potential import potential
-from eslr_jax.scene.plan import prepare_scene
+from eslr_jax.networks.registry import MODELS
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.potential import potential
 from eslr_jax.terms import CLOTH
 
 CONFIG = MODELS["smooth-small"]

@@ -11,10 +11,10 @@ from draped_ball import TIMESTEP, drifting_ball, square
 
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
-from eslr_jax.evaluation.gap import trajectory_gap
-from eslr_jax.models.registry import MODELS
-from eslr_jax.physics.materials import COTTON
-from eslr_jax.scene.plan import plan_scene, prepare_scene
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.report.gap import trajectory_gap
+from eslr_jax.simulation.plan import plan_scene, prepare_scene
 from eslr_jax.simulation.rollout import rollout, rollout_scene, step
 from eslr_jax.simulation.simulate import raise_for_status, simulate
 from eslr_jax.simulation.stepper import keeps_tolerance
@@ -133,8 +133,8 @@ def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
 
 @pytest.mark.slow
 def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved):
-    from eslr_jax.evaluation.foreign import find_friction_loads
-    from eslr_jax.evaluation.gap import reached_potentials, trajectory_states
+    from eslr_jax.pipeline.report.foreign import find_friction_loads
+    from eslr_jax.pipeline.report.gap import reached_potentials, trajectory_states
 
     scene = prepare_scene(cloth, poses).replace(pin_targets=None)
     trajectory = rollout_scene(None, scene, SOLVER)

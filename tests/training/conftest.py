@@ -29,7 +29,7 @@ def cheap_model():
     """One layer of eight channels."""
     import dataclasses
 
-    from eslr_jax.models.registry import MODELS
+    from eslr_jax.networks.registry import MODELS
 
     return dataclasses.replace(MODELS["mgn-small"], refinement_steps=1, latent_size=8)
 

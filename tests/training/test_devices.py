@@ -24,7 +24,7 @@ latent_size = 16
 def start(out, config, devices, *options):
     arguments = ["train", "--out", str(out), "--config", str(config), *options]
     flags = f"import os; os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count={devices}'; "
-    code = flags + "from eslr_jax.cli import main; main()"
+    code = flags + "from eslr_jax.pipeline.cli import main; main()"
     with (out.parent / f"{out.name}.log").open("ab") as log:
         return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=log, stderr=log)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
-from eslr_jax.assets.models import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CapacityError, NonFiniteError, Status
-from eslr_jax.graph.normalizer import WARMUP_UPDATES
-from eslr_jax.models.registry import MODELS
+from eslr_jax.networks.normalizer import WARMUP_UPDATES
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.assets.models import load_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train, window_metrics

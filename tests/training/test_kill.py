@@ -25,7 +25,7 @@ KILLS = 10
 
 def run(out, *options):
     return subprocess.Popen(
-        [sys.executable, "-m", "eslr_jax.cli", "train", "--out", str(out), *options],
+        [sys.executable, "-m", "eslr_jax.pipeline.cli", "train", "--out", str(out), *options],
         stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )

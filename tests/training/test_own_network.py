@@ -9,18 +9,18 @@ import pytest
 from draped_ball import drifting_ball, square
 
 from eslr_jax import SimConfig, prepare_scene, rollout
-from eslr_jax.assets import load_model
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError
-from eslr_jax.models.registry import read_system
+from eslr_jax.networks.registry import read_system
+from eslr_jax.pipeline.assets import load_model
 from eslr_jax.training.checkpoint import read_run_config
 from eslr_jax.training.loop import train
 
 CODE = """
 from flax import linen as nn
-from eslr_jax.models.network import System, network
-from eslr_jax.physics.guess import initial_guess
-from eslr_jax.physics.potential import evaluate
+from eslr_jax.networks.network import System, network
+from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.potential import evaluate
 from eslr_jax.terms.problem import weight_norm
 
 @network("nudge")

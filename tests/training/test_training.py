@@ -15,17 +15,17 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from eslr_jax.assets import load_model
-from eslr_jax.assets.models import model_record
 from eslr_jax.config import TrainConfig
 from eslr_jax.errors import CheckpointError, ConfigError
-from eslr_jax.graph.normalizer import WARMUP_UPDATES
-from eslr_jax.models.registry import MODELS
-from eslr_jax.physics.guess import pushed_out_guess
-from eslr_jax.physics.potential import potential
-from eslr_jax.scene.build import initial_state
+from eslr_jax.networks.normalizer import WARMUP_UPDATES
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.pipeline.assets import load_model
+from eslr_jax.pipeline.assets.models import model_record
+from eslr_jax.pipeline.assets.training import load_training_data
+from eslr_jax.simulation.scene import initial_state
+from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.potential import potential
 from eslr_jax.training.checkpoint import Checkpoints, read_earlier, read_run_config, write_run_config
-from eslr_jax.training.data import load_training_data
 from eslr_jax.training.loop import export, train
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config
@@ -103,15 +103,15 @@ def test_a_folder_in_use_is_not_overwritten(finished, config):
     _, folder = finished
     before = (folder / "metrics.jsonl").read_text()
     with pytest.raises(CheckpointError, match="--resume"):
-        train(config, folder)
+        train(config, folder, datasets=())
     with pytest.raises(CheckpointError, match="another configuration"):
-        train(dataclasses.replace(config, seed=1), folder, resume=True)
+        train(dataclasses.replace(config, seed=1), folder, datasets=(), resume=True)
     assert (folder / "metrics.jsonl").read_text() == before
 
 
 def test_resuming_nothing_is_refused(config, tmp_path):
     with pytest.raises(CheckpointError, match="no training run"):
-        train(config, tmp_path, resume=True)
+        train(config, tmp_path, datasets=(), resume=True)
 
 
 def test_half_written_checkpoint_is_not_taken(finished):
@@ -174,7 +174,7 @@ def test_a_finished_run_is_extended_but_not_cut(finished, config, small_data, tm
     _, folder = finished
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     with pytest.raises(CheckpointError, match="it can be extended to more, not cut to 4"):
-        train(dataclasses.replace(config, steps=4), tmp_path, resume=True)
+        train(dataclasses.replace(config, steps=4), tmp_path, datasets=(), resume=True)
     longer = dataclasses.replace(config, steps=8)
     assert int(train(longer, tmp_path, datasets=(small_data,), resume=True).step) == 8
     assert read_run_config(tmp_path) == longer

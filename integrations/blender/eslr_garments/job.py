@@ -141,7 +141,7 @@ def simulation_steps(python: str, folder: Path, fabric: str, tolerance: str, has
     """
 
     def step(text: str, *words: object) -> Step:
-        return Step(text, [python, "-m", "eslr_jax.cli", *map(str, words)], f"{words[0]}.txt")
+        return Step(text, [python, "-m", "eslr_jax.pipeline.cli", *map(str, words)], f"{words[0]}.txt")
 
     body, garment, run = folder / "body.glb", folder / "garment.npz", folder / "run"
     # The garment is where it belongs, so nothing about it has to be recognised.

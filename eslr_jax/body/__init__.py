@@ -1,1 +1,0 @@
-"""Rigged bodies: skinning in JAX; motions and retargeting on the host."""

@@ -1,0 +1,1 @@
+"""From measurements to a material, and which values are physical."""

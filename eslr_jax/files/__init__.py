@@ -1,0 +1,1 @@
+"""Archives of arrays, and files that are written whole or not at all."""

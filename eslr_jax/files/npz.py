@@ -1,0 +1,126 @@
+"""Write arrays to NumPy archives, and read archives without trusting what they say about themselves."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from eslr_jax.errors import AssetError, EslrError
+from eslr_jax.files.atomic import atomic_write
+from eslr_jax.files.parsing import parsing
+
+_KINDS = {"f": "floats", "iu": "integers", "biu": "flags", "biuf": "flags", "fiu": "numbers", "U": "text"}
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = False) -> None:
+    """Write named arrays as an npz archive, atomically.
+
+    Args:
+        path: Path of the archive.
+        arrays: Arrays by name.
+        is_compressed: Compress the arrays, which makes files smaller and writing several times slower.
+
+    Raises:
+        AssetError: The file can't be written.
+    """
+    save = np.savez_compressed if is_compressed else np.savez
+    with atomic_write(path) as temporary, temporary.open("wb") as stream:
+        save(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
+
+
+def read_arrays(
+    path: str | Path, *, content: str, names: Collection[str] | None = None, max_bytes: int = 16 << 30
+) -> dict[str, np.ndarray]:
+    """Read arrays of an npz archive; nothing is unpickled, and headers are checked before memory is taken.
+
+    Args:
+        path: Path of the archive.
+        content: What the file should hold, for messages, e.g. "trajectory".
+        names: Names of the arrays to read where present; None reads all.
+        max_bytes: Largest unpacked size accepted [bytes].
+
+    Returns:
+        Arrays by name.
+
+    Raises:
+        AssetError: The file is missing, truncated, damaged, larger than `max_bytes`, or no npz archive.
+    """
+    with parsing(path, content, form=" as an npz archive", remedy="write it again") as file:
+        if not zipfile.is_zipfile(file):
+            raise AssetError(f"{content} file {path} is not an npz archive or is truncated; write it again")
+        with zipfile.ZipFile(file) as archive:
+            members = {member.removesuffix(".npy"): member for member in archive.namelist()}
+            if names is not None:
+                members = {name: member for name, member in members.items() if name in names}
+            total = sum(archive.getinfo(member).file_size for member in members.values())
+            if total > max_bytes:
+                raise AssetError(
+                    f"{content} file {path} unpacks to {total} bytes, more than {max_bytes}; check the file"
+                )
+            return {name: _read_member(archive, member) for name, member in members.items()}
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Read one array after checking that its header agrees with its size."""
+    size = archive.getinfo(name).file_size
+    with archive.open(name) as stream:
+        shape, dtype = _read_header(stream)
+        expected = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or expected > size:
+            raise ValueError(f"array {name} has an impossible header")
+    with archive.open(name) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read the shape and dtype of an npy stream."""
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    return shape, dtype
+
+
+def check_layout(
+    arrays: Mapping[str, np.ndarray],
+    layout: Mapping[str, tuple[str, ...]],
+    *,
+    what: str,
+    remedy: str,
+    error: type[EslrError] = AssetError,
+) -> None:
+    """Raise unless arrays have the types and shapes of a layout; arrays that are absent are not checked.
+
+    Args:
+        arrays: Arrays by name.
+        layout: For every name the kinds of dtype accepted, the dimensions, and for arrays of indices the
+            dimension that they index, e.g. `{"faces": ("iu", "faces 3", "vertices")}`. A word is one length
+            throughout.
+        what: What messages call the file.
+        remedy: What the user should do about it.
+        error: Class of the error.
+    """
+    lengths: dict[str, int] = {}
+    for name in (name for name in layout if name in arrays):
+        kinds, dimensions, *indexed = layout[name]
+        array, words = arrays[name], dimensions.split()
+        wanted = [word if word.isdigit() or word not in lengths else f"{lengths[word]}" for word in words]
+        fits = array.dtype.kind in kinds and array.ndim == len(words)
+        for word, size in zip(words, array.shape, strict=False):
+            fits &= size == (int(word) if word.isdigit() else lengths.setdefault(word, size))
+        if not fits:
+            raise error(
+                f"{what}: {name} is {array.dtype} {array.shape}; expected {_KINDS[kinds]} [{', '.join(wanted)}]; "
+                f"{remedy}"
+            )
+        for word in indexed:
+            count = lengths.get(word, 0)
+            if array.size and not (array.min() >= 0 and array.max() < count):
+                worst = array.min() if array.min() < 0 else array.max()
+                raise error(f"{what}: {name} names {worst} of {count} {word}; {remedy}")

@@ -1,1 +1,0 @@
-"""Host rooms on rest meshes: topology, validation, geodesics, embedding, padding, skin transfer."""

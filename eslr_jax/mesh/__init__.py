@@ -1,0 +1,1 @@
+"""Garments as meshes: topology, validation, padding, geodesic embedding."""

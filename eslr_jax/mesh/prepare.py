@@ -1,0 +1,178 @@
+"""From a rest mesh to a `Garment`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from eslr_jax.errors import MeshError
+from eslr_jax.mesh import topology
+from eslr_jax.mesh.coarse import add_coarse_edges
+from eslr_jax.mesh.embedding import EmbeddingMode, geodesic_embedding
+from eslr_jax.mesh.groups import compact_groups
+from eslr_jax.mesh.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
+from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
+from eslr_jax.types import Garment
+
+
+def prepare_garment(
+    rest_positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    skin_weights: Float[np.ndarray, "vertices influences"],
+    skin_indices: Int[np.ndarray, "vertices influences"],
+    is_pinned: Bool[np.ndarray, " vertices"] | Int[np.ndarray, " pins"] | None = None,
+    sewn_positions: Float[np.ndarray, "vertices 3"] | None = None,
+    embedding_size: int = 8,
+    embedding_mode: EmbeddingMode = "canonical",
+    allow_components: bool = False,
+    pad: bool = False,
+    name: str = "garment",
+) -> Garment:
+    """Validate a rest mesh and compute everything about it that stays constant during a rollout.
+
+    Args:
+        rest_positions: Vertex positions in the body's rest pose [m], shape [vertices, 3].
+        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
+        skin_weights: Joint weights, shape [vertices, influences]; rows are normalised to one.
+        skin_indices: Joint of every weight, shape [vertices, influences].
+        is_pinned: Vertices that follow their skinned position, as a mask, shape [vertices], or as indices.
+        sewn_positions: Positions on which lengths, areas and angles are measured [m], shape [vertices, 3]; the
+            rest positions by default. They differ where the rest shape was posed or moved out of the body.
+        embedding_size: Number of coordinates of the geodesic embedding.
+        embedding_mode: Kind of geodesic embedding; see `embedding.geodesic_embedding`.
+        allow_components: Accept a mesh of several connected components.
+        pad: Pad to the garment's bucket.
+        name: Name of the garment in messages.
+
+    Returns:
+        The garment, with float32, int32 and bool leaves.
+
+    Raises:
+        MeshError: The mesh can't be simulated, or an array has the wrong number of rows.
+        ConfigError: The embedding mode is unknown.
+    """
+    validate_mesh(rest_positions, faces, name=name, allow_components=allow_components)
+    validate_orientation(rest_positions, faces, name=name)
+    positions = sewn = np.asarray(rest_positions, np.float64)
+    if sewn_positions is not None:
+        sewn = np.asarray(sewn_positions, np.float64)
+        if sewn.shape != positions.shape:
+            raise MeshError(
+                f"{name}: sewn positions {sewn.shape} do not fit rest positions {positions.shape}; "
+                "give one row per vertex"
+            )
+        validate_lengths(sewn, faces, name=f"{name}, as sewn")
+    faces = np.asarray(faces, np.int64)
+    num_vertices = len(positions)
+    is_pinned = _pin_mask(name, num_vertices, is_pinned)
+    skin_weights = np.asarray(skin_weights, np.float64)
+    skin_indices = np.asarray(skin_indices)
+    _check_rows(name, num_vertices, skin_weights, skin_indices)
+
+    areas = topology.face_areas(sewn, faces)
+    hinges, hinge_faces = topology.find_hinges(faces)
+    senders, receivers, reverse = topology.directed_edges(topology.unique_edges(faces))
+    neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
+    leaves: dict[str, Any] = dict(
+        rest_positions=positions,
+        sewn_positions=sewn,
+        faces=faces,
+        rest_areas=areas,
+        inverse_rest_frames=topology.inverse_rest_frames(sewn, faces),
+        hinges=hinges,
+        hinge_rest_areas=areas[hinge_faces].sum(axis=1),
+        hinge_rest_lengths=np.linalg.norm(sewn[hinges[:, 1]] - sewn[hinges[:, 0]], axis=1),
+        vertex_areas=topology.vertex_areas(areas, faces, num_vertices),
+        senders=senders,
+        receivers=receivers,
+        reverse_edges=reverse,
+        neighbors=neighbors,
+        neighbor_mask=neighbor_mask,
+        face_incidence=topology.incidence_table(faces, num_vertices),
+        hinge_incidence=topology.incidence_table(hinges, num_vertices),
+        vertex_blocks=compact_groups(positions, BLOCK),
+        face_blocks=compact_groups(positions[faces].mean(axis=1), FACE_BLOCK),
+        edge_mask=np.ones(len(senders), bool),
+        vertex_mask=np.ones(num_vertices, bool),
+        geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode),
+        skin_weights=skin_weights / skin_weights.sum(axis=1, keepdims=True),
+        skin_indices=skin_indices,
+        is_pinned=is_pinned,
+    )
+    garment = Garment(**leaves)  # NumPy leaves, until the padding is done
+    return to_device(pad_garment(garment) if pad else garment)
+
+
+def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list[Garment]:
+    """Pad garments to one bucket, so that they share compiled functions and can be stacked.
+
+    Args:
+        garments: Unpadded garments; those with coarse edges get them anew, padded too. Their materials are left
+            out.
+        bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
+    """
+    if bucket is None:
+        bucket = common_bucket([garment_bucket(garment) for garment in garments])
+        bucket = bucket._replace(vertices=bucket.vertices + 1)
+    padded = [pad_garment(garment.replace(material=None), bucket) for garment in garments]
+    return [to_device(add_coarse_edges(one) if one.coarse is not None else one) for one in padded]
+
+
+def to_device(garment: Garment) -> Garment:
+    """Return a garment with float32, int32 and bool JAX leaves."""
+    dtypes = {"f": np.float32, "i": np.int32, "u": np.int32, "b": np.bool_}
+    # Converted by NumPy: JAX would compile a program for every shape.
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, dtypes[leaf.dtype.kind])), garment)
+
+
+def _check_rows(name: str, num_vertices: int, skin_weights: np.ndarray, skin_indices: np.ndarray) -> None:
+    """Raise on skin weights that do not fit the mesh, name no joint, or whose rows can't be normalised."""
+    fits = skin_weights.ndim == 2 and len(skin_weights) == num_vertices
+    if not fits or skin_weights.shape != skin_indices.shape:
+        raise MeshError(
+            f"{name}: skin weights {skin_weights.shape} and indices {skin_indices.shape} do not fit "
+            f"{num_vertices} vertices; give one row per vertex, or use transfer_skin_weights"
+        )
+    if (skin_indices < 0).any():
+        vertex = int(np.argmax((skin_indices < 0).any(axis=1)))
+        raise MeshError(
+            f"{name}: skin indices of vertex {vertex} are {skin_indices[vertex]}; joints are counted from 0"
+        )
+    sums = skin_weights.sum(axis=1)
+    is_bad = ~(np.isfinite(sums) & (sums > 0)) | np.any(skin_weights < 0, axis=1)
+    if is_bad.any():
+        vertex = int(np.argmax(is_bad))
+        raise MeshError(
+            f"{name}: skin weights of vertex {vertex} are {skin_weights[vertex]}; "
+            "give finite, non-negative weights with a positive sum"
+        )
+
+
+def _pin_mask(name: str, num_vertices: int, is_pinned: np.ndarray | None) -> Bool[np.ndarray, " vertices"]:
+    """Return a mask of the pinned vertices, given a mask or indices; raise where they do not fit the mesh."""
+    mask = np.zeros(num_vertices, bool)
+    if is_pinned is None:
+        return mask
+    given = np.asarray(is_pinned)
+    if given.dtype.kind in "iu":
+        is_missing = (given < 0) | (given >= num_vertices)
+        if given.ndim != 1 or is_missing.any():
+            missing = given[is_missing].ravel()[:1]
+            cause = f"vertex {missing[0]}" if len(missing) else f"an array of shape {given.shape}"
+            raise MeshError(
+                f"{name}: {cause} can't be pinned; give a list of indices from 0 to {num_vertices - 1}"
+            )
+        mask[given] = True
+        return mask
+    if given.dtype.kind != "b" or given.shape != (num_vertices,):
+        raise MeshError(
+            f"{name}: is_pinned has shape {given.shape} and dtype {given.dtype} for {num_vertices} vertices; "
+            "give one boolean per vertex, or indices"
+        )
+    return given

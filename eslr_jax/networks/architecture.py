@@ -1,0 +1,182 @@
+"""What the networks of this package share: options, new weights, and how they predict."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, ClassVar, Literal, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import jraph
+import numpy as np
+
+from eslr_jax.errors import CheckpointError
+from eslr_jax.networks import features, normalizer
+from eslr_jax.networks.apply import Places
+from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, feature_sizes
+from eslr_jax.networks.network import Example, Network, Prediction, Statistics, System
+from eslr_jax.networks.refine import predict_acceleration, refine
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.types import ClothState, CoarseEdges
+
+_MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture(System):
+    """Options of every network on a garment's graph.
+
+    Without `correction_scale` it reads HOOD's features and predicts an acceleration, as in the paper. With it, it
+    reads scaled features with the potential's gradient, and moves the solver's initial guess.
+    """
+
+    latent_size: int = 128  # channels of vertices and edges (HOOD)
+    hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
+    correction_scale: float | None = None  # [m] per unit of output that moves the solver's guess
+    world_edge_radius: float = 0.03  # [m] (HOOD)
+    precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
+    # What a backward pass computes again: whole layers, all but their products, or nothing.
+    remat: Literal["layers", "products", "none"] = "products"
+
+    has_gates: ClassVar[bool] = False  # the output has two of them behind the vector
+    is_combined: ClassVar[Any] = False  # a refinement step minimises over its directions
+
+    def __post_init__(self) -> None:
+        """Reject impossible values.
+
+        Raises:
+            ValueError: Names the field.
+        """
+        for field in dataclasses.fields(self):
+            value, name = getattr(self, field.name), field.name
+            if isinstance(value, int) and not isinstance(value, bool) and value < (name not in _MAY_BE_ZERO):
+                least = "must not be negative" if name in _MAY_BE_ZERO else "must be at least 1"
+                raise ValueError(f"{name} {least}, got {value}")
+            if isinstance(value, float) and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+
+    @property
+    def reads_gradient(self) -> bool:
+        """Whether the potential's gradient is among the inputs."""
+        return self.correction_scale is not None
+
+    @property
+    def graph(self) -> GraphKind:
+        """What the network reads of a frame."""
+        return GraphKind(self.reads_gradient, world_edge_radius=self.world_edge_radius)
+
+    @property
+    def module(self) -> nn.Module:
+        """The Flax module, with the methods of `eslr.EncodeProcessDecode`."""
+        raise NotImplementedError
+
+    def draw_constants(self) -> dict[str, Any]:
+        """Return arrays that are not trained."""
+        return {}
+
+    def new_network(self, seed: int = 0, example: Example | None = None) -> Network:
+        """Return a network with new weights, which fits any garment; see `System`."""
+        params = draw_weights(jax.jit(lambda: _declare(self)["params"])(), seed)
+        return Network(params, self, _new_statistics(self), self.draw_constants())
+
+    def predict(
+        self, network: Network, problem: FrameProblem, state: ClothState, *, detach: bool
+    ) -> Prediction:
+        """Return the prediction for a frame; see `Network.predict`."""
+        if self.reads_gradient:
+            return refine(network, problem, state, detach=detach)
+        return predict_acceleration(network, problem, state)
+
+    def check(self, network: Network) -> None:
+        """Compare the shapes of weights with the architecture; nothing is computed, and tracers are accepted.
+
+        Raises:
+            CheckpointError: A weight is missing, unknown, or of another shape.
+        """
+        expected, given = _expected_shapes(self), _shapes(network)
+        for name in sorted(expected.keys() | given.keys()):
+            if expected.get(name) != given.get(name):
+                raise CheckpointError(
+                    f"these weights are for another architecture: {name} is {given.get(name, 'missing')}, "
+                    f"expected {expected.get(name, 'absent')}; load the weights of this one"
+                )
+
+
+def draw_weights(spreads: dict[str, Any], seed: int) -> dict[str, Any]:
+    """Return weights as modules declare them, with the kernels drawn; see `dense.kernel_spread`.
+
+    Args:
+        spreads: Weights of a module's `init`.
+        seed: Of the normal numbers that kernels are multiplied by.
+    """
+    generator = np.random.default_rng(seed)
+
+    def draw(path, spread):
+        is_kernel = not any(word in path[-1].key for word in ("bias", "scale"))
+        return spread * generator.standard_normal(spread.shape, np.float32) if is_kernel else spread
+
+    return jax.tree_util.tree_map_with_path(draw, spreads)
+
+
+@functools.cache
+def _expected_shapes(config: Architecture) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every array of an architecture by its path."""
+    return _shapes(jax.eval_shape(config.new_network))
+
+
+def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every array by its path."""
+    leaves = jax.tree_util.tree_leaves_with_path(network.parts)
+    return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
+
+
+def _declare(config: Architecture) -> dict[str, Any]:
+    """Return weights as their modules declare them, before anything is drawn; see `dense.kernel_spread`."""
+    graph, places = _example(config)
+    return cast(dict[str, Any], config.module.init(jax.random.key(0), graph, places, _new_statistics(config)))
+
+
+def _new_statistics(config: Architecture) -> Statistics:
+    """Return empty normalisers for what the configuration normalises."""
+    if config.reads_gradient:
+        return {}
+    sizes = feature_sizes(config.graph)
+    embedded = features.NUM_TYPES + (NUM_LEVELS if config.graph.has_coarse_edges else 0)
+    columns = {
+        "garment": sizes["garment"] + embedded - features.HOOD_NODE_STATIC,
+        "mesh": sizes["mesh"] - features.HOOD_MESH_STATIC,
+        "world": sizes["world"],
+        "output": 3,
+    }
+    return {name: normalizer.init_normalizer(count) for name, count in columns.items()}
+
+
+def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Places]:
+    """Return the smallest graph that touches every weight: one edge, two body points."""
+    kind = config.graph
+    sizes, zeros, pair = feature_sizes(kind), functools.partial(jnp.zeros, dtype=jnp.float32), jnp.arange(2)
+    worlds = ("world", "world_reverse") if kind.has_reverse_edges else ("world",)
+    edges = dict.fromkeys(
+        ("mesh", *(COARSE_SETS if kind.has_coarse_edges else ())), zeros((2, sizes["mesh"]))
+    )
+    level = CoarseEdges(pair[::-1], pair, pair[::-1], jnp.ones(2, bool), jnp.ones(2, bool))
+    graph = jraph.GraphsTuple(
+        nodes={"garment": zeros((2, sizes["garment"])), "body": zeros((2, sizes["body"]))},
+        edges={**edges, **dict.fromkeys(worlds, zeros((2, sizes["world"])))},
+        senders={**dict.fromkeys(edges, pair[::-1]), **dict.fromkeys(worlds, pair)},
+        receivers=dict.fromkeys((*edges, *worlds), pair),
+        globals={
+            "reverse_edges": pair[::-1],
+            "incoming_edges": pair[:, None],
+            "garment_type": jnp.zeros(2, jnp.int32),
+            "body_type": jnp.zeros(2, jnp.int32),
+            "world_mask": jnp.ones(2, bool),
+            "coarse": (level,) * (len(edges) - 1),
+        },
+        n_node=jnp.array([2]),
+        n_edge={name: jnp.array([2]) for name in (*edges, *worlds)},
+    )
+    width = getattr(config, "embedding_size", 0)  # what attention reads, where there is any
+    return graph, Places(zeros((2, width)), jnp.ones(2, bool))

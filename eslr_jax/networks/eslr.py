@@ -1,0 +1,251 @@
+"""Encode, process, decode: ESLR, and with fewer parts MeshGraphNet.
+
+The encoders' latents go through a stack of LSDMP layers and, beside it, through a stack of GSA blocks; the
+decoder reads both. Without smoothing and attention, and with `Eslr.update_body`, this is MeshGraphNet as
+in HOOD's baselines; without `update_body` body rows keep their encoding.
+
+Source: paper, section on the simulation pipeline.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple, cast
+
+import flax.linen as nn
+import jax.numpy as jnp
+import jraph
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.errors import ConfigError
+from eslr_jax.networks import features
+from eslr_jax.networks.apply import Places
+from eslr_jax.networks.branches import TwoBranches, make_decoder, stack, world_mask
+from eslr_jax.networks.build import GraphKind, Rows, feature_sizes
+from eslr_jax.networks.dense import kernel_spread
+from eslr_jax.networks.gsa import GsaBlock
+from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents
+from eslr_jax.networks.mlp import MLP
+from eslr_jax.networks.network import Statistics, network
+from eslr_jax.networks.normalizer import normalize
+from eslr_jax.networks.operators import mesh_tables, sum_receivers
+from eslr_jax.types import Normalizer
+
+VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
+
+
+class EncodedWorld(NamedTuple):
+    """The part of `Encoded` that a body adds."""
+
+    body: Float[Array, "vertices latent"]  # finished: a body row has no features that change
+    edges: Float[Array, "vertices hidden"]  # body to garment
+    reverse: Float[Array, "vertices hidden"] | None  # garment to body; None where body rows are constant
+
+
+class Encoded(NamedTuple):
+    """Hidden layers of the encoders, as far as a frame's constant features decide them."""
+
+    garment: Float[Array, "vertices hidden"]
+    mesh: Float[Array, "edges hidden"]
+    tables: LayerTables
+    world: EncodedWorld | None  # None in a scene without a body
+
+
+class GraphModule(nn.Module):
+    """A module that reads HOOD's features through their normalisers, with an embedding of the vertex type."""
+
+    config: Any
+
+    def normalized(self, graph: jraph.GraphsTuple, statistics: Statistics | None) -> tuple[Rows, Rows]:
+        """Return node and edge features as the encoders read them.
+
+        Raises:
+            ValueError: The features are HOOD's and `statistics` is None.
+        """
+        if self.config.reads_gradient:
+            return graph.nodes, graph.edges
+        if statistics is None:
+            raise ValueError("HOOD's features need the statistics of their normalisers")
+
+        def scale(
+            rows: Float[Array, "_ features"], normalizer: Normalizer, num_static: int
+        ) -> Float[Array, "_ features"]:
+            changing = rows.shape[1] - num_static
+            scaled = normalize(normalizer, rows[:, :changing])
+            return jnp.concatenate([scaled, rows[:, changing:]], axis=1)
+
+        nodes = {
+            name: scale(rows, statistics["garment"], features.HOOD_NODE_STATIC)
+            for name, rows in self.with_types(graph).items()
+        }
+        edges = {
+            name: scale(rows, statistics["world"], 0)
+            if name.startswith("world")
+            else scale(rows, statistics["mesh"], features.HOOD_MESH_STATIC)
+            for name, rows in cast(Rows, graph.edges).items()
+        }
+        return nodes, edges
+
+    def with_types(self, graph: jraph.GraphsTuple) -> Rows:
+        """Return the node features with the embedding of the vertex type behind the velocity, as in HOOD."""
+
+        def insert(rows: Float[Array, "_ 11"], types: Int[Array, " _"]) -> Float[Array, "_ 20"]:
+            embedding = self.type_embedding.astype(rows.dtype)[types]
+            return jnp.concatenate(
+                [rows[:, :VELOCITY_COLUMNS], embedding, rows[:, VELOCITY_COLUMNS:]], axis=1
+            )
+
+        nodes = cast(Rows, graph.nodes)
+        return {name: insert(rows, graph.globals[f"{name}_type"]) for name, rows in nodes.items()}
+
+
+class EncodeProcessDecode(GraphModule):
+    """The whole network, from a graph's features to a vector, and gates, per vertex."""
+
+    config: TwoBranches
+
+    def setup(self) -> None:
+        """Declare encoders, stacks and decoder."""
+        config = self.config
+        size, sizes = config.latent_size, feature_sizes(config.graph)
+
+        def encoder(input_size: int) -> MLP:
+            return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
+
+        if not config.reads_gradient:
+            self.type_embedding = self.param(
+                "type_embedding",
+                kernel_spread(features.NUM_TYPES),
+                (features.NUM_TYPES, features.NUM_TYPES),
+            )
+            self.garment_encoder = encoder(sizes["garment"] + features.NUM_TYPES)
+        else:
+            self.garment_encoder = encoder(sizes["garment"])
+            self.body_encoder = encoder(sizes["body"])
+        self.mesh_encoder = encoder(sizes["mesh"])
+        self.world_encoder = encoder(sizes["world"])
+        self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
+        if config.attention_blocks:
+            self.blocks = stack(GsaBlock, config, config.attention_blocks)
+            shape = (config.attention_features, config.attention_size)
+            self.projection = self.variable("constants", "projection", jnp.zeros, shape)
+        self.decoder = make_decoder(config, 2 if config.attention_blocks else 1)
+
+    def __call__(
+        self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
+    ) -> Float[Array, "vertices outputs"]:
+        """Return the raw output for a whole graph.
+
+        Args:
+            graph: Graph of `build_graph`.
+            places: Embedding and mask of the vertices.
+            statistics: Normalisers of the rows "garment" (and body), "mesh" and "world", for HOOD's features.
+        """
+        return self.process(self.encode_frame(graph, statistics), places)
+
+    def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
+        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
+
+        Args:
+            graph: Graph of `build_graph` or of `build_frame_graph`.
+            statistics: Normalisers, see `__call__`.
+        """
+        nodes, edges = self.normalized(graph, statistics)
+        dtype = nodes["garment"].dtype
+        world = None
+        if "world" in edges:
+            body_encoder = self.body_encoder if self.config.reads_gradient else self.garment_encoder
+            first_layers = {
+                name: self.world_encoder.start(edges[name], 0, bias=True)
+                for name in ("world", "world_reverse")
+                if name in edges
+            }
+            world = EncodedWorld(
+                body=body_encoder(nodes["body"]),
+                edges=first_layers["world"],
+                reverse=first_layers.get("world_reverse"),
+            )
+        return Encoded(
+            garment=self.garment_encoder.start(nodes["garment"], 0, bias=True),
+            mesh=self.mesh_encoder.start(edges["mesh"], 0, bias=True),
+            tables=LayerTables(mesh_tables(graph, dtype), world_mask(graph, dtype)),
+            world=world,
+        )
+
+    def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
+        """Add the features of a refinement step to those of its frame.
+
+        Args:
+            encoded: Hidden layers of `encode_frame` for the frame's features.
+            changing: Graph of `build_refinement_graph`.
+        """
+        nodes, edges, world = changing.nodes, changing.edges, encoded.world
+        if world is not None:
+            rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
+            reverse = None if world.reverse is None else world.reverse + rows
+            world = world._replace(edges=world.edges + rows, reverse=reverse)
+        return encoded._replace(
+            garment=encoded.garment + self.garment_encoder.start(nodes["garment"], features.NODE_FRAME_SIZE),
+            mesh=encoded.mesh + self.mesh_encoder.start(edges["mesh"], features.MESH_FRAME_SIZE),
+            world=world,
+        )
+
+    def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
+        """Finish the encoders, run both stacks and decode."""
+        vertices = self.garment_encoder.finish(encoded.garment)
+        mesh = self.mesh_encoder.finish(encoded.mesh)
+        world = None
+        if encoded.world is not None:
+            finish, given = self.world_encoder.finish, encoded.world
+            reverse = None if given.reverse is None else finish(given.reverse)
+            world = WorldLatents(given.body, finish(given.edges), reverse)
+        latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
+        latents, _ = self.layers(latents, encoded.tables)
+        return self.decode(latents.garment, vertices, places)
+
+    def decode(
+        self,
+        processed: Float[Array, "vertices latent"],
+        encoded: Float[Array, "vertices latent"],
+        places: Places,
+    ) -> Float[Array, "vertices outputs"]:
+        """Run the attention branch and decode.
+
+        Args:
+            processed: Vertex latents behind the stack of layers, shape [vertices, latent].
+            encoded: Vertex latents of the encoder, from which attention starts, shape [vertices, latent].
+            places: Embedding and mask of the vertices.
+
+        Raises:
+            ConfigError: The garment has another number of geodesic coordinates than the network reads.
+        """
+        config = self.config
+        hidden = self.decoder.start(processed, 0, bias=True)
+        if config.attention_blocks:
+            size = places.embedding.shape[1]
+            if size != config.embedding_size:
+                raise ConfigError(
+                    f"the garment has {size} geodesic coordinates and the model embedding_size = "
+                    f"{config.embedding_size}; prepare the garment with that embedding_size"
+                )
+            attended, _ = self.blocks(encoded, (*places, self.projection.value))
+            hidden = hidden + self.decoder.start(attended, config.latent_size)
+        return self.decoder.finish(hidden)
+
+
+@network("eslr")
+@dataclasses.dataclass(frozen=True)
+class Eslr(TwoBranches):
+    """The paper's network; the defaults are its 15-layer model (4,753,108 parameters)."""
+
+    update_body: bool = False  # open: layers update body rows as HOOD does, see models.lsdmp
+
+    @property
+    def graph(self) -> GraphKind:
+        """What the network reads of a frame."""
+        return super().graph._replace(has_reverse_edges=self.update_body)
+
+    @property
+    def module(self) -> EncodeProcessDecode:
+        """The Flax module."""
+        return EncodeProcessDecode(self)

@@ -1,0 +1,265 @@
+"""Load garments by name or by path, fitted or carried to a body, and prepare them for simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from eslr_jax.errors import ConfigError
+from eslr_jax.mesh.coarse import add_coarse_edges
+from eslr_jax.mesh.prepare import prepare_garment, to_device
+from eslr_jax.pipeline.assets.bodies import load_body
+from eslr_jax.pipeline.assets.cache import cached_arrays, cached_struct, content_key
+from eslr_jax.pipeline.assets.catalog import find_asset, is_path
+from eslr_jax.pipeline.dressing.fit import fit_garment
+from eslr_jax.pipeline.dressing.options import FitOptions, Scale
+from eslr_jax.pipeline.dressing.refine import refine
+from eslr_jax.pipeline.dressing.report import check_wearer, wearer_entry
+from eslr_jax.pipeline.dressing.transfer import transfer_garment
+from eslr_jax.pipeline.fabrics import garment_material
+from eslr_jax.pipeline.formats.garment import (
+    GarmentFile,
+    GarmentSource,
+    garment_arrays,
+    garment_from_arrays,
+    garment_path,
+    is_garment_file,
+    read_garment_npz,
+    read_garment_source,
+)
+from eslr_jax.types import Body, Garment
+
+Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
+_SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
+_REFINED = {
+    "50k": "tq",
+    "200k": "tqq",
+}  # sizes that are made from 4k vertices, see `pipeline.dressing.refine`
+
+
+def load_garment(
+    name: str | Path = "tshirt",
+    *,
+    vertices: Resolution = "1k",
+    body: Body | None = None,
+    fit: FitOptions | None = None,
+    pad: bool = False,
+    cache: bool = True,
+    **options: Any,
+) -> Garment:
+    """Load a garment, fit it to the body if it is a mesh, and prepare it for simulation; warn of a doubtful fit.
+
+    Args:
+        name: Name of a bundled garment, or path of a fitted one: of `eslr fit`, or `garment.npz` of a run.
+            A mesh (obj, ply, stl, glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
+        vertices: Resolution of a bundled garment; 50k and 200k are subdivisions of its 4k mesh.
+        body: Body that wears it, by default the bundled one. A mesh is fitted to this body, and a bundled garment
+            is transferred to it.
+        fit: Options of the fit; everything is recognised by default.
+        pad: Pad to a bucket of sizes, so that garments of similar size share one compiled rollout.
+        cache: Keep the result for the next time.
+        options: Arguments of `prepare_stored` and of `prepare_garment`; those that a network asks for are its
+            `Network.garment_options`.
+
+    Returns:
+        The garment on the body's rest pose. The origin of its `rest_positions` is the body's: that of the bundled
+        body is at the hips, 0.82 m above the soles, while the poses of `pose_body` stand on a floor at y = 0. Its
+        `material` has the file's fabrics, or is None, for cotton.
+
+    Raises:
+        AssetError: There is no such garment, or the file can't be read.
+        MeshError: The mesh can't be simulated, does not fit the body, or can't be carried to it.
+    """
+    stored = load_garment_file(name, vertices=vertices, body=body, fit=fit, cache=cache)
+    warn_of_fit(Path(name).name, stored)
+    return prepare_stored(stored, pad=pad, cache=cache, name=Path(name).name, **options)
+
+
+def warn_of_fit(name: str, stored: GarmentFile) -> None:
+    """Warn of what was doubtful when a garment was fitted."""
+    for text in stored.fit_warnings:
+        warnings.warn(f"{name}: {text}", stacklevel=3)
+
+
+def load_garment_file(
+    name: str | Path = "tshirt",
+    *,
+    vertices: Resolution = "1k",
+    body: Body | None = None,
+    fit: FitOptions | None = None,
+    cache: bool = True,
+    on_source: Callable[[GarmentSource], None] | None = None,
+) -> GarmentFile:
+    """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
+
+    Args:
+        name: Garment; see `load_garment`, also for the other arguments.
+        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
+        body: Body that is to wear it.
+        fit: Options of the fit.
+        cache: Keep the result for the next time.
+        on_source: Function that is told of a mesh before it is fitted.
+    """
+    if not is_path(str(name)):
+        _refuse_fit(str(name), fit or FitOptions())
+        stored = read_garment_npz(
+            find_asset("garment", f"{name}_{'4k' if vertices in _REFINED else vertices}")
+        )
+        stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
+        return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
+    path = garment_path(name)
+    if path.is_file() and is_garment_file(path):
+        stored = read_garment_npz(path)
+        if body is not None:
+            check_wearer(stored, body, str(name))
+        return stored
+    source = read_garment_source(name)
+    if on_source is not None:
+        on_source(source)
+    rig, options = load_body() if body is None else body, fit or FitOptions()
+    if not cache:
+        return fit_garment(source, rig, options)
+    key = content_key("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
+    arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
+    return garment_from_arrays(arrays, source.name)
+
+
+def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
+    """Check that a resolution other than the usual one is asked for bundled garments.
+
+    Args:
+        names: Garments by name or path.
+        vertices: Resolution of those that are bundled.
+
+    Raises:
+        ConfigError: All of them are files, which have their own.
+    """
+    if vertices != "1k" and all(map(is_path, names)):
+        raise ConfigError(
+            f"--vertices {vertices} is for bundled garments, and the mesh of a file stays as it is; leave "
+            "it out, or remesh the file: eslr fit --edge-length"
+        )
+
+
+def _refuse_fit(name: str, options: FitOptions) -> None:
+    """Raise a ConfigError if a bundled garment is given an option of a fit, except its scale."""
+    usual = vars(FitOptions()) | {"scale": options.scale}
+    given = [field for field, value in vars(options).items() if value != usual[field]]
+    if given:
+        names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
+        raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
+
+
+def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:
+    """Return a bundled garment on a body: as stored on the bundled body, transferred to any other."""
+    if body is None:
+        return stored
+    own = load_body()
+    if (
+        body.joint_names == own.joint_names
+        and body.rest_positions.shape == own.rest_positions.shape
+        and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)
+    ):
+        return dataclasses.replace(stored, metadata=stored.metadata | wearer_entry(own))  # its run keeps it
+    if not cache:
+        return transfer_garment(stored, own, body, scale=scale)
+    bends = () if body.pose_directions is None else (np.asarray(body.pose_directions),)
+    arrays = [array for _, array in sorted(garment_arrays(stored).items())]
+    key = content_key(
+        "transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends
+    )
+    carried = cached_arrays(key, lambda: garment_arrays(transfer_garment(stored, own, body, scale=scale)))
+    return garment_from_arrays(carried, "garment")
+
+
+def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:
+    """Return a bundled garment on a finer mesh; vertices between pinned ones are pinned."""
+    count = len(stored.rest_positions)
+    finer = refine(stored.faces, count, scheme)
+    rows = np.repeat(np.arange(count), stored.skin_indices.shape[1])
+    dense = np.zeros((count, stored.skin_indices.max() + 1))
+    np.add.at(dense, (rows, stored.skin_indices.ravel()), stored.skin_weights.ravel())
+    weights = finer.linear @ dense
+    chosen = np.argsort(-weights, axis=1)[:, : stored.skin_indices.shape[1]]
+    weights = np.take_along_axis(weights, chosen, axis=1)
+    return GarmentFile(
+        rest_positions=finer.smooth @ stored.rest_positions,
+        faces=finer.faces,
+        skin_weights=weights / weights.sum(axis=1, keepdims=True),
+        skin_indices=chosen,
+        is_pinned=finer.linear @ stored.is_pinned > 0.99,
+        sewn_positions=None if stored.sewn_positions is None else finer.smooth @ stored.sewn_positions,
+        face_parts=None if stored.face_parts is None else stored.face_parts[finer.parents],
+        part_names=stored.part_names,
+        metadata=stored.metadata,
+    )
+
+
+def prepare_stored(
+    stored: GarmentFile,
+    *,
+    pad: bool = False,
+    cache: bool = True,
+    name: str = "garment",
+    has_coarse_edges: bool = False,
+    **options: Any,
+) -> Garment:
+    """Prepare a garment file for simulation.
+
+    Args:
+        stored: Garment of `load_garment_file`.
+        pad: Pad to a bucket of sizes.
+        cache: Keep the result for the next time.
+        name: Name of the garment in messages.
+        has_coarse_edges: Add the coarse edges that a hierarchical network reads.
+        options: Arguments of `prepare_garment`.
+
+    Returns:
+        The garment, with the material of the file's fabrics if it has some.
+
+    Raises:
+        MeshError: The mesh can't be simulated.
+        ConfigError: The file has a fabric that is unknown.
+    """
+    options.setdefault("allow_components", not stored.metadata.keys().isdisjoint(("fit", "outfit")))
+
+    def make() -> Garment:
+        return prepare_garment(
+            stored.rest_positions,
+            stored.faces,
+            skin_weights=stored.skin_weights,
+            skin_indices=stored.skin_indices,
+            is_pinned=stored.is_pinned,
+            sewn_positions=stored.sewn_positions,
+            pad=pad,
+            name=name,
+            **options,
+        )
+
+    own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
+    key = content_key("prepare", pad, sorted(options.items()), *own)
+    garment = cached_struct(key, Garment, make) if cache else make()
+    if has_coarse_edges:
+        garment = add_coarse_edges(garment)
+    if stored.metadata.get("fabrics"):
+        garment = garment.replace(material=garment_material((), garment, stored))
+    return to_device(garment)
+
+
+def _body_arrays(body: Body) -> list[np.ndarray]:
+    """Return the arrays of a body that a fit depends on."""
+    names = (
+        "rest_positions",
+        "faces",
+        "skin_weights",
+        "skin_indices",
+        "is_obstacle",
+        "joint_rest_positions",
+        "parents",
+    )
+    return [np.asarray(getattr(body, name)) for name in names]

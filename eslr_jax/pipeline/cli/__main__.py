@@ -1,0 +1,5 @@
+"""`python -m eslr_jax.pipeline.cli`."""
+
+from eslr_jax.pipeline.cli import main
+
+main()

@@ -1,0 +1,226 @@
+"""Make a garment that another program exported ready for simulation on a body."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax.mesh.topology import face_areas, face_cross_products, vertex_components
+from eslr_jax.mesh.validate import check_arrays, validate_mesh
+from eslr_jax.pipeline.dressing.clearance import lay_to_rest
+from eslr_jax.pipeline.dressing.options import FitOptions
+from eslr_jax.pipeline.dressing.pins import choose_pins
+from eslr_jax.pipeline.dressing.placement import find_placement
+from eslr_jax.pipeline.dressing.postures import Posture, arm_postures, rest_posture
+from eslr_jax.pipeline.dressing.remesh import remesh
+from eslr_jax.pipeline.dressing.repair import (
+    Cleaned,
+    consistent_orientation,
+    join_components,
+    largest_component,
+    weld,
+)
+from eslr_jax.pipeline.dressing.report import wearer_entry
+from eslr_jax.pipeline.dressing.transfer import carry_shape
+from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, first_rows
+from eslr_jax.pose.motion import chest_direction
+from eslr_jax.types import Body
+
+_MAX_COORDINATE = 1e6  # beyond it no unit makes a garment
+
+
+def fit_garment(
+    source: GarmentSource, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
+) -> GarmentFile:
+    """Clean a garment's mesh, put it on the body, and give it skin weights and pins.
+
+    Lengths, areas and angles stay those of the file, unless it is remeshed. Lowering arms and moving vertices
+    out of the body change the rest positions, not the sewn shape.
+
+    Args:
+        source: Garment of `read_garment_source`.
+        body: The body in its rest pose.
+        options: Settings that replace what is recognised from the mesh.
+        made_for: The body that it was modelled on, if that is another one: it is put on that body first and
+            carried from there; see `transfer_garment`.
+
+    Returns:
+        The garment; `metadata["fit"]` reports what was recognised, done and doubted, `metadata["body"]` tells
+        the body.
+
+    Raises:
+        MeshError: The mesh can't be repaired, does not fit the body, or can't be carried to it.
+        ConfigError: An option contradicts the garment.
+    """
+    options = options or FitOptions()
+    mesh, name = source.mesh, source.name
+    check_arrays(mesh.positions, mesh.faces, name=name)
+    largest = float(np.abs(mesh.positions).max())
+    if largest > _MAX_COORDINATE:
+        raise MeshError(
+            f"{name}: coordinates up to {largest:.3g} are too large for a garment; check the file"
+        )
+    for option, value in (("weld", options.weld), ("join_gap", options.join_gap)):
+        if not 0 <= value < np.inf:
+            raise ConfigError(f"{option} = {value:g} is no distance; give 0 or more")
+    if made_for is None and options.scale != "body":
+        raise ConfigError(
+            f"scale {options.scale} is for a garment of another body; give that body too (eslr fit --made-for)"
+        )
+    worn_by = body if made_for is None else made_for
+    clean, report = _clean(mesh.positions, mesh.faces, options)
+    postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
+    facing = chest_direction(worn_by)
+    placement = find_placement(
+        clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
+    )
+    posture = postures[placement.posture]
+    clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
+    is_turned = _turned_faces(clean, posture)
+    faces = _turn(clean.faces, is_turned)
+    report |= joined | {"turned_faces": int(is_turned.sum())}
+
+    sewn, parts, uvs, lost = clean.positions, mesh.face_parts, mesh.corner_uvs, []
+    file_pins = np.zeros(len(sewn), bool)
+    if options.edge_length is None:
+        vertex_map, joined_rows, face_source = clean.vertex_map, None, clean.face_source
+        if source.is_pinned is not None:
+            held = vertex_map[source.is_pinned]
+            file_pins[held[held >= 0]] = True
+        if mesh.rows is not None:
+            vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
+        uvs = None if uvs is None else _turn(uvs[face_source], is_turned)
+    else:
+        lost = _lost_pins(source, options)
+        sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
+        vertex_map, joined_rows, face_source = np.arange(len(sewn)), None, clean.face_source[nearest]
+        file_pins, uvs = np.zeros(len(sewn), bool), None
+    parts = None if parts is None else parts[face_source]
+    validate_mesh(sewn, faces, name=name, allow_components=options.components != "refuse")
+    report |= {"vertices": len(sewn), "faces": len(faces)}
+
+    placed, worn_in, transfer = sewn, posture, {}
+    if made_for is not None:
+        placed, sewn, worn_in, carried = carry_shape(
+            sewn, faces, posture, made_for, body, scale=options.scale
+        )
+        transfer = {"transfer": carried}
+    rest, weights, indices, penetration = lay_to_rest(
+        placed, faces, worn_in, body, is_pushed=options.push_out
+    )
+    is_pinned, pinned_by, falling = choose_pins(
+        options.pin,
+        file_pins,
+        body,
+        positions=rest,
+        faces=faces,
+        vertex_map=vertex_map,
+        face_parts=parts,
+        part_names=mesh.part_names,
+    )
+    return GarmentFile(
+        rest_positions=rest,
+        faces=faces,
+        skin_weights=weights,
+        skin_indices=indices,
+        is_pinned=is_pinned,
+        sewn_positions=sewn,
+        corner_uvs=uvs,
+        face_parts=parts,
+        part_names=mesh.part_names,
+        vertex_map=vertex_map,
+        joined_rows=joined_rows,
+        metadata={
+            "name": name,
+            **wearer_entry(body),
+            "fit": {
+                "placement": {
+                    "what": placement.describe(),
+                    "metres_per_unit": placement.factor,
+                    "up": placement.up,
+                    "front": placement.front,
+                    "origin": placement.origin,
+                    "moved_m": [round(float(value), 4) for value in placement.translation],
+                    "arms_below_horizontal_deg": posture.arm_angle,
+                    "cost": round(placement.cost, 3),
+                    "confidence": round(placement.confidence, 3),
+                },
+                "mesh": report,
+                "penetration": penetration,
+                "pinned": int(is_pinned.sum()),
+                "pinned_by": pinned_by,
+                "warnings": [*placement.warnings, *lost, *falling],
+                **transfer,
+            },
+        },
+    )
+
+
+def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
+    """Weld open edges; return the mesh and a report."""
+    clean = weld(positions, faces.astype(np.int64), tolerance=options.weld)
+    if not face_areas(clean.positions, clean.faces).sum() > 0:
+        raise MeshError(
+            "no face with an area is left after welding coincident vertices; check the mesh, or give eslr fit a "
+            "smaller --weld"
+        )
+    num_used = len(np.unique(faces))
+    return clean, {
+        "source_vertices": len(positions),
+        "source_faces": len(faces),
+        "loose_vertices": len(positions) - num_used,
+        "welded_vertices": num_used - len(clean.positions),
+        "dropped_faces": len(faces) - len(clean.faces),
+        "components": vertex_components(clean.faces, len(clean.positions))[0],
+    }
+
+
+def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
+    """Join or drop separate parts as the options say; positions are in metres."""
+    if options.components not in ("join", "largest"):
+        return clean, {}
+    if options.components == "join":
+        step = join_components(clean.positions, clean.faces, options.join_gap)
+    else:
+        step = largest_component(clean.positions, clean.faces)
+    onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1
+    left = vertex_components(step.faces, len(step.positions))[0]
+    joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])
+    return joined, {"components_left": left}
+
+
+def _turned_faces(clean: Cleaned, posture: Posture) -> np.ndarray:
+    """Return a mask of the faces to turn: those that disagree with neighbours, and parts that face the body."""
+    turn = consistent_orientation(clean.positions, clean.faces)
+    crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
+    _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
+    outward = np.einsum("fx,fx->f", crosses, posture.normals[posture.touchable[nearest]])
+    _, component = vertex_components(clean.faces, len(clean.positions))
+    owner = component[clean.faces[:, 0]]
+    return turn ^ (np.bincount(owner, weights=outward) < 0)[owner]
+
+
+def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
+    """Reverse the corners of the marked rows."""
+    result = rows.copy()
+    result[is_turned] = rows[is_turned][:, ::-1]
+    return result
+
+
+def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
+    """Return a warning of pins of the file, whose vertices remeshing replaces; raise if a number names them."""
+    counted = [text for text in options.pin if text.startswith("vertices:")]
+    if counted:
+        raise ConfigError(
+            f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
+            "a region or a loop"
+        )
+    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
+        return []
+    return [
+        "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "
+        "loop"
+    ]

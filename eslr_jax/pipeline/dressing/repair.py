@@ -1,0 +1,132 @@
+"""Repair the meshes that modelling programs export: seams, duplicates, loose parts, turned faces."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from eslr_jax.mesh.topology import face_areas, half_edges, undirected_edges, vertex_components
+
+
+@dataclasses.dataclass(frozen=True)
+class Cleaned:
+    """A repaired mesh, and the source of its vertices and faces."""
+
+    positions: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    vertex_map: Int[np.ndarray, " source_vertices"]  # new vertex of every source vertex; -1: dropped
+    face_source: Int[np.ndarray, " faces"]  # source face of every new face
+
+
+def weld(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], *, tolerance: float = 1e-5
+) -> Cleaned:
+    """Join coincident boundary vertices, then drop collapsed faces, repeated faces and loose vertices.
+
+    Only boundary vertices are joined. This closes seams that were split for texture coordinates, and keeps two
+    layers of cloth apart that touch. The tolerance is relative to the bounding box's diagonal.
+    """
+    diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    candidates = _boundary_vertices(faces)
+    pairs = KDTree(positions[candidates]).query_pairs(tolerance * diagonal, output_type="ndarray")
+    return merge_vertices(positions, faces, candidates[pairs])
+
+
+def merge_vertices(
+    positions: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    pairs: Int[np.ndarray, "pairs 2"],
+) -> Cleaned:
+    """Join the given pairs of vertices; a chain of pairs becomes its first vertex. See `weld`."""
+    num_vertices = len(positions)
+    graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (num_vertices, num_vertices))
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)  # labels ascend with their first vertex
+    merged = np.asarray(first)[label]
+    joined = merged[faces]
+    kept = np.flatnonzero((joined != joined[:, [1, 2, 0]]).all(axis=1))
+    _, earliest = np.unique(np.sort(joined[kept], axis=1), axis=0, return_index=True)
+    return _select_faces(positions, joined, kept[np.sort(earliest)], merged)
+
+
+def join_components(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gap: float
+) -> Cleaned:
+    """Sew separate parts together where their boundaries come within `gap` of each other.
+
+    Every boundary vertex is joined to the nearest boundary vertex of another part. Where one boundary has more
+    vertices than the other, several are joined to one. The slivers between them vanish if `gap` is at least
+    half the longer edges.
+    """
+    _, component = vertex_components(faces, len(positions))
+    candidates = _boundary_vertices(faces)
+    pairs = [np.empty((0, 2), np.int64)]
+    for part in np.unique(component[candidates]):
+        is_own = component[candidates] == part
+        own, others = candidates[is_own], candidates[~is_own]
+        if not len(others):
+            break
+        distance, nearest = KDTree(positions[others]).query(positions[own], distance_upper_bound=gap)
+        is_near = np.isfinite(distance)
+        pairs.append(np.stack([own[is_near], others[nearest[is_near]]], axis=1))
+    return merge_vertices(positions, faces, np.concatenate(pairs))
+
+
+def largest_component(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Cleaned:
+    """Keep the connected part with the largest area."""
+    _, component = vertex_components(faces, len(positions))
+    owner = component[faces[:, 0]]
+    largest = np.argmax(np.bincount(owner, weights=face_areas(positions, faces)))
+    return _select_faces(positions, faces, np.flatnonzero(owner == largest), np.arange(len(positions)))
+
+
+def consistent_orientation(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Bool[np.ndarray, " faces"]:
+    """Return which faces to turn so that neighbours agree; most of each part's area stays unturned.
+
+    Edges with more than two faces and one-sided surfaces are left for `validate_mesh` to refuse.
+    """
+    starts, _, _ = half_edges(faces)
+    _, edge, counts = undirected_edges(faces)
+    order = np.argsort(edge, kind="stable")
+    begin = (np.cumsum(counts) - counts)[counts == 2]
+    first, second = order[begin], order[begin + 1]
+    agrees = starts[first] != starts[second]  # neighbours run along their edge in opposite directions
+    # Every face stands for two nodes, itself and its turned copy. Each is joined to the copy of the neighbour
+    # that agrees with it, so a part falls into two components, one with every face's better side.
+    num_faces = len(faces)
+    left, right = first // 3, second // 3
+    shift = np.where(agrees, 0, num_faces)
+    rows = np.concatenate([left, left + num_faces])
+    columns = np.concatenate([right + shift, right + num_faces - shift])
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(rows), bool), (rows, columns)), (2 * num_faces, 2 * num_faces)
+    )
+    _, sheet = connected_components(graph, directed=False)
+    sheet, turned_sheet = sheet[:num_faces], sheet[num_faces:]
+    areas = np.bincount(sheet, weights=face_areas(positions, faces), minlength=2 * num_faces)
+    return areas[turned_sheet] > areas[sheet]
+
+
+def _select_faces(
+    positions: np.ndarray, faces: np.ndarray, kept: np.ndarray, vertex_map: np.ndarray
+) -> Cleaned:
+    """Keep some faces and the vertices they use, and renumber; `vertex_map` is that of `faces`."""
+    used = np.unique(faces[kept])
+    number = np.full(len(positions), -1)
+    number[used] = np.arange(len(used))
+    return Cleaned(positions[used], number[faces[kept]], number[vertex_map], kept)
+
+
+def _boundary_vertices(faces: np.ndarray) -> np.ndarray:
+    """Return the vertices on edges of a single face, in ascending order; the mesh may be broken."""
+    edges, _, counts = undirected_edges(faces)
+    return np.unique(edges[counts == 1])

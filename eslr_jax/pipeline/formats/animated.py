@@ -1,0 +1,299 @@
+"""Meshes that move, and the joints that move them, as the formats of other programs want them.
+
+Checked; one texture coordinate a vertex; few shapes; local motions of joints, and what these leave of a motion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+from scipy.spatial.transform import Rotation
+
+from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.files.atomic import atomic_write, ensure_output_dir
+from eslr_jax.files.npz import check_layout
+from eslr_jax.pipeline.formats.palette import GARMENT_COLORS, Color
+
+_RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
+_FLAT = 0.05  # determinant of blended rotations below which a vertex can't be moved in every direction
+# A skin weight that moves a vertex by less than float32 resolves over a body's size.
+_NEGLIGIBLE_WEIGHT = 1e-6
+_LAYOUT = {  # of an AnimatedMesh and its Skin
+    "positions": ("f", "frames vertices 3"),
+    "faces": ("iu", "faces 3", "vertices"),
+    "corner_uvs": ("f", "faces 3 2"),
+    "velocities": ("f", "frames vertices 3"),
+    "rest_positions": ("f", "vertices 3"),
+    "joint_transforms": ("f", "frames joints 3 4"),
+    "joint_rest_positions": ("f", "joints 3"),
+    "parents": ("iu", "joints"),
+    "joint_names": ("U", "joints"),
+    "skin_weights": ("f", "vertices influences"),
+    "skin_indices": ("iu", "vertices influences", "joints"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Skin:
+    """Joints that move, and how a mesh is bound to them: posed = sum_j weight_j (R_j rest + t_j)."""
+
+    skin_weights: np.ndarray  # [vertices, influences], rows sum to one
+    skin_indices: np.ndarray  # [vertices, influences]
+    joint_transforms: np.ndarray  # [frames, joints, 3, 4], rest point -> posed point [m]
+    joint_rest_positions: np.ndarray  # [joints, 3] [m]
+    parents: Sequence[int]  # -1 is a root
+    joint_names: Sequence[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class AnimatedMesh:
+    """A triangle mesh that moves."""
+
+    name: str
+    positions: np.ndarray  # [frames, vertices, 3] [m]
+    faces: np.ndarray  # [faces, 3]
+    color: Color = GARMENT_COLORS[0]
+    corner_uvs: np.ndarray | None = None  # texture coordinates of each face's corners, v up [faces, 3, 2]
+    velocities: np.ndarray | None = None  # [frames, vertices, 3] [m/s]
+    rest_positions: np.ndarray | None = None  # [vertices, 3] [m], what `skin` moves
+    skin: Skin | None = None  # joints that move it, exactly or nearly
+
+
+def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
+    """Raise a MeshError or a MotionError unless meshes can be written as one scene with this timestep [s]."""
+    if not np.isfinite(timestep) or timestep <= 0:
+        raise MotionError(f"timestep is {timestep} s; it must be positive")
+    if not meshes:
+        raise MeshError("no mesh to write; give at least one")
+    for mesh in meshes:
+        _check_mesh(mesh)
+    frames = {mesh.name: len(mesh.positions) for mesh in meshes}
+    if len(set(frames.values())) > 1:
+        raise MotionError(f"meshes need the same number of frames, these have {frames}")
+
+
+def _check_mesh(mesh: AnimatedMesh) -> None:
+    """Raise unless a mesh is finite, its parts and its joints fit each other, and these move rigidly."""
+    what, remedy = f"mesh {mesh.name}", "simulate it again"
+    arrays = {
+        key: np.asarray(value) for key, value in vars(mesh).items() if key in _LAYOUT and value is not None
+    }
+    if mesh.skin is not None:
+        arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+    check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+    if 0 in arrays["positions"].shape or not len(arrays["faces"]):
+        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+    is_finite = np.isfinite(arrays["positions"]).all((1, 2))
+    if not is_finite.all():
+        raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+    if mesh.skin is None:
+        return
+    if mesh.rest_positions is None:
+        raise MeshError(f"{what} has a skin and no rest positions; give both")
+    weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
+    if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
+        raise MeshError(
+            f"{what} has skin weights that are negative or don't sum to one; normalise them first"
+        )
+    matrices = transforms[..., :3]
+    gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
+    is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
+    is_rigid &= np.isfinite(transforms).all((2, 3))
+    if not is_rigid.all():
+        frame, joint = np.argwhere(~is_rigid)[0]
+        raise MotionError(
+            f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
+        )
+
+
+def split_seams(
+    faces: np.ndarray, num_vertices: int, corner_uvs: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Give each vertex one texture coordinate by splitting the vertices on seams.
+
+    Args:
+        faces: Triangles, shape [faces, 3].
+        num_vertices: Number of vertices.
+        corner_uvs: Texture coordinate of every corner, shape [faces, 3, 2]; None splits nothing.
+
+    Returns:
+        Faces; the old vertex of each new one, where old vertices come first and in order; and texture coordinates
+        [vertices, 2], zero for vertices without a face.
+    """
+    if corner_uvs is None:
+        return faces, np.arange(num_vertices), None
+    corners = faces.reshape(-1)
+    values = np.asarray(corner_uvs, np.float32).reshape(-1, 2)
+    keys = np.concatenate([corners[:, None].astype(np.float64), values.astype(np.float64)], axis=1)
+    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    owner = unique[:, 0].astype(np.int64)
+    order = np.lexsort([first, owner])  # of each vertex the coordinate that comes first in the file
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = owner[order][1:] != owner[order][:-1]
+    place = np.empty(len(order), np.int64)
+    place[order[is_first]] = owner[order[is_first]]
+    extra = order[~is_first]
+    extra = extra[np.argsort(first[extra], kind="stable")]
+    place[extra] = num_vertices + np.arange(len(extra))
+    uvs = np.zeros((num_vertices + len(extra), 2), np.float32)
+    uvs[place] = unique[:, 1:]
+    return place[inverse.ravel()].reshape(-1, 3), np.concatenate([np.arange(num_vertices), owner[extra]]), uvs
+
+
+def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Average the area-weighted face normals around each vertex.
+
+    Args:
+        positions: Vertex positions [m], shape [vertices, 3].
+        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
+
+    Returns:
+        Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
+    """
+    corners = positions[faces].astype(np.float64)
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.stack(
+        [
+            np.bincount(faces.reshape(-1), np.repeat(face_normals[:, axis], 3), minlength=len(positions))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+
+
+def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find few shapes whose weighted sums are the offsets of every frame (principal component analysis).
+
+    A shape is `basis.T @ offsets`, and `basis[t]` holds its weight in frame t. Other values per frame, such as
+    normals, may be projected on the same basis.
+
+    Args:
+        offsets: Offsets of the vertices [m], shape [frames, vertices, 3].
+        tolerance: Largest error of any vertex in any frame [m].
+
+    Returns:
+        Basis [frames, shapes] with orthonormal columns, and the shapes [shapes, vertices, 3] [m].
+    """
+    table = np.asarray(offsets, np.float64).reshape(len(offsets), -1)
+    values, vectors = np.linalg.eigh(table @ table.T)
+    values, basis = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    # No vertex errs less than the mean square of the shapes left out: begin there, and add until the worst fits.
+    left = np.append(np.cumsum(values[::-1])[::-1], 0.0) / (table.size / 3)
+    count = int(np.argmax(left <= tolerance**2))
+    while True:
+        shapes = basis[:, :count].T @ table
+        away = np.linalg.norm((table - basis[:, :count] @ shapes).reshape(-1, 3), axis=1).max()
+        if away <= tolerance or count >= len(table):
+            return basis[:, :count], shapes.reshape(count, *np.shape(offsets)[1:])
+        count = min(len(table), count + max(1, count // 8))
+
+
+def influences(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+    """Return skin weights that matter, largest first, and their joints, both [vertices, influences]."""
+    weights, indices = np.asarray(skin.skin_weights, np.float64), np.asarray(skin.skin_indices)
+    order = np.argsort(-weights, axis=1, kind="stable")
+    weights, indices = np.take_along_axis(weights, order, 1), np.take_along_axis(indices, order, 1)
+    used = max(1, int((weights > _NEGLIGIBLE_WEIGHT).any(0).sum()))
+    weights, indices = weights[:, :used], indices[:, :used]
+    return weights / weights.sum(1, keepdims=True), np.where(weights > 0, indices, 0)
+
+
+def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
+    """Split joint transforms into rotations and translations relative to each joint's parent.
+
+    Returns:
+        Quaternions (x, y, z, w), shape [frames, joints, 4], which never take the long way round from one frame to
+        the next, and translations [m], shape [frames, joints, 3]. At rest no joint is rotated.
+    """
+    transforms = np.asarray(skin.joint_transforms, np.float64)
+    matrices, rest = transforms[..., :3], np.asarray(skin.joint_rest_positions, np.float64)
+    origins = np.einsum("tjab,jb->tja", matrices, rest) + transforms[..., 3]
+    rotations, translations = np.empty((*transforms.shape[:2], 4)), np.empty((*transforms.shape[:2], 3))
+    for joint, parent in enumerate(skin.parents):
+        local, shift = matrices[:, joint], origins[:, joint]
+        if parent >= 0:
+            local = np.einsum("tba,tbc->tac", matrices[:, parent], local)
+            shift = np.einsum("tba,tb->ta", matrices[:, parent], shift - origins[:, parent])
+        quaternions = Rotation.from_matrix(local).as_quat()
+        flips = np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]) < 0
+        signs = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
+        rotations[:, joint], translations[:, joint] = quaternions * signs[:, None], shift
+    return rotations.astype(np.float32), translations.astype(np.float32)
+
+
+def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """Return what to add to the rest vertices so that the joints move them to given positions.
+
+    Args:
+        skin: The skin.
+        rest: Vertex positions at rest [m], shape [vertices, 3].
+        positions: Vertex positions [m], shape [frames, vertices, 3].
+        tolerance: Distance that needs no correction [m].
+
+    Returns:
+        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance.
+    """
+    weights, indices = influences(skin)
+    rows = np.repeat(np.arange(len(rest)), weights.shape[1])
+    blend = scipy.sparse.csr_array((weights.ravel(), (rows, indices.ravel())), (len(rest), len(skin.parents)))
+    transforms = np.asarray(skin.joint_transforms, np.float64).reshape(len(positions), -1, 12)
+
+    def blended(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return each vertex's matrix, and what the joints leave of its way."""
+        matrices = (blend @ transforms[frame]).reshape(-1, 3, 4)
+        moved = np.einsum("vab,vb->va", matrices[..., :3], rest) + matrices[..., 3]
+        return matrices[..., :3], positions[frame] - moved
+
+    frames = range(len(positions))
+    if all(np.linalg.norm(blended(frame)[1], axis=1).max() <= tolerance for frame in frames):
+        return None
+    result = np.zeros(np.shape(positions), np.float32)
+    for frame in frames:
+        matrices, away = blended(frame)
+        # Where opposite rotations cancel, no offset helps: a blend of rotations near zero counts as the identity.
+        is_flat = np.abs(np.linalg.det(matrices)) < _FLAT
+        matrices[is_flat] = np.eye(3)
+        result[frame] = np.linalg.solve(matrices, away[..., None])[..., 0]
+    return result
+
+
+def write_frames(
+    folder: str | Path, mesh: AnimatedMesh, suffix: str, content: Callable[[np.ndarray], bytes]
+) -> None:
+    """Write one file per frame into a new folder, which appears when it is complete.
+
+    Names sort alphabetically in the order of the frames.
+
+    Args:
+        folder: Path of the folder, which must be empty or not exist.
+        mesh: The mesh in motion.
+        suffix: Of the files.
+        content: From the positions of a frame, [vertices, 3] in float32, to the bytes of its file.
+    """
+    target = Path(folder)
+    if target.is_file() or (target.is_dir() and any(target.iterdir())):
+        raise AssetError(f"{target} exists already; name a new folder for the sequence")
+    ensure_output_dir(target.parent)
+    parts = target.with_name(f".{target.name}.part")
+    shutil.rmtree(parts, ignore_errors=True)  # of an export that was killed
+    digits = max(4, len(str(len(mesh.positions) - 1)))
+    try:
+        ensure_output_dir(parts)
+        for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
+            with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
+                temporary.write_bytes(content(positions))
+        if target.is_dir():
+            target.rmdir()
+        os.replace(parts, target)
+    except OSError as error:
+        raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
+    finally:
+        shutil.rmtree(parts, ignore_errors=True)

@@ -1,0 +1,249 @@
+"""Read skinned characters and their animations from glTF 2.0 files (.gltf, .glb, .vrm).
+
+The rest pose is the bind pose. The inverse bind matrices of a skin tell it in the mesh's own space. Exporters
+disagree on how that space lies in the world: see `_bind_space`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.files.parsing import parsing
+from eslr_jax.pipeline.formats.gltf_document import GltfDocument, sample_keys
+from eslr_jax.pipeline.formats.registry import reader
+from eslr_jax.pose.skeleton import (
+    MAX_POSES,
+    RiggedMesh,
+    Skeleton,
+    SkeletonMotion,
+    nearest_rotations,
+    order_joints,
+    unique_names,
+)
+
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
+_SCALE_TOLERANCE = 0.01  # by which a bind space may differ in size from the posed skin
+_SAME_SPACE = 1e-4  # relative difference of joints that show the bind pose, in float32
+
+
+@dataclasses.dataclass
+class _Joints:
+    """The joints of all skins of a file at rest, in world space."""
+
+    nodes: list[int]
+    rest_frames: np.ndarray  # [joints, 4, 4]
+    skeleton: Skeleton
+    spaces: dict[int, np.ndarray]  # skin -> matrix from its mesh space to the world
+
+
+def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
+    """Return the names of a file's animations."""
+    with parsing(path, "motion") as file:
+        return _clip_names(GltfDocument(file))
+
+
+@reader("body", GLTF_SUFFIXES)
+def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
+    """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
+
+    It has the shape that the file's weights of morph targets give it.
+
+    Args:
+        path: Path of a .gltf, .glb or .vrm file.
+        meshes: Names of the meshes, or of their nodes, that make up the body, as in "Skin,Hat"; "" is all that
+            are skinned.
+    """
+    document = GltfDocument(path)
+    joints = _read_joints(document)
+    found = {}  # skinned nodes, and the names they go by
+    for index, node in enumerate(document.items("nodes")):
+        if "mesh" in node and "skin" in node:
+            entries = (node, document.item("meshes", node["mesh"]))
+            found[index] = [str(entry["name"]) for entry in entries if entry.get("name")] or [f"mesh{index}"]
+    wanted = set(filter(None, meshes.split(",")))
+    if unknown := sorted(wanted.difference(*found.values())):
+        known = ", ".join(names[0] for names in found.values())
+        raise AssetError(f"{path} has no skinned mesh {unknown[0]!r}; it has {known}")
+    nodes = [node for node, names in found.items() if not wanted or wanted & set(names)]
+    parts = [part for node in nodes for part in _read_node(document, joints, node)]
+    if not parts:
+        raise AssetError(f"{path} has a skin, but no triangles bound to it; export the mesh with its skin")
+    offsets = np.cumsum([0, *(len(part[0]) for part in parts)])
+    influences = max(part[2].shape[1] for part in parts)
+    positions, faces, weights, indices = zip(*parts, strict=True)
+
+    def widen(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, ((0, 0), (0, influences - array.shape[1])))
+
+    return RiggedMesh(
+        name=path.name,
+        positions=np.concatenate(positions),
+        faces=np.concatenate([part + offset for part, offset in zip(faces, offsets, strict=False)]),
+        skin_weights=np.concatenate([widen(part) for part in weights]),
+        skin_indices=np.concatenate([widen(part) for part in indices]),
+        skeleton=joints.skeleton,
+    )
+
+
+@reader("motion", GLTF_SUFFIXES)
+def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
+    """Read an animation of a character's joints, at the rate of its densest keys; "" names the only one."""
+    document = GltfDocument(path)
+    names = _clip_names(document)
+    if not names:
+        raise MotionError(f"{path} has no animation; export the character with one")
+    if not clip and len(names) > 1:
+        raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
+    if clip and clip not in names:
+        raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+    joints = _read_joints(document)
+    index = names.index(clip) if clip else 0
+    keys = document.key_frames(document.items("animations")[index])
+    if not keys:
+        raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")
+    times, fps = document.sample_times([key[3] for key in keys])
+    if len(times) * len(document.parents) > MAX_POSES:
+        raise MotionError(f"{path}: {len(times)} frames of {len(document.parents)} nodes; cut the clip")
+    animated = {
+        (node, what): sample_keys(what, kind, at, values, times) for node, what, kind, at, values in keys
+    }
+    world = document.world_matrices(animated, len(times))[:, joints.nodes]
+    since_rest = world @ np.linalg.inv(joints.rest_frames)
+    return SkeletonMotion(
+        names[index], joints.skeleton, nearest_rotations(since_rest[..., :3, :3]), world[..., :3, 3], fps
+    )
+
+
+def _clip_names(document: GltfDocument) -> tuple[str, ...]:
+    """Return the names of the animations; those without a name are numbered."""
+    entries = document.items("animations")
+    return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
+
+
+def _read_joints(document: GltfDocument) -> _Joints:
+    """Collect the joints of all skins at rest."""
+    skins = document.items("skins")
+    if not skins:
+        raise AssetError(f"{document.path} has no skin; give a character that is bound to a skeleton")
+    world = document.world_matrices({}, 1)[0]
+    users = {
+        node.get("skin"): index
+        for index, node in reversed(list(enumerate(document.items("nodes"))))
+        if "skin" in node
+    }
+    frames: dict[int, np.ndarray] = {}
+    spaces: dict[int, np.ndarray] = {}
+    for number, skin in enumerate(skins):
+        nodes, bind = _read_skin(document, skin, number)
+        user = users.get(number)
+        spaces[number] = _bind_space(document, world, nodes, bind, user)
+        rest = spaces[number] @ np.linalg.inv(bind)
+        for node, frame in zip(nodes, rest, strict=True):
+            frames.setdefault(node, frame)
+    nodes = list(frames)
+    place = {node: joint for joint, node in enumerate(nodes)}
+    parents = []
+    for node in nodes:
+        above = document.parents[node]
+        while above >= 0 and above not in place:
+            above = document.parents[above]
+        parents.append(place.get(above, -1))
+    names = unique_names([str(document.item("nodes", node).get("name") or f"joint{node}") for node in nodes])
+    order, new_parents = order_joints(names, parents, what=str(document.path))
+    nodes = [nodes[joint] for joint in order]
+    rest_frames = np.stack([frames[node] for node in nodes])
+    skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest_frames[:, :3, 3])
+    return _Joints(nodes, rest_frames, skeleton, spaces)
+
+
+def _read_skin(document: GltfDocument, skin: dict[str, Any], number: int) -> tuple[list[int], np.ndarray]:
+    """Return a skin's joint nodes and its inverse bind matrices [joints, 4, 4]."""
+    nodes = skin.get("joints", [])
+    if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
+        raise document.fail(f"has skin {number} without joints, or with one twice")
+    for node in nodes:
+        document.item("nodes", node)
+    bind = np.tile(np.eye(4), (len(nodes), 1, 1))
+    if "inverseBindMatrices" in skin:
+        values = document.array(skin["inverseBindMatrices"])
+        if values.shape[1:] != (16,) or len(values) < len(nodes):
+            raise document.fail(f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints")
+        bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
+    if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
+        raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
+    return nodes, bind
+
+
+def _bind_space(
+    document: GltfDocument, world: np.ndarray, nodes: list[int], bind: np.ndarray, user: int | None
+) -> np.ndarray:
+    """Return the matrix that takes a skin's mesh space to the world in the bind pose.
+
+    In the pose of the nodes, joint j takes the mesh space to the world by G_j B_j. If the nodes are in the bind
+    pose, these matrices agree and are the answer. Otherwise the answer is the matrix of the mesh's node or of the
+    skeleton's parent, whichever has the right size and is nearer to the joints; else that of the first joint.
+    """
+    posed = world[nodes] @ bind
+    size = np.cbrt(abs(np.linalg.det(posed[0, :3, :3])))
+    if np.abs(posed - posed[0])[:, :3, :3].max() <= _SAME_SPACE * size:
+        return posed[0]
+    top = min(nodes, key=document.order.index)
+    candidates = [np.eye(4) if document.parents[top] < 0 else world[document.parents[top]]]
+    if user is not None:
+        candidates.append(world[user])
+    best, least = posed[0], np.inf
+    for candidate in candidates:
+        own = np.cbrt(abs(np.linalg.det(candidate[:3, :3])))
+        away = np.abs(posed - candidate)[:, :3, :3].mean()
+        if abs(own - size) <= _SCALE_TOLERANCE * size and away < least:
+            best, least = candidate, away
+    return best
+
+
+def _read_node(
+    document: GltfDocument, joints: _Joints, index: int
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Return positions [m], faces, weights and joints of each primitive of a skinned node."""
+    node = document.item("nodes", index)
+    skin = document.item("skins", node["skin"])
+    space = joints.spaces[node["skin"]]
+    place = {joint: number for number, joint in enumerate(joints.nodes)}
+    order = np.array([place[joint] for joint in skin["joints"]])
+    result = []
+    for primitive in document.item("meshes", node["mesh"]).get("primitives", []):
+        attributes = primitive.get("attributes", {})
+        if "JOINTS_0" not in attributes:
+            continue
+        points, faces = document.shaped_triangles(node, primitive)
+        if np.linalg.det(space[:3, :3]) < 0:
+            faces = faces[:, ::-1]
+        weights, local = _read_weights(document, attributes, len(points))
+        if local.max() >= len(order):
+            raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
+        world = points @ space[:3, :3].T + space[:3, 3]
+        result.append((world, faces, weights, order[local.astype(np.int64)]))
+    return result
+
+
+def _read_weights(
+    document: GltfDocument, attributes: dict[str, Any], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return all skin weights of a primitive, rows summing to one, and their joints, [vertices, influences]."""
+    weights, joints = [], []
+    number = 0
+    while f"JOINTS_{number}" in attributes:
+        weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
+        joints.append(document.array(attributes[f"JOINTS_{number}"]))
+        if weights[-1].shape != (count, 4) or joints[-1].shape != (count, 4):
+            raise document.fail("has skin weights that don't fit its vertices")
+        number += 1
+    weight, joint = np.concatenate(weights, axis=1), np.concatenate(joints, axis=1)
+    total = weight.sum(axis=1, keepdims=True)
+    if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
+        raise document.fail("has a vertex without skin weights")
+    return weight / total, np.where(weight > 0, joint, 0.0)

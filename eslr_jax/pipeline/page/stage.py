@@ -1,0 +1,178 @@
+"""A simulation that goes on frame by frame while a person watches and changes it."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.config import SimConfig
+from eslr_jax.contact.self_contact import default_rows
+from eslr_jax.numerics import Vector3
+from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
+from eslr_jax.simulation.plan import prepare_scene
+from eslr_jax.simulation.program import begin_program, find_program
+from eslr_jax.simulation.rollout import step_frame
+from eslr_jax.simulation.stepper import FrameReport, make_stepper
+from eslr_jax.terms import Air, Collision, Elements, Repulsion, Term, scene_terms
+from eslr_jax.terms.problem import FrameProblem
+from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene
+
+MOST_ITERATIONS = 100
+_CONFIG = SimConfig(iterations=MOST_ITERATIONS)
+_HOLD = 20.0  # [N/m], of the spring to a hand: at half a metre it pulls with a kilogram's weight
+
+
+@struct.dataclass
+class Hand(Term):
+    """What holds the cloth: a spring from a vertex to a place."""
+
+    name = "hand"
+
+    vertex: Int[Array, ""]
+    place: Float[Array, " 3"]  # [m]
+    stiffness: Float[Array, ""]  # [N/m]; zero where nothing is held
+
+    def elements(self, x: Vector3, problem: FrameProblem, data: None) -> tuple[Elements, ...]:
+        """Return the energy of the spring [J]."""
+        squared = sum((part[self.vertex] - place) ** 2 for part, place in zip(x, self.place, strict=True))
+        return (Elements(0.5 * self.stiffness * squared[None], self.vertex[None, None]),)
+
+
+class Stage(NamedTuple):
+    """A scene that can be stepped forth and back along its motion."""
+
+    scene: Scene  # with tracks
+    constant: Scene  # without
+    inputs: FrameInput  # from every frame to the next
+    back: FrameInput  # from every frame to the one before
+
+
+class Step(NamedTuple):
+    """One frame."""
+
+    state: ClothState
+    report: FrameReport
+
+
+def no_hand() -> Hand:
+    """Return a hand that holds nothing."""
+    return Hand(jnp.int32(0), jnp.zeros(3), jnp.float32(0.0))
+
+
+def grasp(vertex: int, place: Any) -> Hand:
+    """Return a hand that pulls a vertex to a place [m]."""
+    return Hand(jnp.int32(vertex), jnp.asarray(place, jnp.float32), jnp.float32(_HOLD))
+
+
+def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
+    """Return a garment on a moving body, with all that one can change while it moves.
+
+    It is stepped by BDF2 in air. Changes of fabric, wind, hand and tolerance do not compile anew.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion, two frames or more.
+        material: Fabric.
+
+    Raises:
+        MotionError: The motion has fewer than two frames.
+    """
+    # Nobody enlarges its buffers here.
+    layers = Repulsion(num_rows=default_rows(garment.vertex_mask.shape[0]))
+    terms = scene_terms(Collision(has_skin=True), layers, Air((0.0, 0.0, 0.0)), no_hand())
+    begin = partial(_begin_compiling, material)
+    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
+    return _staged(scene, material)
+
+
+def _begin_compiling(material: Material, scene: Scene) -> None:
+    """Begin to compile the step of a scene, of which the shapes are known."""
+
+    def first_step(scene: Scene) -> tuple:
+        stage = _staged(scene, material)
+        frame = jax.tree.map(lambda leaf: leaf[0], stage.inputs)
+        return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
+
+    begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+
+
+def _staged(scene: Scene, material: Material) -> Stage:
+    """Return the stage of a scene."""
+    inputs = frame_inputs(scene)
+    back = (
+        inputs
+        if inputs.body is None
+        else inputs._replace(body=inputs.body._replace(start=inputs.body.end, end=inputs.body.start))
+    )
+    if scene.pin_targets is not None:
+        back = back._replace(pin_targets=scene.pin_targets[:-1])
+    constant = jax.tree.map(jnp.asarray, without_tracks(scene)).replace(num_frames=2)
+    # Changed to what it is, so that it has the types of all that it will be changed to.
+    return changed(Stage(scene, constant, inputs, back), material, (0.0, 0.0, 0.0), no_hand())
+
+
+def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
+    """Return a stage with another fabric, wind [m/s] and hand."""
+    asked = jax.tree.map(jnp.asarray, (Air(jnp.asarray(wind, jnp.float32)), hand))
+    material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
+    terms = (*stage.constant.terms[: -len(asked)], *asked)  # they stand last
+    constant = stage.constant.replace(material=material, terms=terms)
+    return stage._replace(constant=constant)
+
+
+def advance(
+    stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int, tolerance: float
+) -> Step:
+    """Step the cloth while the body moves from one frame to a neighbour.
+
+    Args:
+        stage: Of `set_stage`.
+        state: Cloth at the first of the two frames.
+        frames: Two neighbouring frames.
+        iterations: Of the solver, at most.
+        tolerance: Share of the initial gap at which the frame may end.
+    """
+    now, then = frames
+    inputs = stage.inputs if then > now else stage.back
+    row = min(now, then)
+    frame = jax.tree.map(lambda leaf: leaf[row], inputs)
+    arguments = (stage.constant, state, frame, jnp.int32(iterations), jnp.float32(tolerance))
+    return find_program(_step, _CONFIG, arguments)(*arguments)
+
+
+def _step(
+    scene: Scene,
+    state: ClothState,
+    frame: FrameInput,
+    iterations: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    *,
+    config: SimConfig,
+) -> Step:
+    stepper = make_stepper(None, config, iterations, tolerance)
+    return Step(*step_frame(stepper, scene, state, frame))
+
+
+def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
+    """Return the vertex that a ray points at.
+
+    It is the first vertex along the ray, among those that are at most a centimetre farther from the ray than the
+    nearest one.
+
+    Args:
+        positions: Vertices [m].
+        origin: Where the ray begins [m].
+        direction: Where it goes; unit length.
+    """
+    offset = positions - np.asarray(origin)
+    along = offset @ np.asarray(direction)
+    aside = np.linalg.norm(offset - along[:, None] * np.asarray(direction), axis=1)
+    aside = np.where(along > 0, aside, np.inf)
+    is_close = aside <= aside.min() + 0.01
+    return int(np.flatnonzero(is_close)[np.argmin(along[is_close])])

@@ -1,0 +1,205 @@
+"""Evaluate a network on a split: optimality gap, and free rollouts (host)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.spatial import cKDTree
+
+from eslr_jax.config import EvaluationOptions, SimConfig
+from eslr_jax.errors import ConfigError, Status
+from eslr_jax.mesh.prepare import pad_alike
+from eslr_jax.networks.network import Network
+from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, load_splits, split_clips
+from eslr_jax.pipeline.report.controls import control_garment, control_network
+from eslr_jax.pipeline.report.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
+from eslr_jax.pipeline.report.metrics import extremes, measure_frames
+from eslr_jax.pipeline.report.report import mean_energies
+from eslr_jax.pose.motion import back_and_forth, pose_body, still_motion
+from eslr_jax.simulation.plan import prepare_scene, shared_surface
+from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
+from eslr_jax.types import Scene, Trajectory
+
+_TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
+_REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
+_STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
+_STILL_ARM_ANGLE = -20.0  # [degrees] from the rest pose
+_REACH = 0.06  # [m] of cloth, within which a body vertex counts as covered
+
+
+def evaluate(
+    network: Network,
+    options: EvaluationOptions,
+    *,
+    iterations: int = 0,
+    on_scene: Callable[[int, int, str], None] = lambda done, total, label: None,
+) -> dict[str, Any]:
+    """Evaluate a network.
+
+    Args:
+        network: The network.
+        options: Split, garments, clips and lengths.
+        iterations: Solver iterations behind the network.
+        on_scene: Called after each garment and clip with the count, the total and a label.
+
+    Returns:
+        Plain values: teacher-forced and on-policy gap [J] beside that of L-BFGS from the same states, and
+        the measures of free rollouts; per garment and clip under `scenes`.
+
+    Raises:
+        ConfigError: There is no such split, or it is empty; or iterations are negative.
+    """
+    if iterations < 0:
+        raise ConfigError(f"iterations = {iterations}; give 0 or more")
+    garments = options.garments or tuple(load_splits()["garments"]["train"])
+    clips = options.clips or split_clips(options.split)
+    config = SimConfig(iterations=iterations, tolerance=0.0)
+    body = load_body()
+    scenes, forced, policy = [], [], []
+    drifts: dict[str, float | None] = {}
+    total = len(garments) * len(clips)
+    # Padded to one bucket: all scenes then share one compiled rollout.
+    load = partial(load_garment, vertices=options.vertices, **network.garment_options)  # type: ignore[arg-type]
+    cloths = pad_alike([load(name) for name in garments])
+    if options.control is not None:
+        network = control_network(options.control, network)
+        cloths = [control_garment(options.control, cloth) for cloth in cloths]
+    surface = shared_surface(cloths, body)
+    for garment, cloth in zip(garments, cloths, strict=True):
+        for clip in clips:
+            motion = load_motion(clip)
+
+            def scene_of(num_frames: int, motion=motion, cloth=cloth):
+                poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
+                return prepare_scene(cloth, poses, surface=surface)
+
+            if options.gap_frames:
+                on_truth, on_policy = _gaps(network, scene_of(options.gap_frames), config, options.every)
+                forced.append(on_truth)
+                policy.append(on_policy)
+            scene = scene_of(options.rollout_frames)
+            free = _roll(network, scene, config)
+            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
+            apart = distance_mm(free, optimum, scene)
+            row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
+            scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
+            on_scene(len(scenes), total, f"{garment} {clip}")
+        still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
+        resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
+        drifts[garment] = _drift(network, resting, config)
+    known = [drift for drift in drifts.values() if drift is not None]
+    largest = max(known) if len(known) == len(drifts) else None
+    return {
+        "split": None if options.clips else options.split,
+        "vertices": options.vertices,
+        "garments": list(garments),
+        "clips": list(clips),
+        **({**_summarize(forced), "on_policy": _summarize(policy)} if forced else {}),
+        "rollout": _pool_rollouts(scenes) | {"drift_mm_s": largest, "drift_mm_s_of": drifts},
+        "scenes": scenes,
+    }
+
+
+def _gaps(
+    network: Network, scene: Scene, config: SimConfig, every: int
+) -> tuple[OptimalityGap, OptimalityGap]:
+    """Return the gaps from the optimum's states and from those of the network's own rollout."""
+    options = GapOptions(every=every, refined=(config.iterations,))
+    measured = []
+    truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
+    for stepper, steps in ((None, truth), (network, config)):
+        trajectory = _roll(stepper, scene, steps)
+        measured.append(jax.device_get(measure_gap(network, trajectory, scene, options)))
+    return measured[0], measured[1]
+
+
+def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:
+    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on.
+
+    Raises:
+        EslrError: The solver's rollout goes wrong.
+    """
+    simulation = simulate(network, scene, config=config, raises=network is None)
+    return hold_last(simulation.trajectory, scene.num_frames)
+
+
+def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
+    """Return medians over all frames of all scenes: joules, and relative to the frame's own initial gap."""
+    whole: OptimalityGap = jax.tree.map(lambda *parts: np.concatenate(parts), *measured)
+    return {
+        "frames": len(whole.optimum),
+        **gap_medians(whole, next(iter(whole.refined.values()))),
+        "lbfgs": {str(count): gap_medians(whole, whole.solver[count]) for count in ITERATIONS},
+    }
+
+
+def distance_mm(trajectory: Trajectory, reference: Trajectory, scene: Scene) -> float:
+    """Return how far two rollouts of a scene are apart: mean over vertices and simulated frames [mm]."""
+    apart = np.asarray(trajectory.positions)[1:] - np.asarray(reference.positions)[1:]
+    return float(np.linalg.norm(apart[:, np.asarray(scene.garment.vertex_mask)], axis=-1).mean() * 1e3)
+
+
+def measure_rollout(trajectory: Trajectory, scene: Scene) -> dict[str, Any]:
+    """Return plain measures of a trajectory; `num_frames` are those before the first bad one.
+
+    Raises:
+        ConfigError: The scene has no body, against which penetration and coverage are measured.
+    """
+    if scene.body is None:
+        raise ConfigError("penetration and coverage are measured against a body; give a scene with one")
+    measures = jax.device_get(measure_frames(trajectory.positions, scene))
+    is_real = np.asarray(scene.garment.vertex_mask)
+    positions = np.asarray(trajectory.positions)[:, is_real]
+    jerk = np.diff(positions, n=3, axis=0) / float(scene.timestep) ** 3
+    skin = np.asarray(scene.body.positions)[-1]
+    apart, _ = cKDTree(positions[-1]).query(skin, distance_upper_bound=_REACH)
+    return {
+        "finite": bool(np.isfinite(positions).all())
+        and Status.NON_FINITE not in Status(int(trajectory.status)),
+        "num_frames": good_frames(trajectory).num_frames,
+        **mean_energies(trajectory),
+        **extremes(measures, is_real),
+        "jitter_m_s3": float(np.median(np.linalg.norm(jerk, axis=-1))),
+        "coverage": float(np.isfinite(apart).mean()),
+    }
+
+
+def _drift(network: Network, scene: Scene, config: SimConfig) -> float | None:
+    """Return the sideways speed of the garment's centre on a still body, over the last second [mm/s].
+
+    None where the rollout went wrong: it stands still from there on.
+    """
+    trajectory = _roll(network, scene, config)
+    if Status(int(trajectory.status)) != Status.OK:
+        return None
+    areas = np.asarray(scene.garment.vertex_areas)
+    centre = np.einsum("v,tvc->tc", areas / areas.sum(), np.asarray(trajectory.positions))
+    frames = round(1.0 / float(scene.timestep))
+    moved = centre[-1] - centre[-1 - frames]
+    return float(np.hypot(moved[0], moved[2]) * 1e3)
+
+
+def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return means, and the worst where a bar is on the worst; `optimum` holds the same of the solver."""
+    pooled = {
+        "finite": all(scene["finite"] for scene in scenes),
+        "stretch_p99": float(np.max([scene["stretch_p99"] for scene in scenes])),
+        "penetration_p999_mm": float(np.max([scene["penetration_p999_mm"] for scene in scenes])),
+        **{
+            name: float(np.mean([scene[name] for scene in scenes]))
+            for name in ("total", "jitter_m_s3", "coverage")
+        },
+        "terms": {
+            name: float(np.mean([scene["terms"][name] for scene in scenes])) for name in scenes[0]["terms"]
+        },
+    }
+    if "optimum" in scenes[0]:
+        ratios = [scene["coverage"] / max(scene["optimum"]["coverage"], 1e-9) for scene in scenes]
+        pooled["coverage_worst_ratio"] = float(np.min(ratios))
+        pooled["distance_mm"] = float(np.mean([scene["distance_mm"] for scene in scenes]))
+        pooled["optimum"] = _pool_rollouts([scene["optimum"] for scene in scenes])
+    return pooled

@@ -1,0 +1,175 @@
+"""Values over a garment to colour it by: stretch, energies, optimality gap, distance to the body."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
+
+from eslr_jax.errors import AssetError
+from eslr_jax.mesh.topology import vertex_normals
+from eslr_jax.numerics import components, product, scatter_corners
+from eslr_jax.pipeline.report.gap import map_frames, trajectory_states
+from eslr_jax.pipeline.report.run import Run, run_trajectory
+from eslr_jax.simulation.frame import frame_inputs
+from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.potential import potential
+from eslr_jax.solver.solve import Start, solve
+from eslr_jax.terms import Repulsion
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.terms.stretch import principal_stretches
+from eslr_jax.terms.term import vertex_shares
+from eslr_jax.types import ClothState, Garment, Scene
+
+# Energy lost to air and damping belongs to a frame, not to a shape.
+_TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction", "repulsion")
+FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
+_BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
+_CONTACT_FIELDS = ("collision-energy", "friction-energy", "repulsion-energy", "gap")
+_ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
+_QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
+
+
+class Field(NamedTuple):
+    """A value per frame and vertex, with the range that a colour scale should span."""
+
+    values: Float[np.ndarray, "frames vertices"]
+    low: float
+    high: float
+    unit: str
+
+
+def run_field(run: Run, name: str) -> Field:
+    """Return a field of a run.
+
+    `stretch` is the largest principal stretch, averaged over the faces around a vertex; energies and `gap`
+    are those of the frame's minimisation problem, per area, see `energy_shares` and `gap_shares`; `distance`
+    is to the tangent plane of the nearest body vertex.
+
+    Args:
+        run: Of `read_run`.
+        name: One of `FIELDS`.
+
+    Raises:
+        AssetError: The field is unknown, or the run lacks what it needs.
+    """
+    if name not in FIELDS:
+        raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
+    if name in _BODY_FIELDS and run.trajectory.body is None:
+        raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
+    if name == "repulsion-energy" and run.scene.term(Repulsion) is None:
+        raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
+    if name == "distance":
+        return _distances(run)
+    garment = run.scene.garment
+    if name == "stretch":
+        values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
+        return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
+    values = _problem_values(run, name)
+    values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
+    # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
+    low, high = (
+        (0.0, np.quantile(values, 0.99)) if name in _CONTACT_FIELDS else np.quantile(values, [0.001, 0.999])
+    )
+    return Field(values, min(float(low), 0.0), max(float(high), 1e-6), "J/m2")
+
+
+@jax.jit
+def _stretches(
+    positions: Float[Array, "frames vertices 3"], garment: Garment
+) -> Float[Array, "frames vertices"]:
+    """Return the mean over a vertex' faces of their larger principal stretch, weighted by area."""
+
+    def frame(position: Float[Array, "vertices 3"]) -> Float[Array, " vertices"]:
+        larger, _ = principal_stretches(position, garment)
+        weights = garment.rest_areas[:, None] * jnp.ones((1, 3))
+        total = scatter_corners(weights, garment.face_incidence)
+        return scatter_corners(weights * larger[:, None], garment.face_incidence) / jnp.maximum(total, 1e-12)
+
+    return jax.lax.map(frame, positions)
+
+
+def _problem_values(run: Run, name: str) -> Float[np.ndarray, "frames vertices"]:
+    """Return a value [J] of the frames' minimisation problems; the first frame has none."""
+    trajectory = run_trajectory(run)
+    states, _ = trajectory_states(trajectory, run.scene)
+    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
+    return np.concatenate([np.zeros_like(values[:1]), values])
+
+
+@partial(jax.jit, static_argnames="name")
+def _every_frame(
+    name: str, reached: Float[Array, "frames vertices 3"], states: ClothState, scene: Scene
+) -> Float[Array, "frames vertices"]:
+    """State the problem of every frame and return a value of where the cloth went [J]."""
+
+    def measure(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
+        if name == "gap":
+            return gap_shares(position, problem)
+        return energy_shares(name.removesuffix("-energy"), position, problem)
+
+    return map_frames(measure, reached, states, frame_inputs(scene), scene)
+
+
+def energy_shares(
+    name: str, position: Float[Array, "vertices 3"], problem: FrameProblem
+) -> Float[Array, " vertices"]:
+    """Share the energy of the terms of one name out over the vertices [J]; the shares add up to it.
+
+    Args:
+        name: Of one of the problem's terms.
+        position: Positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem.
+    """
+    x = components(pin(problem, position))
+    parts = [
+        part
+        for term, data in zip(problem.terms, problem.data, strict=True)
+        if term.name == name
+        for part in term.elements(x, problem, data)
+    ]
+    return vertex_shares(tuple(parts), x[0].shape[0])
+
+
+def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> Float[Array, " vertices"]:
+    """Share the optimality gap out over the vertices [J]; the shares add up to it.
+
+    The share of a vertex is the work of the remaining force at it along its straight way x* + s (x - x*) to the
+    optimum, which is the integral of grad P . (x - x*) over s. The differences of `energy_shares` at x and x*
+    also add up to the gap. But they show the energy that the terms exchange, which is of first order in x - x*,
+    while the gap is of second order.
+
+    Args:
+        position: Any stepper's positions at t + 1 [m], shape [vertices, 3].
+        problem: The frame's problem.
+    """
+    start = Start(position, potential(pushed_out_guess(problem), problem))
+    minimum = solve(problem, start, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    way = position - minimum.position
+    places, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
+
+    def work(place: Float[Array, ""]) -> Float[Array, " vertices"]:
+        gradient = jax.grad(potential)(minimum.position + place * way, problem)
+        return jnp.sum(gradient * way, axis=-1)
+
+    works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
+    return product(jnp.asarray(0.5 * weights, position.dtype), works)
+
+
+def _distances(run: Run) -> Field:
+    """Return the height of every vertex over the tangent plane of the nearest body vertex [m]."""
+    trajectory = run.trajectory
+    if trajectory.body is None:
+        raise AssetError(f"{run.name} has no body, and so no distance to it")
+    values = np.empty(trajectory.positions.shape[:2], np.float32)
+    faces = trajectory.body.faces
+    for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body.positions, strict=True)):
+        normals = vertex_normals(body, faces)
+        _, nearest = cKDTree(body).query(cloth)
+        values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
+    return Field(values, 0.0, 0.06, "m")

@@ -1,0 +1,237 @@
+"""The report of a simulation, as plain values."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from eslr_jax.mesh.closest import nearest_places
+from eslr_jax.mesh.topology import vertex_normals
+from eslr_jax.pipeline.formats.garment import split_outfit
+from eslr_jax.pipeline.report.crossing import find_crossings
+from eslr_jax.pipeline.report.metrics import face_stretches, measure_frames, penetration_p999_mm
+from eslr_jax.terms import Ground, Repulsion
+from eslr_jax.types import BodyMotion, Scene, Trajectory
+
+_EVERY = 10  # frames between those whose crossings are counted
+_DEEP = 1e-3  # [m] inside the body, from which a depth is measured again
+_PACKAGES = ("eslr-jax", "jax", "jaxlib", "flax", "numpy")
+
+
+Parts = tuple[np.ndarray | None, tuple[str, ...]]
+"""Number of the part of every face, shape [faces], and the names of the parts; see `GarmentFile`."""
+
+
+def trajectory_report(
+    trajectory: Trajectory,
+    scene: Scene,
+    *,
+    parts: Parts = (None, ()),
+    poses: BodyMotion | None = None,
+    outfit: Mapping[str, int] | None = None,
+) -> dict[str, Any]:
+    """Measure a trajectory.
+
+    Args:
+        trajectory: What to measure.
+        scene: Its scene.
+        parts: Parts of the garment, which the worst places are named by.
+        poses: The whole body: what seems to be deep in the part that was searched for contacts is measured again.
+        outfit: Numbers of vertices of garments that are worn together, by name and in order.
+
+    Returns:
+        Plain values: energies [J] as means over frames, largest stretch, penetration [mm] and the share of
+        vertices that penetrate; without a body the penetration values are None. `worst_stretch` and
+        `worst_penetration` hold frame, time [s], vertex and part of the largest values. `garments` holds stretch
+        and penetration of every garment of an outfit by name; None for a single garment. `crossing_pairs` are the
+        most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
+        any, of every tenth simulated frame and the last; None where self-contact is not modelled.
+    """
+    measures = jax.device_get(measure_frames(trajectory.positions, scene))
+    trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
+    is_real = np.asarray(scene.garment.vertex_mask)
+    positions = np.asarray(trajectory.positions)[:, is_real]
+
+    def stretches(frame: int) -> np.ndarray:
+        return np.asarray(face_stretches(trajectory.positions[frame][None], scene.garment))[0]
+
+    depth, worst = None, None
+    if measures.distances is not None:
+        depth = -measures.distances[:, is_real]
+        if poses is not None:
+            depth = _measured_again(depth, positions[1:], poses)
+        if depth.max() > 0:
+            frame, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
+            worst = _place(int(frame) + 1, int(np.flatnonzero(is_real)[column]), scene, parts)
+    stretched = int(np.argmax(measures.max_stretch)) + 1
+    torn = int(np.asarray(scene.garment.faces)[stretches(stretched).argmax(), 0])
+    several = dict(outfit) if outfit is not None and len(outfit) > 1 else None
+    return {
+        "finite": bool(np.isfinite(positions).all()),
+        "num_frames": trajectory.num_frames,
+        "num_vertices": int(is_real.sum()),
+        **mean_energies(trajectory),
+        "max_principal_stretch": float(measures.max_stretch.max()),
+        "p99_principal_stretch": float(measures.p99_stretch.max()),
+        "start_principal_stretch": float(stretches(0).max()),
+        "worst_stretch": _place(stretched, torn, scene, parts),
+        "penetration_p999_mm": None if depth is None else penetration_p999_mm(depth),
+        **_penetration(depth),
+        "worst_penetration": worst,
+        "rms_speed_m_s": float(measures.speed.mean()),
+        "residual_median": float(np.median(trajectory.residuals[1:])),
+        "iterations_mean": float(np.mean(trajectory.iterations[1:])),
+        "garments": None if several is None else _garments(trajectory, scene, depth, several),
+        **_crossings(trajectory, scene, parts),
+    }
+
+
+def describe_terms(scene: Scene) -> dict[str, str]:
+    """Return a few words on the terms that a scene models, by name."""
+    words: dict[str, str] = {}
+    for term in scene.terms:
+        words[term.name] = ", ".join(filter(None, (words.get(term.name), term.describe(scene.garment))))
+    return words
+
+
+def describe_model(scene: Scene) -> dict[str, Any]:
+    """Return what a scene models, in words for a report; a scene is read from its own file."""
+    return {
+        "modelled": describe_terms(scene),
+        "integrator": "euler" if scene.initial_state.past is None else "bdf2",
+        "substeps": scene.substeps,
+        "ground_m": None if (ground := scene.term(Ground)) is None else float(ground.height),
+    }
+
+
+def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
+    """Return the largest of depths in a body [m], and the share that is inside; None without a body."""
+    return {
+        "penetration_max_mm": None if depth is None else float(max(depth.max(), 0.0) * 1e3),
+        "penetrating_share": None if depth is None else float((depth > 0).mean()),
+    }
+
+
+def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
+    """Return where cloth passes through cloth in spite of self-contact."""
+    if scene.term(Repulsion) is None:
+        return {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
+    faces = _real_faces(scene)
+    last = trajectory.num_frames - 1
+    frames = sorted({*range(_EVERY, last, _EVERY), last})
+    pairs = [find_crossings(np.asarray(trajectory.positions[frame]), faces).faces for frame in frames]
+    counts = [len(rows) for rows in pairs]
+    worst = int(np.argmax(counts))
+    vertex = int(faces[pairs[worst][0, 0], 0]) if counts[worst] else None
+    return {
+        "crossing_pairs": counts[worst],
+        "crossing_share": float(np.mean(np.array(counts) > 0)),
+        "worst_crossing": None if vertex is None else _place(frames[worst], vertex, scene, parts),
+    }
+
+
+def _real_faces(scene: Scene) -> np.ndarray:
+    """Return the faces of the garment that are no padding."""
+    return np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
+
+
+def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any] | None:
+    """Return where cloth lies deepest behind cloth in frame 0, which self-contact has to bring back.
+
+    Args:
+        scene: The scene.
+        parts: Parts of the garment, which the place is named by.
+
+    Returns:
+        Plain values: pairs of faces that intersect, `depth_mm` of the deepest vertex, its `position_m` and its
+        place. None where nothing is behind a layer that it passed, or self-contact is not modelled.
+    """
+    if scene.term(Repulsion) is None:
+        return None
+    positions = np.asarray(scene.initial_state.position)
+    crossings = find_crossings(positions, _real_faces(scene))
+    vertex = int(np.argmax(crossings.depths))
+    if crossings.depths[vertex] == 0:
+        return None
+    return {
+        "crossing_pairs": len(crossings.faces),
+        "depth_mm": 1e3 * float(crossings.depths[vertex]),
+        "position_m": positions[vertex].tolist(),
+        "place": _place(0, vertex, scene, parts),
+    }
+
+
+def _garments(
+    trajectory: Trajectory, scene: Scene, depth: np.ndarray | None, outfit: dict[str, int]
+) -> dict[str, dict[str, Any]]:
+    """Return stretch and penetration of the garments of an outfit, as the report has them of the whole.
+
+    `depth` is that of real vertices in simulated frames [m], None without a body.
+    """
+    stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))
+    is_face = np.asarray(scene.garment.rest_areas) > 0
+    found: dict[str, dict[str, Any]] = {}
+    for name, rows, is_own in split_outfit(np.asarray(scene.garment.faces), outfit):
+        stretch = stretches[:, is_own & is_face]
+        found[name] = {
+            "num_vertices": outfit[name],
+            "p99_principal_stretch": float(np.quantile(stretch, 0.99, axis=1, method="lower").max()),
+            "max_principal_stretch": float(stretch.max()),
+            **_penetration(None if depth is None else depth[:, rows]),
+        }
+    return found
+
+
+def _measured_again(depth: np.ndarray, positions: np.ndarray, poses: BodyMotion) -> np.ndarray:
+    """Return depths [m], shape [frames, vertices], with the large ones as they are in the whole body.
+
+    Contacts are searched among the faces in reach, approximately. Where that part ends, they may be far off.
+    `positions` are of the same frames; the body has one more, the first.
+    """
+    faces, depth = np.asarray(poses.faces), np.array(depth)
+    for frame in np.flatnonzero((depth > _DEEP).any(axis=1)):
+        body, deep = np.asarray(poses.positions[frame + 1]), np.flatnonzero(depth[frame] > _DEEP)
+        place = nearest_places(positions[frame, deep], body, faces, vertex_normals(body, faces))
+        is_outside = np.einsum("px,px->p", place.offsets, place.normals) > 0
+        depth[frame, deep] = np.where(is_outside, -1, 1) * np.linalg.norm(place.offsets, axis=1)
+    return depth
+
+
+def _place(frame: int, vertex: int, scene: Scene, parts: Parts) -> dict[str, Any]:
+    """Return a frame and a vertex as plain values, with the frame's time [s] and the vertex's part."""
+    numbers, names = parts
+    part = None
+    if numbers is not None and names:
+        around = (np.asarray(scene.garment.faces)[: len(numbers)] == vertex).any(axis=1)
+        part = names[int(np.bincount(numbers[around]).argmax())] if around.any() else None
+    return {"frame": frame, "time_s": frame * float(scene.timestep), "vertex": vertex, "part": part}
+
+
+def mean_energies(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the energies as means over simulated frames by name [J], `terms`, and their `total`."""
+    means = {name: float(np.mean(np.asarray(values)[1:])) for name, values in trajectory.energies.items()}
+    return {"terms": means, "total": sum(means.values())}
+
+
+def environment() -> dict[str, Any]:
+    """Return the device and the versions that a figure was measured with."""
+    device = jax.devices()[0]
+    kind = device.device_kind
+    if device.platform == "cpu":
+        try:
+            lines = Path("/proc/cpuinfo").read_text().splitlines()
+        except OSError:  # not Linux
+            lines = []
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        kind = f"{platform.machine()}, {names[0] if names else platform.processor()}"
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {
+        "device": f"{device.platform}: {kind}",
+        "versions": versions | {"python": platform.python_version()},
+    }

@@ -1,0 +1,145 @@
+"""Score anybody's trajectory by the measures that our own is reported with (host)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from eslr_jax.errors import ConfigError, MissingExtraError, MotionError, NonFiniteError
+from eslr_jax.pipeline.formats.garment import split_outfit
+from eslr_jax.pipeline.report.foreign import foreign_trajectory, with_energies
+from eslr_jax.pipeline.report.gap import gap_medians, trajectory_gap
+from eslr_jax.pipeline.report.metrics import face_stretches
+from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.report import Parts, trajectory_report
+from eslr_jax.pipeline.report.wear import wear_report
+from eslr_jax.pose.lbs import skin_garment
+from eslr_jax.simulation.simulate import enlarge_buffers
+from eslr_jax.types import BodyMotion, Scene, Trajectory
+
+EVERY = 4  # frames between those whose gap and intersections are measured, as in `eslr evaluate`
+_LEAST_FRAMES = (
+    3  # the gap is measured from the second simulated frame on: the first one's velocity is guessed
+)
+_INTERSECTIONS = (
+    "intersections_cloth",
+    "intersections_cloth_max",
+    "intersections_body",
+    "intersections_body_max",
+)
+
+
+def score_trajectory(
+    trajectory: Trajectory | Float[ArrayLike, "frames vertices 3"],
+    scene: Scene,
+    *,
+    poses: BodyMotion | None = None,
+    parts: Parts = (None, ()),
+    outfit: Mapping[str, int] | None = None,
+    every: int = EVERY,
+) -> dict[str, Any]:
+    """Score a trajectory of any simulator.
+
+    Args:
+        trajectory: Vertex positions [m], shape [frames, vertices, 3], in the order of the scene's garment; or a
+            trajectory, whose velocities and friction loads then count.
+        scene: What was simulated, of `prepare_scene`; it has as many frames.
+        poses: The whole body, see `trajectory_report`. If given, `wear_report` measures how the garment sits.
+        parts: Parts of the garment, see `trajectory_report`.
+        outfit: Garments that are worn together, see `trajectory_report`.
+        every: Frames between those whose gap and intersections are measured.
+
+    Returns:
+        Plain values: those of `trajectory_report` without `iterations_mean`, with `poses` those of `wear_report`,
+        and
+        - `pooled_stretch_p99`: the principal stretch that 99 % of the faces of all frames stay below;
+        - `gap_relative_median`, `gap_relative_max`: the optimality gap in our energy, from the trajectory's own
+          states, relative to the initial gap; `gap_median_j`, `gap_mean_j` and `gap_p90_j` in joules;
+          `gap_frames`, the number of frames in which the gap was measured;
+        - `intersections_cloth`, `intersections_body`: pairs of triangles that intersect in the last frame, and,
+          ending in `_max`, in the worst of the frames measured. None without the extra `score`. `garments` has
+          those of the last frame that a garment takes part in.
+
+    Raises:
+        ConfigError: `every` is less than one.
+        MotionError: There are fewer than three frames, or another number of frames or vertices than in the scene.
+        NonFiniteError: A position is NaN or infinite.
+    """
+    positions = np.asarray(trajectory.positions if isinstance(trajectory, Trajectory) else trajectory)
+    _check(positions, scene, every)
+    if not isinstance(trajectory, Trajectory):
+        trajectory = foreign_trajectory(positions, scene)
+    before = trajectory
+    trajectory = with_energies(before, scene)
+    if (
+        larger := enlarge_buffers(scene, trajectory)
+    ) is not None:  # those that `simulate` begins with are small
+        scene = larger
+        trajectory = with_energies(before, scene)
+    report = trajectory_report(trajectory, scene, parts=parts, poses=poses, outfit=outfit)
+    del report["iterations_mean"]  # another simulator's are not ours
+    if poses is not None:
+        skinned = jax.jit(skin_garment)(scene.garment, poses.joint_transforms)
+        report |= wear_report(positions, scene.garment, skinned, poses, parts=parts)
+    # BDF2 goes on by the residuals, if they are known; here as in the energies.
+    ends = jax.device_get(trajectory_gap(before, scene, every=every))
+    is_face = np.asarray(scene.garment.rest_areas) > 0
+    stretches = np.asarray(face_stretches(trajectory.positions[1:], scene.garment))[:, is_face]
+    return report | {
+        "pooled_stretch_p99": float(np.quantile(stretches, 0.99)),
+        "gap_frames": len(ends.reached),
+        **gap_medians(ends, ends.reached),
+        "gap_relative_max": float(np.max(ends.share(ends.reached))),
+        **_count_intersections(positions, scene, every, report["garments"]),
+    }
+
+
+def _check(positions: np.ndarray, scene: Scene, every: int) -> None:
+    """Raise unless positions are a trajectory of the scene."""
+    if every < 1:
+        raise ConfigError(f"every = {every}: give a number of frames, 1 or more")
+    expected = (scene.num_frames, *scene.initial_state.position.shape)
+    if positions.shape != expected:
+        raise MotionError(
+            f"positions {positions.shape} are not those of the scene, which has {list(expected)}: frames, "
+            "vertices and 3; give a trajectory of this garment and of all frames"
+        )
+    if len(positions) < _LEAST_FRAMES:
+        raise MotionError(f"{len(positions)} frames are too few to score; give {_LEAST_FRAMES} or more")
+    is_finite = np.isfinite(positions).all(axis=(1, 2))
+    if not is_finite.all():
+        raise NonFiniteError(f"frame {np.argmin(is_finite)} is not finite; cut the trajectory before it")
+
+
+def _count_intersections(
+    positions: np.ndarray, scene: Scene, every: int, garments: dict[str, dict[str, Any]] | None
+) -> dict[str, int | None]:
+    """Return the numbers of intersecting pairs of triangles in the last frame, and in the worst measured frame.
+
+    Every entry of `garments` gets the number of pairs in the last frame that involve this garment.
+    """
+    faces = np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
+    body, body_faces = None, None
+    if scene.body is not None:
+        body, body_faces = np.asarray(scene.body.positions), np.asarray(scene.body.surface.faces)
+    frames = sorted({*range(2, len(positions), every), len(positions) - 1})
+    try:
+        pairs = [
+            intersecting_pairs(positions[frame], faces, None if body is None else body[frame], body_faces)
+            for frame in frames
+        ]
+    except MissingExtraError:
+        return dict.fromkeys(_INTERSECTIONS)
+    is_body = [(found >= len(faces)).any(axis=1) for found in pairs]
+    with_body = [int(is_its.sum()) for is_its in is_body]
+    cloth = [len(is_its) - count for is_its, count in zip(is_body, with_body, strict=True)]
+    rows = garments or {}
+    for name, _, is_own in split_outfit(faces, {name: row["num_vertices"] for name, row in rows.items()}):
+        takes_part = np.isin(pairs[-1], np.flatnonzero(is_own)).any(axis=1)
+        rows[name]["intersections_cloth"] = int(np.sum(takes_part & ~is_body[-1]))
+        rows[name]["intersections_body"] = int(np.sum(takes_part & is_body[-1]))
+    return dict(zip(_INTERSECTIONS, (cloth[-1], max(cloth), with_body[-1], max(with_body)), strict=True))

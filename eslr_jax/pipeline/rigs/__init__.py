@@ -1,0 +1,1 @@
+"""Bodies of files: rigs, alignment, sequences, clothing."""

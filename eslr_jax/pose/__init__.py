@@ -1,0 +1,1 @@
+"""Bodies in motion as arrays: skinning, joints, timing."""

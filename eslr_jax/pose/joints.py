@@ -1,0 +1,214 @@
+"""Which joint is which: parts of a body by the joint names of common rigs, and joint maps between two rigs.
+
+A part is a side and a chain, such as left `upper_leg`; spine, neck and fingers are chains of several joints.
+Known are the names of CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, and the
+LeftCollar/LeftShoulder/LeftElbow family.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from eslr_jax.errors import MotionError
+from eslr_jax.pose.skeleton import Skeleton
+
+Part = tuple[str, str]  # side ("left", "right", "") and chain
+
+_SIDES = {"left": "left", "l": "left", "lft": "left", "right": "right", "r": "right", "rgt": "right"}
+_PREFIXES = re.compile(
+    r"^(mixamorig\d*|bip\d*|bip01|cc_base|def|org|character\d*|rig|j_bip(_c)?|j|valvebiped)[\s_.:-]+",
+    re.IGNORECASE,
+)
+_IGNORED = {"twist", "roll", "end", "nub", "ik", "pole", "ctrl", "helper", "site", "share", "metacarpal"}
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+_WORDS = {  # with a side or without one
+    "hips": "hips", "pelvis": "hips", "root": "root",
+    "spine": "spine", "lowerback": "spine", "upperback": "spine", "thorax": "spine", "chest": "spine",
+    "upperchest": "spine", "torso": "spine", "abdomen": "spine", "abdomenlower": "spine",
+    "abdomenupper": "spine", "chestlower": "spine", "chestupper": "spine", "waist": "spine",
+    "neck": "neck", "lowerneck": "neck", "upperneck": "neck", "necklower": "neck", "neckupper": "neck",
+    "head": "head", "skull": "head",
+}  # fmt: skip
+_SIDED_WORDS = {
+    "hipjoint": "hip_joint",
+    "upleg": "upper_leg", "upperleg": "upper_leg", "thigh": "upper_leg", "femur": "upper_leg",
+    "hip": "upper_leg", "thighbend": "upper_leg",
+    "loleg": "lower_leg", "lowerleg": "lower_leg", "lowleg": "lower_leg", "calf": "lower_leg",
+    "shin": "lower_leg", "tibia": "lower_leg", "knee": "lower_leg", "leg": "lower_leg",
+    "foot": "foot", "ankle": "foot",
+    "toe": "toe", "toes": "toe", "toebase": "toe", "ball": "toe",
+    "clavicle": "clavicle", "collar": "clavicle", "shoulder": "shoulder",
+    "uparm": "upper_arm", "upperarm": "upper_arm", "humerus": "upper_arm", "arm": "upper_arm",
+    "shldr": "upper_arm", "shldrbend": "upper_arm",
+    "loarm": "forearm", "lowerarm": "forearm", "lowarm": "forearm", "forearm": "forearm",
+    "radius": "forearm", "elbow": "forearm", "forearmbend": "forearm",
+    "hand": "hand", "wrist": "wrist",
+    "fingers": "fingers", "fingerbase": "fingers", "handfinger": "fingers",
+}  # fmt: skip
+for _finger in _FINGERS:
+    for _word in (_finger, f"hand{_finger}", f"f{_finger}"):
+        _SIDED_WORDS[_word] = _finger
+_SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
+HAND = ("hand", "fingers", *_FINGERS)  # parts that continue the forearm's bone
+_FALLBACKS = {"fingers": ("middle", "index"), "hip_joint": (), "toe": ()} | {
+    finger: ("fingers",) for finger in _FINGERS[1:]
+}
+
+
+def name_part(name: str) -> Part | None:
+    """Return the part that a joint's name alone stands for, or None if it is unknown."""
+    name = re.split(r"[:|]", name)[-1]
+    if name.startswith("__"):  # a helper of MakeHuman, in the place of the joint that follows
+        return None
+    name = _PREFIXES.sub("", name)
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", name)]
+    if not words or _IGNORED & set(words):
+        return None
+    side = ""
+    for position in (0, -1, *range(1, len(words) - 1)):
+        if words[position] in _SIDES and len(words) > 1:
+            side = _SIDES[words.pop(position)]
+            break
+    digits = [word for word in words if word.isdigit()]
+    base = "".join(word for word in words if not word.isdigit())
+    if not side and base not in _WORDS and base[:1] in ("l", "r") and base[1:] in _SIDED_WORDS:
+        side, base = _SIDES[base[0]], base[1:]  # lfemur, rThigh
+    if not side and base.startswith(("left", "right")):
+        side = "left" if base.startswith("left") else "right"
+        base = base.removeprefix(side)
+    if side and base == "finger" and digits and int(digits[0][0]) < len(_FINGERS):
+        return side, _FINGERS[int(digits[0][0])]  # Biped: Finger0 is the thumb, Finger01 its second joint
+    if side and base in _SIDED_WORDS:
+        return side, _SIDED_WORDS[base]
+    if not side and base in (*_WORDS, "hip"):
+        return "", _WORDS.get(base, "hips")
+    return None
+
+
+def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
+    """Return the joints of every part that is known by name, in the order of the names.
+
+    Shoulder, foot and hand mean different joints in different families; the other names of the rig decide.
+    """
+    found: dict[Part, list[int]] = {}
+    for joint, name in enumerate(joint_names):
+        part = name_part(name)
+        if part is not None:
+            found.setdefault(part, []).append(joint)
+    for side in ("left", "right"):
+        if (side, "shoulder") in found:
+            is_clavicle = (side, "clavicle") not in found and (side, "upper_arm") in found
+            found[side, "clavicle" if is_clavicle else "upper_arm"] = found.pop((side, "shoulder"))
+        if (side, "wrist") in found:
+            joints = found.pop((side, "wrist"))
+            if (side, "hand") in found:
+                found[side, "fingers"] = found.pop((side, "hand")) + found.get((side, "fingers"), [])
+            found[side, "hand"] = joints
+        feet = found.get((side, "foot"), [])
+        ankles = [joint for joint in feet if "ankle" in joint_names[joint].lower()]
+        if ankles and len(ankles) < len(feet):
+            beyond = [joint for joint in feet if joint not in ankles]
+            found[side, "foot"] = ankles
+            found[side, "toe"] = beyond + found.get((side, "toe"), [])
+    return found
+
+
+def find_parts(skeleton: Skeleton) -> dict[Part, list[int]]:
+    """Return the joints of every part of a rig, from the hips outwards; the hips are always among them."""
+    found = find_named_parts(skeleton.joint_names)
+    hips = _find_hips(skeleton, found)
+    found.pop(("", "root"), None)
+    found = {part: kept for part, joints in found.items() if (kept := [j for j in joints if j != hips])}
+    found["", "hips"] = [hips]
+    return found
+
+
+def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:
+    """Return the joint that legs and spine hang on."""
+    below = [
+        parts[part][0]
+        for part in (("left", "upper_leg"), ("right", "upper_leg"), ("", "spine"), ("", "neck"), ("", "head"))
+        if part in parts
+    ]
+    has_legs = ("left", "upper_leg") in parts and ("right", "upper_leg") in parts
+    if not has_legs or len(below) < 3:
+        return parts.get(("", "hips"), parts.get(("", "root"), [0]))[0]
+    chains = [{joint} for joint in below]
+    for chain, joint in zip(chains, below, strict=True):
+        while (joint := skeleton.parents[joint]) >= 0:
+            chain.add(joint)
+    return max(set.intersection(*chains), default=0)
+
+
+def torso_axes(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> np.ndarray | None:
+    """Return left, up and front of the resting torso as columns, shape [3, 3]; None if they are not known."""
+    rest = skeleton.rest_positions
+    for chain in ("upper_leg", "upper_arm", "clavicle"):
+        if ("left", chain) in parts and ("right", chain) in parts:
+            left = rest[parts["left", chain][0]] - rest[parts["right", chain][0]]
+            break
+    else:
+        return None
+    top = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
+    if top is None:
+        return None
+    up = rest[top] - rest[parts["", "hips"][0]]
+    if np.linalg.norm(np.cross(left, up)) < 1e-6 * np.linalg.norm(left) * np.linalg.norm(up) or not up.any():
+        return None
+    left = left / np.linalg.norm(left)
+    up = up - (up @ left) * left
+    up /= np.linalg.norm(up)
+    return np.stack([left, up, np.cross(left, up)], axis=1)
+
+
+def map_joints(
+    target: Skeleton, source: Skeleton, changes: Mapping[str, str] | None = None, *, same_names: bool = False
+) -> dict[str, str]:
+    """Return the joint of the source that each joint of a rig follows.
+
+    A joint follows a joint of the same part: the one of the same name where the part has the same names in both
+    rigs, in whatever order; else they are matched from the hips outwards, in proportion if two chains differ in
+    length. A joint of no known part follows the joint of the same name. Joints without a counterpart are left
+    out, and move with their parent.
+
+    Args:
+        target: Joints of the body.
+        source: Joints of the motion's file.
+        changes: Joints of the body to joints of the source; "" keeps one still.
+        same_names: Leave out joints that would follow one of another name, but for the changes.
+
+    Raises:
+        MotionError: A changed joint is not there.
+    """
+    known = set(source.joint_names)
+    ours = {} if known == set(target.joint_names) else find_parts(target)
+    theirs = find_parts(source)
+    result: dict[str, str] = {}
+    for (side, chain), joints in ours.items():
+        others = theirs.get((side, chain), [])
+        for other in _FALLBACKS.get(chain, ()):
+            others = others or theirs.get((side, other), [])
+        names = {target.joint_names[joint] for joint in joints}
+        if names == {source.joint_names[other] for other in others}:
+            result |= {name: name for name in names}
+            continue
+        for position, joint in enumerate(joints if others else ()):
+            share = -(-(position + 1) * len(others) // len(joints)) - 1
+            result[target.joint_names[joint]] = source.joint_names[others[share]]
+    of_parts = {target.joint_names[joint] for joints in ours.values() for joint in joints}
+    result |= {name: name for name in target.joint_names if name in known and name not in of_parts}
+    if same_names:
+        result = {name: other for name, other in result.items() if name == other}
+    for changed, other in (changes or {}).items():
+        for name, rig, owner in ((changed, target, "the body"), (other, source, "the motion")):
+            if name not in rig.joint_names and (name or rig is target):
+                close = difflib.get_close_matches(name, rig.joint_names, n=1)
+                first = ", ".join(rig.joint_names[:6])
+                hint = f"; did you mean {close[0]}?" if close else f"; it has {first}, ..."
+                raise MotionError(f"joint map: {owner} has no joint {name!r}{hint}")
+        result[changed] = other
+    return {name: result[name] for name in target.joint_names if result.get(name)}

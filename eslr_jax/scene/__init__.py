@@ -1,1 +1,0 @@
-"""Scenes: what a rollout models, and all that it reads."""

@@ -1,0 +1,105 @@
+"""From a garment, a moving body and terms to the scene that a rollout reads; pure, for jit, vmap and grad."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.pose.lbs import skin_garment
+from eslr_jax.terms import Term
+from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Obstacle, PastState, Scene
+
+Integrator = Literal["euler", "bdf2"]
+"""Implicit Euler is the paper's, and networks are trained with it. BDF2, of second order, keeps motion alive."""
+
+
+def build_scene(
+    garment: Garment,
+    poses: BodyMotion,
+    material: Material,
+    terms: tuple[Term, ...],
+    *,
+    integrator: Integrator = "euler",
+    substeps: int = 1,
+    starts_at_rest: bool = False,
+    has_pins: bool = True,
+) -> Scene:
+    """Return the scene of a garment on a moving body.
+
+    Frame 0 is the garment skinned to the first pose, moved out of what the terms forbid.
+
+    Args:
+        garment: A prepared garment.
+        poses: The body in motion, two frames or more; the faces of its surface can be touched.
+        material: Fabric.
+        terms: What to model, of `plan_scene`.
+        integrator: How time is stepped.
+        substeps: Number of equal parts in which a frame is simulated.
+        starts_at_rest: Frame 0 stands still; else it moves as the body does.
+        has_pins: Model the garment's pins.
+    """
+    skinned = skin_garment(garment, poses.joint_transforms)
+    body = None
+    if any(term.reads_body for term in terms):
+        body = Obstacle(poses.surface, poses.positions[:, poses.surface.vertex_ids])
+    position = skinned[0]
+    for term in terms:
+        position = term.start(position, garment, body)
+    velocity = (skinned[1] - skinned[0]) / poses.timestep
+    if starts_at_rest:
+        velocity = jnp.zeros_like(velocity)
+    return Scene(
+        garment=garment.replace(material=None),
+        material=material,
+        terms=terms,
+        initial_state=start_integrator(initial_state(position, velocity), integrator),
+        timestep=poses.timestep,
+        body=body,
+        pin_targets=skinned if has_pins else None,
+        num_frames=skinned.shape[0],
+        substeps=substeps,
+    )
+
+
+def worn_material(garment: Garment, material: Material | None) -> Material:
+    """Return the fabric that a garment is simulated with: one that is given, or its own, or cotton."""
+    if material is not None:
+        return material
+    return COTTON if garment.material is None else garment.material
+
+
+def slice_tracks(scene: Scene, frames: slice | Int[Array, " frames"]) -> Scene:
+    """Return a scene with some frames of what moves: body and pins; the number of frames is left as it is."""
+    body, pins = scene.body, scene.pin_targets
+    return scene.replace(
+        body=None if body is None else body.replace(positions=body.positions[frames]),
+        pin_targets=None if pins is None else pins[frames],
+    )
+
+
+def start_integrator(state: ClothState, integrator: Integrator) -> ClothState:
+    """Return a state without a past, from which an integrator can begin."""
+    if integrator == "euler":
+        return state.replace(past=None)
+    nothing = jnp.zeros_like(state.position)
+    return state.replace(past=PastState(nothing, nothing, jnp.ones((), nothing.dtype), jnp.zeros((), bool)))
+
+
+def initial_state(position: Float[Array, "vertices 3"], velocity: Float[Array, "vertices 3"]) -> ClothState:
+    """Return a state without history.
+
+    Args:
+        position: Vertex positions [m], shape [vertices, 3].
+        velocity: Vertex velocities [m/s], shape [vertices, 3].
+    """
+    return ClothState(
+        position=position,
+        velocity=velocity,
+        friction_load=jnp.zeros(position.shape[0], position.dtype),
+        frame=jnp.int32(0),
+        status=jnp.int32(0),
+        first_bad_frame=jnp.int32(-1),
+    )

@@ -1,0 +1,176 @@
+"""One frame, solved: from a starting point to the minimum of its potential, and how the minimum moves.
+
+The minimum x* of the potential P(x, theta) is a function of everything the problem holds. Differentiating
+grad P(x*, theta) = 0 gives dx*/dtheta = -H^-1 d(grad P)/dtheta with the Hessian H = d^2 P / dx^2. So a derivative
+costs one linear solve, however many iterations the solver took, and does not depend on the starting point. It is
+exact at the minimum. If the solver stops early, its error is of the order of the remaining gradient.
+
+Source: Griewank and Walther 2008, Evaluating Derivatives, section 15 (implicit functions).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, Int
+
+from eslr_jax.errors import ConfigError, Status
+from eslr_jax.numerics import safe_norm
+from eslr_jax.solver import tangent
+from eslr_jax.solver.lbfgs import Minimum, Stop, minimize
+from eslr_jax.solver.minres import LinearSolution, solve_symmetric
+from eslr_jax.solver.potential import Point, potential
+from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
+from eslr_jax.terms.problem import FrameProblem, weight_norm
+
+SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
+_MOST_ITERATIONS = 2000  # of a frame that is differentiated
+# [weights] Force above which a frame has no derivative. With 0.2 the derivative of a T-shirt's height by its
+# density is off by 2 %, with 1 by 20 %.
+_REFUSED = 0.1
+# Residual of the linear system to reach, relative to its right side, and the most iterations. In float32 1e-4
+# puts a T-shirt's gradient through five frames off by 0.7 %, 1e-3 by 3 % (experiments/inverse/accuracy.py).
+_LINEAR_STOP = {"float32": (1e-4, 500), "float64": (1e-9, 3000)}
+_LINEAR_STALL = 1e-2  # residual above which the derivative is refused
+
+
+class Start(NamedTuple):
+    """Where the solver begins a frame."""
+
+    position: Float[Array, "vertices 3"]  # [m]
+    inertial_energy: Float[Array, ""]  # [J], see `InitialGuess`
+    previous: Point | None = None  # from which a network came to `position`; None for the solver's own guess
+
+
+def lower_point(reached: Point, previous: Point) -> Point:
+    """Return the lower of two points; the previous one where they are level, the other where one is NaN."""
+    is_lower = (reached.value < previous.value) | jnp.isnan(previous.value)
+    return jax.tree.map(lambda new, old: jnp.where(is_lower, new, old), reached, previous)
+
+
+def solve(
+    problem: FrameProblem,
+    start: Start,
+    *,
+    iterations: int | Int[Array, ""],
+    tolerance: float | Float[Array, ""] = 0.0,
+    memory: int = 8,
+) -> Minimum:
+    """Minimise the frame's potential by L-BFGS; differentiable by every real number in `problem`.
+
+    Forward and reverse mode solve the frame on until it rests, whatever the tolerance, and then one linear system
+    (see the module). Where the frame does not come to rest, its status says so, and the derivative is NaN rather
+    than wrong. It is NaN too where the linear system stalls; `solve_hessian` tells why. `gradient`, `iterations`
+    and `gap_bound` of the result have no derivative.
+
+    Args:
+        problem: The frame's problem.
+        start: Where to begin; it has no influence on the minimum, and its derivative is zero.
+        iterations: Upper bound of iterations; may be traced.
+        tolerance: Share of the initial gap that may be left, see `SimConfig.tolerance`; may be traced. The
+            minimum does not depend on it: its derivative is zero.
+        memory: Number of pairs that L-BFGS keeps; static.
+
+    Raises:
+        ConfigError: The number of iterations is not an integer, as where somebody differentiates by it.
+    """
+    iterations = jnp.asarray(iterations)
+    if not jnp.issubdtype(iterations.dtype, jnp.integer):
+        raise ConfigError(f"iterations are {iterations.dtype}; give a whole number, which has no derivative")
+    limits = iterations, jax.lax.stop_gradient(jnp.asarray(tolerance, start.inertial_energy.dtype))
+    return _solve(problem, jax.lax.stop_gradient(start), limits, memory)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _solve(
+    problem: FrameProblem, start: Start, limits: tuple[Int[Array, ""], Float[Array, ""]], memory: int
+) -> Minimum:
+    return _minimum(problem, start, Stop(*limits, start.inertial_energy), memory)
+
+
+def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int) -> Minimum:
+    return minimize(
+        lambda position: potential(position, problem),
+        start.position,
+        stretched_stiffness(problem, start.position),
+        stop,
+        memory=memory,
+        previous=start.previous,
+    )
+
+
+@_solve.defjvp
+def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, Any]:
+    """Solve to rest, and move the minimum by one linear system.
+
+    A tolerance of 1 % of the gap is enough for motion, and far too little for a derivative: there the Hessian is
+    still indefinite. So the frames of a derivative are solved on, to the force that rounding raises: positions
+    that are off by the spacing of their numbers strain their edges. In float32, at 1k vertices, that is 0.008
+    weights, and 0.002 are left at best.
+    """
+    problem, start, (iterations, _) = primals
+    spacing = jnp.finfo(start.position.dtype).eps * jnp.max(jnp.abs(start.position))
+    rounding = spacing * safe_norm(hessian_diagonal(problem, start.position))
+    stop = Stop(jnp.maximum(iterations, _MOST_ITERATIONS), 0.0, start.inertial_energy, rounding)
+    minimum = _minimum(problem, start, stop, memory)
+    is_refused = safe_norm(minimum.gradient.reshape(-1)) > _REFUSED * weight_norm(problem)
+    position, is_refused = checkpoint_name((minimum.position, is_refused), SOLUTION)
+    status = jnp.where(is_refused, jnp.int32(Status.DERIVATIVE_REFUSED), jnp.int32(Status.OK))
+    minimum = minimum._replace(position=position, status=status)
+
+    def at_minimum(problem: FrameProblem) -> tuple[Array, Array]:
+        return jax.value_and_grad(potential)(position, problem)
+
+    _, (value_change, force_change) = jax.jvp(at_minimum, (problem,), tangents[:1])
+    move = -_solve_hessian_linear(problem, position, force_change)
+    move = jnp.where(is_refused, jnp.nan, 1.0) * move
+    value_change = value_change + jnp.sum(minimum.gradient * move)
+    fixed = np.zeros((), jax.dtypes.float0)
+    zeros = jax.tree.map(jnp.zeros_like, (minimum.gradient, minimum.gap_bound))
+    return minimum, Minimum(move, value_change, zeros[0], fixed, zeros[1], fixed)  # type: ignore[arg-type]
+
+
+def _solve_hessian_linear(
+    problem: FrameProblem, position: Float[Array, "vertices 3"], force: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
+    """Return H^-1 force, linear in the force; NaN where the system stalls."""
+    problem = jax.lax.stop_gradient(problem)
+    matrix = tangent.tangent(problem, position)
+
+    def solved(_, force: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+        found = _solve_tangent(matrix, problem, position, force)
+        return jnp.where(found.residual < _LINEAR_STALL, found.displacement, jnp.nan)
+
+    apply = partial(tangent.apply, matrix)
+    return jax.lax.custom_linear_solve(lambda move: apply(move.T).T, force, solved, symmetric=True)
+
+
+def solve_hessian(
+    problem: FrameProblem, position: Float[Array, "vertices 3"], force: Float[Array, "vertices 3"]
+) -> LinearSolution:
+    """Solve H v = force by MINRES, preconditioned by the blocks on the diagonal of H.
+
+    Args:
+        problem: The frame's problem.
+        position: Where the Hessian is taken [m], shape [vertices, 3]; a minimum of the potential.
+        force: Right side [N], shape [vertices, 3].
+    """
+    return _solve_tangent(tangent.tangent(problem, position), problem, position, force)
+
+
+def _solve_tangent(matrix: tangent.Tangent, problem: FrameProblem, position: Array, force: Array):
+    inverse = tangent.inverse_diagonal(matrix, problem, position)
+    tolerance, iterations = _LINEAR_STOP[str(force.dtype)]
+    found = solve_symmetric(
+        partial(tangent.apply, matrix),
+        partial(tangent.precondition, inverse),
+        force.T,
+        tolerance=tolerance,
+        iterations=iterations,
+    )
+    return found._replace(displacement=found.displacement.T)

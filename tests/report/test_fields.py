@@ -1,0 +1,167 @@
+"""Fields of a run: values by which a garment is coloured."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cloth import make_limb
+from draped_ball import drifting_ball, square
+from example_runs import write_run as write_run_by_hand
+from own_term import Push
+
+from eslr_jax.config import SimConfig
+from eslr_jax.errors import AssetError
+from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax.pipeline.formats.garment import GarmentFile
+from eslr_jax.pipeline.report.fields import energy_shares, gap_shares, run_field
+from eslr_jax.pipeline.report.gap import trajectory_states
+from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
+from eslr_jax.pipeline.report.score import score_trajectory
+from eslr_jax.simulation.archive import save_scene
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.plan import first_frames, prepare_scene
+from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.scene import initial_state
+from eslr_jax.solver.guess import pushed_out_guess
+from eslr_jax.solver.potential import potential, potential_terms
+from eslr_jax.solver.solve import Start, solve
+from eslr_jax.terms import CLOTH, Collision, Gravity, Repulsion, scene_terms
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, body):
+    folder = tmp_path_factory.mktemp("runs")
+    return [
+        read_run(write_run_by_hand(folder, body, name, scale))
+        for name, scale in (("loose", 1.0), ("tight", 1.2))
+    ]
+
+
+def test_stretch_of_uniform_stretch(runs):
+    field = run_field(runs[0], "stretch")
+    np.testing.assert_allclose(field.values[0], 1.0, atol=1e-4)
+    assert field.values[1].min() > 1.0
+    assert 1.05 < np.median(field.values[1]) <= field.values[1].max() < 1.1 + 1e-3
+    np.testing.assert_allclose(field.values[2], field.values[0], atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """The last frame of a square that falls over a ball."""
+    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Collision(has_skin=True)))
+    states, inputs = trajectory_states(rollout_scene(None, scene, SimConfig(iterations=15)), scene)
+    state, inputs = jax.tree.map(lambda leaf: leaf[-1], (states, inputs))
+    return jax.jit(frame_problem)(scene, state, inputs)
+
+
+@pytest.mark.parametrize("term", ["stretch", "bending", "inertia", "gravity", "collision", "friction"])
+def test_energy_shares_add_up_to_the_energy(problem, term):
+    position = problem.inertial_guess + 1e-3
+    whole = float(potential_terms(position, problem)[term])
+    shares = np.asarray(energy_shares(term, position, problem))
+    assert shares.sum() == pytest.approx(whole, rel=1e-3)
+    assert abs(whole) > 1e-9
+
+
+@pytest.mark.slow
+def test_gap_shares_add_up_to_the_optimality_gap(problem):
+    position = pushed_out_guess(problem)
+    start = Start(position, potential(position, problem))
+    minimum = solve(problem, start, iterations=500, tolerance=1e-3)
+    gap = float(potential(position, problem) - minimum.value)
+    shares = np.asarray(gap_shares(position, problem))
+    assert shares.sum() == pytest.approx(gap, rel=0.01)  # contacts have kinks
+    assert -shares[shares < 0].sum() < 0.5 * gap
+    at_optimum = gap_shares(minimum.position, problem)
+    assert abs(float(at_optimum.sum())) < 0.01 * gap
+
+
+@pytest.mark.slow
+def test_repulsion_counts_where_layers_meet():
+    """Two squares 1 mm apart: the pairs' energy goes to both layers."""
+    lower = square(6, 0.1)
+    upper = np.add(lower.rest_positions, [0.003, 1e-3, 0.002])
+    ones = np.ones((72, 1))
+    garment = prepare_garment(
+        np.concatenate([lower.rest_positions, upper]),
+        np.concatenate([lower.faces, np.add(lower.faces, 36)]),
+        skin_weights=ones,
+        skin_indices=np.zeros((72, 1), int),
+        allow_components=True,
+    )
+    options = {"terms": (*CLOTH, Repulsion(where="all")), "starts_at_rest": True}
+    scene = prepare_scene(garment, drifting_ball(2), **options)
+    still = jnp.asarray(garment.rest_positions)
+    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
+    problem = jax.jit(frame_problem)(scene, initial_state(still, jnp.zeros_like(still)), inputs)
+    whole = float(potential_terms(still, problem)["repulsion"])
+    shares = np.asarray(energy_shares("repulsion", still, problem))
+    assert shares.sum() == pytest.approx(whole, rel=1e-4)
+    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole > 0
+
+
+@pytest.mark.slow
+def test_a_run_with_an_energy_of_ones_own_is_scored_from_its_files(tmp_path, small_garment, small_poses):
+    """Its term is found where its module is imported."""
+    terms = scene_terms(Gravity(1.62), Push(2.0))
+    scene = prepare_scene(small_garment, small_poses, terms=terms, integrator="bdf2")
+    whole = rollout_scene(None, scene, SimConfig(iterations=60))
+    weights = np.ones((scene.garment.vertex_mask.size, 1))
+    stored = GarmentFile(
+        *map(np.asarray, (scene.garment.rest_positions, scene.garment.faces)),
+        weights,
+        np.zeros_like(weights, int),
+        np.asarray(scene.garment.is_pinned),
+    )
+    track = ClothTrack(whole.positions, whole.velocities, whole.friction_loads, whole.residuals)
+    write_run(tmp_path, track, scene, (make_limb(), small_poses, stored), report={})
+    run = read_run(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, run.scene, scene)
+    scores = [
+        score_trajectory(trajectory, each, poses=run_poses(run), every=1)
+        for trajectory, each in ((run_trajectory(run), run.scene), (whole, scene))
+    ]
+    assert scores[0]["terms"]["push"] == pytest.approx(scores[1]["terms"]["push"], rel=1e-4)
+    assert scores[0]["gap_median_j"] == pytest.approx(scores[1]["gap_median_j"], rel=1e-2, abs=1e-7)
+    assert scores[0]["gap_relative_max"] < 0.5
+
+
+@pytest.mark.parametrize("spoil", ["missing", "damaged", "another"])
+def test_a_run_without_its_scene_is_shown_and_not_scored(tmp_path, body, spoil):
+    folder = write_run_by_hand(tmp_path, body, "run")
+    if spoil == "missing":
+        (folder / "scene.npz").unlink()
+    elif spoil == "damaged":
+        (folder / "scene.npz").write_bytes(b"PK")
+    else:
+        scene = read_run(folder).scene
+        save_scene(folder / "scene.npz", first_frames(scene, 3))
+    run = read_run(folder)
+    assert run_field(run, "distance").values.shape == (6, len(run.garment.rest_positions))
+    with pytest.raises(AssetError, match=r"scene\.npz") as caught:
+        run_trajectory(run)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["friction-energy", "distance"])
+def test_a_run_without_a_body_has_no_field_of_it(runs, name):
+    run = dataclasses.replace(runs[0], trajectory=dataclasses.replace(runs[0].trajectory, body=None))
+    with pytest.raises(AssetError, match=f"has no body, and so no {name}") as caught:
+        run_field(run, name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_without_self_contact_has_no_repulsion(tmp_path, body):
+    run = read_run(write_run_by_hand(tmp_path, body, "run", terms=scene_terms(without=(Repulsion,))))
+    with pytest.raises(AssetError, match="without self-contact"):
+        run_field(run, "repulsion-energy")
+
+
+def test_distance_grows_by_what_the_cloth_is_moved(runs):
+    field = run_field(runs[0], "distance")
+    assert np.all(field.values[0] > 0)
+    np.testing.assert_allclose(field.values[0], field.values[3])
+    with pytest.raises(AssetError, match="no field 'warmth'"):
+        run_field(runs[0], "warmth")
