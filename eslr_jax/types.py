@@ -163,7 +163,7 @@ class BodyMotion:
     is_obstacle: Bool[Array, " body_faces"]
     timestep: Float[Array, ""]  # seconds between frames
     rest_positions: Float[Array, "body_vertices 3"]  # in the rest pose that garments are made for [m]
-    surface: BodySurface  # all obstacle faces; a scene may search fewer, see `scene.plan_scene`
+    surface: BodySurface  # all obstacle faces; a scene may search fewer, see `simulation.plan.plan_scene`
 
 
 class PastState(NamedTuple):

@@ -19,7 +19,7 @@ CLOTH: tuple[Term, ...] = (Stretch(), Bending(), Inertia(), Gravity())
 def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[Term, ...]:
     """Return what a scene models by default, with changes: cloth, body, ground, friction and layers.
 
-    A scene leaves out those of them that it does not need, see `scene.plan_scene`.
+    A scene leaves out those of them that it does not need, see `simulation.plan.plan_scene`.
 
     Args:
         changed: Terms in the place of the default ones of their types; others are added behind them.
