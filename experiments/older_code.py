@@ -6,8 +6,8 @@
 Each code solves the frames of its own near-optimal rollouts of T-shirt, dress and trousers. The iterations that
 count are those after which the median gap is a given share of the initial gap. The cost of a frame and of an
 iteration is timed on the T-shirt. Contacts and fabrics changed too, so the two codes do not solve quite the same
-problem. The older code must have the names that the scripts below use: it is 0.2.0 or later. The kept result, of an
-older commit, was made before.
+problem. The older code must have the names that the scripts below use: it is 0.2.0 or later. The kept result
+is of an older one, made before.
 
 Writes older_code.json.
 """
