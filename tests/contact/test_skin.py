@@ -30,7 +30,9 @@ def scene_of(*, has_skin, num_frames):
     return prepare_scene(square(side=6), drifting_ball(num_frames, speed=0.0, mesh=small), **options)
 
 
-@pytest.mark.parametrize(("room", "is_skin"), [(0.003, False), (0.03, True)])
+@pytest.mark.parametrize(
+    ("room", "is_skin"), [(0.003, False), pytest.param(0.03, True, marks=pytest.mark.slow)]
+)
 def test_cloth_that_limbs_pinch_has_no_rows_of_skin(room, is_skin):
     """Rows of both limbs would pull it to both sides, and stretch what is beside them."""
     positions, faces = ball(15, 24)

@@ -59,6 +59,7 @@ def test_network_matches_numpy(body):
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_network_with_gradient_features_matches_numpy():
     network, scene = trained(CORRECTING), coarse_scene()
 

@@ -25,7 +25,7 @@ def worn():
     """A square that covers the top of the ball, its scene and its place when it is skinned."""
     garment, poses = square(), drifting_ball(3)
     scene = prepare_scene(garment, poses)
-    trajectory = rollout_scene(None, scene, SimConfig(iterations=12))
+    trajectory = rollout_scene(None, scene, SimConfig(iterations=15))
     return garment, poses, scene, trajectory, np.asarray(skin_garment(garment, poses.joint_transforms))
 
 

@@ -263,6 +263,7 @@ def test_hoods_curriculum_counts_trajectories(config):
     assert [int(curriculum(plain, jnp.int32(step)).horizon) for step in (9, 10, 20, 900)] == [1, 2, 3, 3]
 
 
+@pytest.mark.slow
 def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small_problem):
     """The mean share of the gap that a step leaves; the last energy stands for the optimum."""
     model = dataclasses.replace(config.model, refinement_steps=3)
