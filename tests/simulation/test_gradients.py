@@ -320,6 +320,7 @@ class Kink(Term):
         return sum(jnp.abs(part - was) for part, was in zip(corners[0], problem.position.T, strict=True))
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_point_of_rest_has_no_derivative_and_says_so():
     scene = small_scene(3, Kink(), has_body=False)
 

@@ -1,6 +1,7 @@
 """A frame's program multiplies in full precision."""
 
 import jax
+import pytest
 from draped_ball import drifting_ball, square
 
 from eslr_jax.config import SimConfig
@@ -10,6 +11,7 @@ from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion, scene_terms
 
 
+@pytest.mark.slow
 def test_physics_multiplies_in_full_precision():
     """A GPU rounds the operands of other products of float32 to ten bits."""
     options = {
