@@ -28,9 +28,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
-from eslr_jax.networks.inputs import GraphInputs, required
+from eslr_jax.networks.features import GraphInputs, required
 from eslr_jax.numerics import safe_norm
-from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
+from eslr_jax.types import CoarseEdges, Garment, Material
 
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 """Edge sets of a garment's coarse levels, finest first (HOOD)."""
@@ -128,9 +128,15 @@ def build_frame_graph(
             away = safe_norm(inputs.contacts.points - inputs.position)
         mask = (jnp.abs(away) <= kind.world_edge_radius) & garment.vertex_mask
         topology["world_mask"] = mask
+        contacts, velocity = inputs.contacts, required(inputs, "body_velocity")
         if is_hood:
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
-        body, world = _world_rows(inputs.contacts, inputs, is_hood)
+            body = features.hood_body_features(velocity, contacts.normals, inputs.timestep)
+            world = features.hood_world_features(contacts, inputs)
+        else:
+            inertial_guess = required(inputs, "inertial_guess")
+            body = features.frame_body_features(velocity, contacts, inputs.timestep)
+            world = features.frame_world_features(inputs.position, contacts, inertial_guess)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
         senders["world"] = receivers["world"] = jnp.arange(mask.shape[0])
         if kind.has_reverse_edges:
@@ -236,22 +242,6 @@ def incoming_edges(
     first = jnp.cumsum(degrees) - degrees
     edges = first[:, None] + jnp.arange(neighbor_mask.shape[1], dtype=jnp.int32)[None]
     return jnp.where(neighbor_mask, edges, num_edges)
-
-
-def _world_rows(
-    contacts: Contacts, inputs: GraphInputs, is_hood: bool
-) -> tuple[Float[Array, "vertices _"], Float[Array, "vertices _"]]:
-    """Return the features of body rows and of world edges, unmasked."""
-    velocity = required(inputs, "body_velocity")
-    if is_hood:
-        return (
-            features.hood_body_features(velocity, contacts.normals, inputs.timestep),
-            features.hood_world_features(contacts, inputs),
-        )
-    return (
-        features.frame_body_features(velocity, contacts, inputs.timestep),
-        features.frame_world_features(inputs.position, contacts, required(inputs, "inertial_guess")),
-    )
 
 
 def _mask_rows(

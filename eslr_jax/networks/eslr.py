@@ -20,12 +20,11 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
-from eslr_jax.networks.branches import TwoBranches, make_decoder, stack, world_mask
+from eslr_jax.networks.architecture import TwoBranches, make_decoder, stack, world_mask
 from eslr_jax.networks.build import GraphKind, Rows, feature_sizes
 from eslr_jax.networks.dense import kernel_spread
 from eslr_jax.networks.gsa import GsaBlock
-from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents
-from eslr_jax.networks.mlp import MLP
+from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents, make_mlp
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.normalizer import normalize
 from eslr_jax.networks.operators import mesh_tables, sum_receivers
@@ -34,21 +33,16 @@ from eslr_jax.types import Normalizer
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 
-class EncodedWorld(NamedTuple):
-    """The part of `Encoded` that a body adds."""
-
-    body: Float[Array, "vertices latent"]  # finished: a body row has no features that change
-    edges: Float[Array, "vertices hidden"]  # body to garment
-    reverse: Float[Array, "vertices hidden"] | None  # garment to body; None where body rows are constant
-
-
 class Encoded(NamedTuple):
-    """Hidden layers of the encoders, as far as a frame's constant features decide them."""
+    """Hidden layers of the encoders, as far as a frame's constant features decide them.
+
+    Body rows are finished: they have no features that change.
+    """
 
     garment: Float[Array, "vertices hidden"]
     mesh: Float[Array, "edges hidden"]
     tables: LayerTables
-    world: EncodedWorld | None  # None in a scene without a body
+    world: WorldLatents | None  # None in a scene without a body
 
 
 class GraphModule(nn.Module):
@@ -106,24 +100,19 @@ class EncodeProcessDecode(GraphModule):
 
     def setup(self) -> None:
         """Declare encoders, stacks and decoder."""
-        config = self.config
-        size, sizes = config.latent_size, feature_sizes(config.graph)
-
-        def encoder(input_size: int) -> MLP:
-            return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
-
+        config, sizes = self.config, feature_sizes(self.config.graph)
         if not config.reads_gradient:
             self.type_embedding = self.param(
                 "type_embedding",
                 kernel_spread(features.NUM_TYPES),
                 (features.NUM_TYPES, features.NUM_TYPES),
             )
-            self.garment_encoder = encoder(sizes["garment"] + features.NUM_TYPES)
+            self.garment_encoder = make_mlp(config, sizes["garment"] + features.NUM_TYPES)
         else:
-            self.garment_encoder = encoder(sizes["garment"])
-            self.body_encoder = encoder(sizes["body"])
-        self.mesh_encoder = encoder(sizes["mesh"])
-        self.world_encoder = encoder(sizes["world"])
+            self.garment_encoder = make_mlp(config, sizes["garment"])
+            self.body_encoder = make_mlp(config, sizes["body"])
+        self.mesh_encoder = make_mlp(config, sizes["mesh"])
+        self.world_encoder = make_mlp(config, sizes["world"])
         self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
         if config.attention_blocks:
             self.blocks = stack(GsaBlock, config, config.attention_blocks)
@@ -160,7 +149,7 @@ class EncodeProcessDecode(GraphModule):
                 for name in ("world", "world_reverse")
                 if name in edges
             }
-            world = EncodedWorld(
+            world = WorldLatents(
                 body=body_encoder(nodes["body"]),
                 edges=first_layers["world"],
                 reverse=first_layers.get("world_reverse"),
@@ -191,7 +180,12 @@ class EncodeProcessDecode(GraphModule):
         )
 
     def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
-        """Finish the encoders, run both stacks and decode."""
+        """Finish the encoders, run both stacks and decode.
+
+        Raises:
+            ConfigError: The garment has another number of geodesic coordinates than the network reads.
+        """
+        config = self.config
         vertices = self.garment_encoder.finish(encoded.garment)
         mesh = self.mesh_encoder.finish(encoded.mesh)
         world = None
@@ -201,26 +195,7 @@ class EncodeProcessDecode(GraphModule):
             world = WorldLatents(given.body, finish(given.edges), reverse)
         latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
         latents, _ = self.layers(latents, encoded.tables)
-        return self.decode(latents.garment, vertices, places)
-
-    def decode(
-        self,
-        processed: Float[Array, "vertices latent"],
-        encoded: Float[Array, "vertices latent"],
-        places: Places,
-    ) -> Float[Array, "vertices outputs"]:
-        """Run the attention branch and decode.
-
-        Args:
-            processed: Vertex latents behind the stack of layers, shape [vertices, latent].
-            encoded: Vertex latents of the encoder, from which attention starts, shape [vertices, latent].
-            places: Embedding and mask of the vertices.
-
-        Raises:
-            ConfigError: The garment has another number of geodesic coordinates than the network reads.
-        """
-        config = self.config
-        hidden = self.decoder.start(processed, 0, bias=True)
+        hidden = self.decoder.start(latents.garment, 0, bias=True)
         if config.attention_blocks:
             size = places.embedding.shape[1]
             if size != config.embedding_size:
@@ -228,7 +203,7 @@ class EncodeProcessDecode(GraphModule):
                     f"the garment has {size} geodesic coordinates and the model embedding_size = "
                     f"{config.embedding_size}; prepare the garment with that embedding_size"
                 )
-            attended, _ = self.blocks(encoded, (*places, self.projection.value))
+            attended, _ = self.blocks(vertices, (*places, self.projection.value))
             hidden = hidden + self.decoder.start(attended, config.latent_size)
         return self.decoder.finish(hidden)
 

@@ -126,7 +126,8 @@ def minimize(
         return _flat(balance(_vectors(force)))
 
     def value_and_gradient(x: Float[Array, " n"]):
-        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(tuple(_split(x)))
+        split = tuple(jax.lax.split(x, (x.size // 3,) * 3))
+        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(split)
         # Written over x one by one: joined at once, XLA computes them in a loop that it can't vectorise.
         gradient = x
         for axis, part in enumerate(parts):
@@ -202,11 +203,6 @@ def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
 def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:
     """Return vectors with one axis: all x, all y, all z."""
     return vectors.T.reshape(-1)
-
-
-def _split(flat: Float[Array, " n"]) -> list[Array]:
-    """Return the components of flat vectors."""
-    return jax.lax.split(flat, (flat.size // 3,) * 3)
 
 
 def _vectors(flat: Float[Array, " n"]) -> Float[Array, "vertices 3"]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components
 from eslr_jax.terms.problem import FrameProblem
@@ -55,6 +55,12 @@ def sum_diagonals(
     return sum(diagonals, jnp.zeros_like(x[0]))
 
 
+def free_vertices(problem: FrameProblem) -> Bool[Array, " vertices"]:
+    """Return which vertices the solver moves: neither padding nor pinned."""
+    garment = problem.garment
+    return garment.vertex_mask if problem.pin_targets is None else garment.vertex_mask & ~garment.is_pinned
+
+
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the diagonal at `position` with the springs that share out its membrane part.
 
@@ -66,12 +72,9 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
         position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     garment = problem.garment
-    is_free = garment.vertex_mask
-    if problem.pin_targets is not None:
-        is_free = is_free & ~garment.is_pinned
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
     elastic = sum_diagonals(problem, position, lambda term: term.is_elastic)
-    share = jnp.where(is_free, elastic / degree, 0.0)
+    share = jnp.where(free_vertices(problem), elastic / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(
         diagonal=hessian_diagonal(problem, position),
