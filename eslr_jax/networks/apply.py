@@ -40,23 +40,12 @@ class Places(NamedTuple):
 def apply_model(
     network: Network, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
-    """Return the network's raw output; see `scale_output`.
-
-    Args:
-        network: The network.
-        graph: Graph of `build_graph`, of the network's kind.
-        garment: The graph's garment, for its geodesic embedding and vertex mask.
-    """
+    """Return the network's raw output for a graph of `build_graph`, of the network's kind; see `scale_output`."""
     return _call(network, graph, Places(garment.geodesic_embedding, garment.vertex_mask), network.statistics)
 
 
 def encode_frame(network: Network, graph: jraph.GraphsTuple) -> Any:
-    """Return what all refinement steps of a frame share.
-
-    Args:
-        network: One that reads the potential's gradient.
-        graph: Graph of `build_frame_graph`.
-    """
+    """Return what all refinement steps of a frame share, from a graph of `build_frame_graph`."""
     return _call(network, graph, method="encode_frame")
 
 
@@ -65,11 +54,7 @@ def apply_refinement(
 ) -> Float[Array, "vertices outputs"]:
     """Return the raw output of one refinement step; equals `apply_model` on the joined graph.
 
-    Args:
-        network: One that reads the potential's gradient.
-        encoded: Result of `encode_frame`.
-        changing: Graph of `build_refinement_graph`.
-        garment: The graph's garment, for its geodesic embedding and vertex mask.
+    `encoded` is the result of `encode_frame`, and `changing` a graph of `build_refinement_graph`.
     """
     places = Places(garment.geodesic_embedding, garment.vertex_mask)
 
@@ -88,11 +73,7 @@ def _call(network: Network, *args: Any, **options: Any) -> Any:
 
 
 def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return the output's vectors in physical units: metres, or for an acceleration metres per frame squared.
-
-    Args:
-        network: The network.
-        output: First three columns of the raw output, shape [vertices, 3].
+    """Return vectors, the output's first three columns, in metres; accelerations in metres per frame squared.
 
     Source: HOOD's output normaliser, applied backwards, for accelerations.
     """
@@ -104,14 +85,9 @@ def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[
 def measure_statistics(
     network: Network, graph: jraph.GraphsTuple, garment: Garment, acceleration: Float[Array, "vertices 3"]
 ) -> Statistics:
-    """Return the statistics of one graph; none for features that are not normalised.
+    """Return the statistics of one graph and of target accelerations [m per frame^2].
 
-    Args:
-        network: The network.
-        graph: Graph of `build_graph`.
-        garment: The graph's garment, for its masks.
-        acceleration: Target accelerations [m per frame^2], shape [vertices, 3]; in HOOD those of the skinned
-            garment.
+    There are none for features that are not normalised. HOOD's targets are those of the skinned garment.
 
     Source: HOOD's `utils/normalization.py`.
     """

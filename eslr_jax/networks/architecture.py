@@ -112,12 +112,7 @@ class Architecture(System):
 
 
 def draw_weights(spreads: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Return weights as modules declare them, with the kernels drawn; see `dense.kernel_spread`.
-
-    Args:
-        spreads: Weights of a module's `init`.
-        seed: Of the normal numbers that kernels are multiplied by.
-    """
+    """Return weights of a module's `init` with the kernels drawn; see `dense.kernel_spread`."""
     generator = np.random.default_rng(seed)
 
     def draw(path, spread):
@@ -216,12 +211,7 @@ class TwoBranches(Architecture):
 
 
 def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
-    """Return the decoder of latents of one or more branches, into a vector and gates.
-
-    Args:
-        config: Architecture.
-        num_branches: Whose latents stand side by side.
-    """
+    """Return the decoder of the latents of one or more branches, side by side, into a vector and gates."""
     size = config.latent_size
     return MLP(
         num_branches * size,
@@ -239,13 +229,7 @@ def stack(module: type[nn.Module], config: Architecture, length: int, **attribut
 
     `Architecture.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
     results of its matrix products ("products"), or its inputs alone ("layers": a third of the memory, for a
-    quarter more time).
-
-    Args:
-        module: Class of the module, with the configuration as its first attribute.
-        config: Architecture.
-        length: Number of copies.
-        **attributes: Other attributes of the module.
+    quarter more time). The module's first attribute is the configuration.
     """
     if config.remat != "none":
         keeps = jax.checkpoint_policies.dots_saveable if config.remat == "products" else None

@@ -64,13 +64,7 @@ class Topology(TypedDict, total=False):
 def build_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph of a frame, or of one refinement step.
-
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body.
-        kind: Features and sets of edges; static.
+    """Return the graph of a frame, or of one refinement step; `kind` is static.
 
     Raises:
         ConfigError: The network is hierarchical and the garment has no coarse levels.
@@ -84,14 +78,7 @@ def build_graph(
 def build_frame_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph with the features that stay for a whole frame, which are all of HOOD's.
-
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body.
-        kind: Features and sets of edges; static.
-    """
+    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
     is_hood = not kind.reads_gradient
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
@@ -174,12 +161,6 @@ def build_refinement_graph(
 ) -> jraph.GraphsTuple:
     """Return the features that change with every refinement step, on the topology of `frame_graph`.
 
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body, with the guess and the potential's gradient there.
-        frame_graph: Graph of `build_frame_graph`.
-
     Raises:
         ValueError: A field of `inputs` that these features need is None.
     """
@@ -234,9 +215,7 @@ def incoming_edges(
 ) -> Int[Array, "vertices degree"]:
     """Return the mesh edges that enter every vertex; they are consecutive, as edges are sorted by receiver.
 
-    Args:
-        neighbor_mask: Which neighbours of a vertex are real, shape [vertices, degree]; real ones come first.
-        num_edges: Number of mesh edges, which pads the table.
+    Real neighbours come first in `neighbor_mask`. The table is padded with `num_edges`.
     """
     degrees = jnp.sum(neighbor_mask, axis=1, dtype=jnp.int32)
     first = jnp.cumsum(degrees) - degrees

@@ -180,11 +180,7 @@ class MLP(nn.Module):
         return add_bias(hidden, self.biases[0].astype(x.dtype)) if bias else hidden
 
     def finish(self, hidden: Float[Array, "rows hidden"]) -> Float[Array, "rows outputs"]:
-        """Apply the layers behind the first product.
-
-        Args:
-            hidden: Sum of `start` over all pieces, shape [rows, hidden].
-        """
+        """Apply the layers behind the first product to the sum of `start` over all pieces."""
         for kernel, bias in zip(self.kernels[1:], self.biases[1:], strict=True):
             product = matmul(jnp.maximum(hidden, 0), kernel.astype(hidden.dtype), self.precision)
             hidden = add_bias(product, bias.astype(hidden.dtype))

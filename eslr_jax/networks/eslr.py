@@ -123,22 +123,11 @@ class EncodeProcessDecode(GraphModule):
     def __call__(
         self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
     ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph.
-
-        Args:
-            graph: Graph of `build_graph`.
-            places: Embedding and mask of the vertices.
-            statistics: Normalisers of the rows "garment" (and body), "mesh" and "world", for HOOD's features.
-        """
+        """Return the raw output for a whole graph; `statistics` are the normalisers of HOOD's features."""
         return self.process(self.encode_frame(graph, statistics), places)
 
     def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
-        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
-
-        Args:
-            graph: Graph of `build_graph` or of `build_frame_graph`.
-            statistics: Normalisers, see `__call__`.
-        """
+        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame."""
         nodes, edges = self.normalized(graph, statistics)
         dtype = nodes["garment"].dtype
         world = None
@@ -162,12 +151,7 @@ class EncodeProcessDecode(GraphModule):
         )
 
     def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
-        """Add the features of a refinement step to those of its frame.
-
-        Args:
-            encoded: Hidden layers of `encode_frame` for the frame's features.
-            changing: Graph of `build_refinement_graph`.
-        """
+        """Add the features of a refinement step, of `build_refinement_graph`, to those of its frame."""
         nodes, edges, world = changing.nodes, changing.edges, encoded.world
         if world is not None:
             rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)

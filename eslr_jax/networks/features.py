@@ -196,11 +196,7 @@ def hood_edge_features(
 ) -> Float[Array, "edges 12"]:
     """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3.
 
-    Args:
-        garment: Rest mesh.
-        material: Fabric.
-        inputs: State of the garment.
-        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
+    Edges are the garment's own, or those of a coarse level.
     """
     current = _edge_vectors(edges, inputs.position)
     rest = _edge_vectors(edges, garment.sewn_positions)
@@ -321,11 +317,7 @@ def frame_mesh_features(
 ) -> Float[Array, "edges 8"]:
     """Return sender minus receiver 3, the same at rest 3, rest length less one, in mean lengths; strain.
 
-    Args:
-        garment: Rest mesh.
-        position: Positions [m].
-        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
-        edge_length: Their mean length at rest [m].
+    Positions [m] and the mean length at rest [m] are those of `edges`: the garment's own, or of a coarse level.
     """
     current = _edge_vectors(edges, position)
     rest = _edge_vectors(edges, garment.sewn_positions)

@@ -38,9 +38,7 @@ class GsaBlock(nn.Module):
     ):
         """Return the next latents, in the form that `nn.scan` asks for.
 
-        Args:
-            x: Vertex latents, shape [vertices, latent].
-            inputs: Geodesic embedding [m], vertex mask and random directions.
+        `inputs` are the geodesic embedding [m], the vertex mask and random directions.
         """
         config, (embedding, mask, projection) = self.config, inputs
         size, width, precision = config.attention_size, config.latent_size, config.precision

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 import jraph
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
@@ -184,8 +184,10 @@ class HierarchicalNetwork(GraphModule):
         tables = {name: coarse_tables(graph, level) for level, name in enumerate(COARSE_SETS)}
         tables["mesh"] = mesh_tables(graph, vertices.dtype)
         for sets, layers in zip(STAGES, self.stages, strict=True):
-            kept = kept_vertices(graph, sets)[:, None]
-            mask = jnp.where(kept, world_mask(graph, vertices.dtype), 0.0)
+            mask = world_mask(graph, vertices.dtype)
+            if "mesh" not in sets:  # which joins all vertices
+                kept = [graph.globals["coarse"][COARSE_SETS.index(name)].is_kept for name in sets]
+                mask = jnp.where(jnp.any(jnp.stack(kept), axis=0)[:, None], mask, 0.0)
             state = StageLatents(garment, {name: latents[name] for name in sets}, world)
             state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
@@ -216,11 +218,3 @@ def vertex_levels(graph: jraph.GraphsTuple) -> Int[Array, " vertices"]:
     """Return the coarsest level that every vertex is on; 0 is the mesh."""
     levels = [jnp.where(level.is_kept, k + 1, 0) for k, level in enumerate(graph.globals["coarse"])]
     return jnp.max(jnp.stack(levels), axis=0)
-
-
-def kept_vertices(graph: jraph.GraphsTuple, sets: tuple[str, ...]) -> Bool[Array, " vertices"]:
-    """Return which vertices some edge set of a stage joins; all of them on the mesh."""
-    coarse = graph.globals["coarse"]
-    kept = [jnp.ones_like(coarse[0].is_kept)] if "mesh" in sets else []
-    kept += [coarse[COARSE_SETS.index(name)].is_kept for name in sets if name != "mesh"]
-    return jnp.any(jnp.stack(kept), axis=0)

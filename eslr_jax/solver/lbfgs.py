@@ -241,12 +241,9 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
 
 
 def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):
-    """Halve the step until the energy falls enough; keep the old point if it never does.
+    """Halve the step until the energy falls enough; return the point's parts and whether it is another one.
 
     The first pass of `minimize` goes to the start, whatever its energy.
-
-    Returns:
-        The point, its value and its gradient, and whether it is another point than before.
     """
     is_first = state.iterations < 0
     slack = _rounding(state.value)

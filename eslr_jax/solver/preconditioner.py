@@ -33,13 +33,9 @@ class Stiffness:
 def hessian_diagonal(
     problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at `position`.
+    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at positions [m].
 
     Padded vertices get one, so that dividing by it is safe.
-
-    Args:
-        problem: The frame's problem.
-        position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     return jnp.where(problem.garment.vertex_mask, sum_diagonals(problem, position), 1.0)
 
@@ -65,11 +61,8 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     """Return the diagonal at `position` with the springs that share out its membrane part.
 
     Every edge gets the smaller of what its two ends can give, so the matrix is symmetric and diagonally
-    dominant. A cotangent Laplacian measured no better, and can lose definiteness on obtuse triangles.
-
-    Args:
-        problem: The frame's problem.
-        position: Where contact and friction are linearised [m], shape [vertices, 3].
+    dominant. A cotangent Laplacian measured no better, and can lose definiteness on obtuse triangles. Contact and
+    friction are linearised at `position` [m].
     """
     garment = problem.garment
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
@@ -83,18 +76,16 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     )
 
 
-def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
+def stretched_stiffness(
+    problem: FrameProblem, position: Float[Array, "vertices 3"], at_rest: Stiffness | None = None
+) -> Stiffness:
     """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
 
     A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal changes by
     the sum of the changes of a vertex's springs, and no more: with a larger diagonal long waves converge slowly
-    (experiments/tried.md). Networks take `stiffness`, which they were trained with.
-
-    Args:
-        problem: The frame's problem.
-        position: Where springs, contact and friction are linearised [m], shape [vertices, 3].
+    (experiments/tried.md). Networks take `stiffness`, which they were trained with. It may be given as `at_rest`.
     """
-    matrix = stiffness(problem, position)
+    matrix = stiffness(problem, position) if at_rest is None else at_rest
     squared, rest = (
         _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.sewn_positions)
     )

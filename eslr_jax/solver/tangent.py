@@ -35,12 +35,7 @@ class Tangent(NamedTuple):
 
 
 def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tangent:
-    """Return the potential's Hessian.
-
-    Args:
-        problem: The frame's problem.
-        position: Where it is taken [m], shape [vertices, 3].
-    """
+    """Return the potential's Hessian at positions [m]."""
     garment = problem.garment
     position = pin(problem, position)
     x = components(position)

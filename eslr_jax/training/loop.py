@@ -186,11 +186,7 @@ def core_seconds(out: Path) -> float:
 
 
 def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:
-    """Check that a run may begin or go on in a folder.
-
-    Raises:
-        CheckpointError: The folder holds another run, one of another configuration, or none to resume.
-    """
+    """Raise a CheckpointError where a folder holds another run or configuration, or no run to resume."""
     if not resume:
         if has_checkpoint(out):
             raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
@@ -294,9 +290,7 @@ def make_seeds_step(config: TrainConfig, resolution: int) -> Callable:
     The seeds are a batch axis of one step: at 1k vertices a GPU spends it on starting kernels, whose number does
     not grow with the seeds.
 
-    Args:
-        config: The run.
-        resolution: Index of the pool and of the data that the step works on.
+    Arguments are those of `make_train_step`.
     """
     step = jax.vmap(make_train_step(config, resolution), in_axes=(_AXES, None), out_axes=(_AXES, 0))
     return jax.jit(step, donate_argnums=0)

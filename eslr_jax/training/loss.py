@@ -42,15 +42,7 @@ def physics_loss(
     config: TrainConfig,
     terms_of: EnergyTerms = potential_terms,
 ) -> tuple[Float[Array, ""], LossReport]:
-    """Return the loss, without unit or in joules (set "hood"), and its report.
-
-    Args:
-        network: The network.
-        problem: The frame's problem.
-        state: Cloth at t.
-        config: Which refinement steps count; static.
-        terms_of: The set of energies.
-    """
+    """Return the loss of a set of energies, without unit or in joules (set "hood"), and its report."""
     positions = network.predict(problem, state, detach=True).positions
     terms = jax.vmap(terms_of, in_axes=(0, None))(positions, problem)
     energies = sum(terms.values())
