@@ -36,6 +36,7 @@ from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make
 
 _AXES = TrainState(network=0, optimizer=0, pools=0, key=0, step=None, skipped=0)  # type: ignore[arg-type]
 _ARENA_MAX, _MMAP_MAX, _TRIM_THRESHOLD, _TOP_PAD = -8, -4, -1, -2  # of glibc's malloc.h
+_DRAWN = ("stretch", "bending", "inertia", "collision", "friction")  # terms
 _SHARES = ("resets", "overflows", "skipped")  # shares of the trajectories of a step
 
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -308,3 +309,40 @@ def keep_memory() -> None:
         return
     for option, value in ((_ARENA_MAX, 1), (_MMAP_MAX, 0), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 2**28)):
         mallopt(option, value)
+
+
+def plot_curves(folder: Path, config: TrainConfig) -> Path | None:
+    """Draw the curves of a run's `metrics.jsonl` into `curves.png` (extra `plot`); None without it or metrics."""
+    try:
+        import matplotlib
+    except ImportError:
+        return None
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    if not records:
+        return None
+    steps = [record["step"] for record in records]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    losses = [record["loss"] for record in records]
+    spans_decades = not 0 < max(losses) < 10 * min(losses)
+    left.plot(steps, losses)
+    left.set(xlabel="step", ylabel=f"loss, {_unit(config)}", yscale="symlog" if spans_decades else "linear")
+    for term in _DRAWN:
+        right.plot(steps, [max(record[term], 1e-7) for record in records], label=term)
+    right.set(xlabel="step", ylabel="energy at the prediction, median [J]", yscale="log")
+    right.legend()
+    with atomic_write(folder / "curves.png") as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
+    plt.close(figure)
+    return folder / "curves.png"
+
+
+def _unit(config: TrainConfig) -> str:
+    """Return what a run's loss is measured in, see `training.loss`."""
+    if config.iterations:
+        return "mean logarithm of the shares of gap and squared distance that are left"
+    if config.refinement_weights == "contraction":
+        return "mean share of a pass's gap that it leaves"
+    return "J" if config.energy_set == "hood" else "in units of lifting the garment by 1 cm"
