@@ -84,7 +84,7 @@ class Plate:
 class Threads:
     """Stretch of a fabric with warp and weft on one garment's faces, see `terms.stretch`."""
 
-    warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `mesh.weave`
+    warp: Float[Array, "faces 2"]  # unit vectors in the rest faces' own frames, see `mesh.plate`
     stiffness: Float[Array, "4 faces"]  # [N/m] along warp, along weft, coupling of both, shear
     limits: Float[Array, "2 faces"] | None = None  # Green strain where they begin to stiffen
 

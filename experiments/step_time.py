@@ -30,7 +30,7 @@ from eslr_jax.networks.build import build_graph
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pipeline.report.scene_parts import time_in_turns
-from eslr_jax.training.memory import keep_memory
+from eslr_jax.training.loop import keep_memory
 
 sys.path.append(str(EXPERIMENTS.parent / "tests"))  # of reference_models
 

@@ -19,8 +19,8 @@ from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.assets.training import load_training_data
 from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.training.loop import keep_memory
 from eslr_jax.training.loss import physics_loss
-from eslr_jax.training.memory import keep_memory
 from eslr_jax.training.recipe import load_recipe
 from eslr_jax.training.step import init_train_state, make_optimizer, make_train_step
 

@@ -36,8 +36,16 @@ def validate_material(material: Material, garment: Garment | None = None) -> Non
     """
     for name, accepted in MATERIAL_RANGES.items():
         values = check_range(f"material {name}", getattr(material, name), accepted)
-        if garment is not None and values.ndim:
-            _check_shape(name, values, garment)
+        if garment is None or not values.ndim:
+            continue
+        element, count = {
+            "density": ("vertex", garment.vertex_areas.shape[0]),
+            "bending_stiffness": ("hinge", garment.hinge_rest_areas.shape[0]),
+        }.get(name, ("face", garment.rest_areas.shape[0]))
+        if values.shape != (count,):
+            raise ConfigError(
+                f"material {name} has shape {values.shape}; give one number, or one per {element} ({count})"
+            )
     if garment is None:
         return
     faces = len(np.asarray(garment.rest_areas))
@@ -57,15 +65,3 @@ def validate_timestep(timestep: Any) -> None:
         ConfigError: It is not a finite number in its range.
     """
     check_range("timestep", timestep, TIMESTEP_RANGE)
-
-
-def _check_shape(name: str, values: np.ndarray, garment: Garment) -> None:
-    """Raise where an array of a fabric doesn't have one value per element of the garment."""
-    element, count = {
-        "density": ("vertex", garment.vertex_areas.shape[0]),
-        "bending_stiffness": ("hinge", garment.hinge_rest_areas.shape[0]),
-    }.get(name, ("face", garment.rest_areas.shape[0]))
-    if values.shape != (count,):
-        raise ConfigError(
-            f"material {name} has shape {values.shape}; give one number, or one per {element} ({count})"
-        )

@@ -6,7 +6,6 @@ import math
 import zipfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 
@@ -69,22 +68,14 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     """Read one array after checking that its header agrees with its size."""
     size = archive.getinfo(name).file_size
     with archive.open(name) as stream:
-        shape, dtype = _read_header(stream)
+        is_old = np.lib.format.read_magic(stream) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if is_old else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
         expected = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or expected > size:
             raise ValueError(f"array {name} has an impossible header")
     with archive.open(name) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read the shape and dtype of an npy stream."""
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    else:
-        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
-    return shape, dtype
 
 
 def check_layout(

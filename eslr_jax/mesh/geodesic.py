@@ -107,7 +107,8 @@ def unfolded_shortcuts(
         windows = (sources, sides, right, left, low, high)
         sources, sides, right, left, low, high = (array[sides >= 0] for array in windows)
         axis = (right - left) / lengths[sides][:, None]  # the twin runs from left to right
-        apex = left + along[sides][:, None] * axis + height[sides][:, None] * _turn_left(axis)
+        upwards = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+        apex = left + along[sides][:, None] * axis + height[sides][:, None] * upwards
         from_low, to_high = _cross(low, apex), _cross(apex, high)
         is_seen = (from_low >= -tolerance) & (to_high >= -tolerance)
         pairs.append(np.stack([sources[is_seen], opposites[sides[is_seen]]], axis=1))
@@ -134,11 +135,6 @@ def unfolded_shortcuts(
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the plane cross product; positive where `second` is counter-clockwise of `first`."""
     return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-
-
-def _turn_left(vectors: np.ndarray) -> np.ndarray:
-    """Return plane vectors turned counter-clockwise by a right angle."""
-    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
 
 
 def _bridges(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

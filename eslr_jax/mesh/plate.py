@@ -1,4 +1,4 @@
-"""Curvatures of a sheet's faces from the angles of its hinges, for bending in newton metres.
+"""Where the threads of a fabric run on a garment's faces, and their curvatures, for bending in newton metres.
 
 The angle of a hinge is divided between its two faces: each face turns by its share, from its middle to the common
 edge. The turns at the three edges of a face give its curvature, the sum of turn times edge length over area along
@@ -12,16 +12,20 @@ doi 10.1111/j.1467-8659.2006.00974.x (curvature of faces from the rotation of th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from eslr_jax.errors import MeshError
 from eslr_jax.mesh import topology
 from eslr_jax.types import Garment, Plate
 
 _SLOTS = 9  # hinges of a face and of its three neighbours
 _DEGREE = 6  # times that one hinge can be among them: two faces with two more neighbours each
+_UP = (0.0, 1.0, 0.0)
+_LEAST = 1e-3  # length of a direction's projection below which a face does not see it
 _SOFTNESS = 1e-2  # share of the mean by which the angles of a face may miss its curvature; bounds the inverse
 
 
@@ -44,6 +48,75 @@ def rest_corners(garment: Garment) -> Float[np.ndarray, "faces 3 2"]:
     inverse = np.asarray(garment.inverse_rest_frames, np.float64)[_is_real(garment)]
     edges = np.linalg.inv(inverse)
     return np.stack([edges[:, :, 0], edges[:, :, 1], np.zeros_like(edges[:, :, 0])], axis=1)
+
+
+def warp_directions(
+    garment: Garment,
+    corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None,
+    *,
+    direction: Sequence[float] = _UP,
+) -> Float[np.ndarray, "faces 2"]:
+    """Return the direction of the warp on every real face: a unit vector in the frame of `rest_corners`.
+
+    Patterns are cut and drawn with the warp along the second texture coordinate. Without texture coordinates,
+    or where a face has none, the warp runs along a direction laid onto the rest mesh: by default up, as in a
+    garment whose pieces hang along the grain. A face that lies across it takes the mean of the faces around
+    it, or if there is none its own first edge.
+
+    Args:
+        garment: Prepared garment.
+        corner_uvs: Texture coordinates of the corners of its faces.
+        direction: Where the warp runs without them, any length.
+
+    Raises:
+        MeshError: The texture coordinates fit another mesh, or the direction is no direction.
+    """
+    corners = rest_corners(garment)
+    warp = _laid(garment, corners, direction)
+    if corner_uvs is None:
+        return warp
+    uvs = np.asarray(corner_uvs, np.float64)
+    if uvs.shape != corners.shape:
+        raise MeshError(f"texture coordinates of shape {uvs.shape} don't fit {len(corners)} faces")
+    in_plane, in_texture = (np.stack([x[:, 0] - x[:, 2], x[:, 1] - x[:, 2]], axis=2) for x in (corners, uvs))
+    determinant = np.linalg.det(in_texture)
+    is_mapped = np.abs(determinant) > 1e-12
+    columns = np.linalg.solve(
+        np.where(is_mapped[:, None, None], in_texture, np.eye(2)), np.array([[0.0], [1.0]])
+    )
+    along = topology.normalize((in_plane @ columns)[:, :, 0])
+    return np.where(is_mapped[:, None], along, warp)
+
+
+def _laid(garment: Garment, corners: np.ndarray, direction: Sequence[float]) -> np.ndarray:
+    """Return a direction of space in the plane of every face."""
+    wanted = np.asarray(direction, np.float64)
+    if wanted.shape != (3,) or not np.linalg.norm(wanted) > 0:
+        raise MeshError(f"{direction} is no direction; give three numbers")
+    positions, faces = (
+        np.asarray(garment.rest_positions, np.float64),
+        np.asarray(garment.faces)[: len(corners)],
+    )
+    points = positions[faces]
+    first = topology.normalize(points[:, 0] - points[:, 2])
+    normal = topology.normalize(np.cross(points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]))
+
+    def laid(vectors: np.ndarray) -> np.ndarray:
+        return vectors - np.vecdot(normal, vectors)[:, None] * normal
+
+    seen = laid(wanted / np.linalg.norm(wanted))
+    while (is_blind := np.linalg.norm(seen, axis=1) < _LEAST).any():
+        around = np.zeros_like(positions)
+        known = topology.normalize(np.where(is_blind[:, None], 0.0, seen))
+        np.add.at(around, faces.ravel(), np.repeat(known, 3, axis=0))
+        mean = laid(around[faces].sum(axis=1))
+        is_found = is_blind & (np.linalg.norm(mean, axis=1) > _LEAST)
+        if not is_found.any():  # no face beside it sees the direction
+            seen = np.where(is_blind[:, None], first, seen)
+            break
+        seen = np.where(is_found[:, None], mean, seen)
+    second = np.cross(normal, first)
+    return topology.normalize(np.stack([np.vecdot(seen, first), np.vecdot(seen, second)], axis=1))
 
 
 def prepare_plate(

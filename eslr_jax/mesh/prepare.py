@@ -14,8 +14,8 @@ from eslr_jax.errors import MeshError
 from eslr_jax.mesh import topology
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.embedding import EmbeddingMode, geodesic_embedding
-from eslr_jax.mesh.groups import compact_groups
 from eslr_jax.mesh.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
+from eslr_jax.mesh.surface import compact_groups
 from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
 from eslr_jax.types import Garment
 

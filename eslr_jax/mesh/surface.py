@@ -1,15 +1,33 @@
-"""Search tables of a body surface, built once per scene on the host."""
+"""Compact groups of neighbouring points, and search tables of a body surface (host)."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
-from eslr_jax.mesh.groups import compact_groups
 from eslr_jax.mesh.topology import face_areas, incidence_table, vertex_areas
 from eslr_jax.types import BodySurface
 
 _PATCH_SIZE = 16  # vertices in a patch; more make the first level cheaper and the second dearer
+
+
+def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
+    """Split points into compact groups, which searches handle together; the last one repeats its last point.
+
+    The set is halved along its longest side again and again, at a multiple of `size`, so the number of groups
+    depends on the number of points alone.
+    """
+    pending, groups = [np.arange(len(points))], []
+    while pending:
+        ids = pending.pop()
+        if len(ids) <= size:
+            groups.append(np.pad(ids, (0, size - len(ids)), mode="edge"))
+            continue
+        ordered = ids[np.argsort(points[ids, np.argmax(np.ptp(points[ids], axis=0))], kind="stable")]
+        middle = -(-len(ids) // (2 * size)) * size
+        pending += [ordered[middle:], ordered[:middle]]
+    return np.stack(groups)
 
 
 def prepare_surface(

@@ -1,4 +1,4 @@
-"""Networks applied to a graph, and the statistics of its features."""
+"""Networks applied: to a graph, and to a frame's problem, by an acceleration or by corrections of a guess."""
 
 from __future__ import annotations
 
@@ -10,9 +10,24 @@ import jraph
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.networks import features, normalizer
-from eslr_jax.networks.build import COARSE_SETS, Rows, Topology
-from eslr_jax.networks.network import Network, Statistics
-from eslr_jax.types import Garment
+from eslr_jax.networks.build import (
+    COARSE_SETS,
+    Rows,
+    Topology,
+    build_frame_graph,
+    build_graph,
+    build_refinement_graph,
+)
+from eslr_jax.networks.features import GraphInputs, required
+from eslr_jax.networks.network import Network, Prediction, Statistics
+from eslr_jax.numerics import safe_norm
+from eslr_jax.solver.guess import initial_guess
+from eslr_jax.solver.potential import evaluate, potential
+from eslr_jax.solver.preconditioner import solve_stiffness, stiffness
+from eslr_jax.solver.subspace import combine_directions
+from eslr_jax.terms import Collision
+from eslr_jax.terms.problem import FrameProblem, pin
+from eslr_jax.types import ClothState, Garment
 
 
 class Places(NamedTuple):
@@ -25,23 +40,12 @@ class Places(NamedTuple):
 def apply_model(
     network: Network, graph: jraph.GraphsTuple, garment: Garment
 ) -> Float[Array, "vertices outputs"]:
-    """Return the network's raw output; see `scale_output`.
-
-    Args:
-        network: The network.
-        graph: Graph of `build_graph`, of the network's kind.
-        garment: The graph's garment, for its geodesic embedding and vertex mask.
-    """
-    return _call(network, graph, _places(garment), network.statistics)
+    """Return the network's raw output for a graph of `build_graph`, of the network's kind; see `scale_output`."""
+    return _call(network, graph, Places(garment.geodesic_embedding, garment.vertex_mask), network.statistics)
 
 
 def encode_frame(network: Network, graph: jraph.GraphsTuple) -> Any:
-    """Return what all refinement steps of a frame share.
-
-    Args:
-        network: One that reads the potential's gradient.
-        graph: Graph of `build_frame_graph`.
-    """
+    """Return what all refinement steps of a frame share, from a graph of `build_frame_graph`."""
     return _call(network, graph, method="encode_frame")
 
 
@@ -50,15 +54,12 @@ def apply_refinement(
 ) -> Float[Array, "vertices outputs"]:
     """Return the raw output of one refinement step; equals `apply_model` on the joined graph.
 
-    Args:
-        network: One that reads the potential's gradient.
-        encoded: Result of `encode_frame`.
-        changing: Graph of `build_refinement_graph`.
-        garment: The graph's garment, for its geodesic embedding and vertex mask.
+    `encoded` is the result of `encode_frame`, and `changing` a graph of `build_refinement_graph`.
     """
+    places = Places(garment.geodesic_embedding, garment.vertex_mask)
 
     def run(module: Any):
-        return module.process(module.encode_refinement(encoded, changing), _places(garment))
+        return module.process(module.encode_refinement(encoded, changing), places)
 
     return _call(network, method=run)
 
@@ -72,11 +73,7 @@ def _call(network: Network, *args: Any, **options: Any) -> Any:
 
 
 def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return the output's vectors in physical units: metres, or for an acceleration metres per frame squared.
-
-    Args:
-        network: The network.
-        output: First three columns of the raw output, shape [vertices, 3].
+    """Return vectors, the output's first three columns, in metres; accelerations in metres per frame squared.
 
     Source: HOOD's output normaliser, applied backwards, for accelerations.
     """
@@ -88,14 +85,9 @@ def scale_output(network: Network, output: Float[Array, "vertices 3"]) -> Float[
 def measure_statistics(
     network: Network, graph: jraph.GraphsTuple, garment: Garment, acceleration: Float[Array, "vertices 3"]
 ) -> Statistics:
-    """Return the statistics of one graph; none for features that are not normalised.
+    """Return the statistics of one graph and of target accelerations [m per frame^2].
 
-    Args:
-        network: The network.
-        graph: Graph of `build_graph`.
-        garment: The graph's garment, for its masks.
-        acceleration: Target accelerations [m per frame^2], shape [vertices, 3]; in HOOD those of the skinned
-            garment.
+    There are none for features that are not normalised. HOOD's targets are those of the skinned garment.
 
     Source: HOOD's `utils/normalization.py`.
     """
@@ -132,6 +124,89 @@ def merge_statistics(network: Network, measured: Statistics) -> Network:
     return network.replace(statistics={**seen, **merged})
 
 
-def _places(garment: Garment) -> Places:
-    """Return embedding and mask of a garment's vertices."""
-    return Places(garment.geodesic_embedding, garment.vertex_mask)
+def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
+    """Return what the graph is built from; pinned vertices already carry their next target (HOOD)."""
+    position = pin(problem, state.position)
+    velocity = state.velocity * problem.timestep
+    if problem.pin_targets is not None:
+        is_pinned = problem.garment.is_pinned[:, None]
+        velocity = jnp.where(is_pinned, position - state.position, velocity)
+    touched = problem.data_of(Collision)
+    contacts = None if touched is None else touched.nearest
+    return GraphInputs(
+        position=position,
+        velocity=velocity,
+        timestep=problem.timestep,
+        contacts=contacts,
+        body_velocity=None if contacts is None else contacts.next_points - contacts.points,
+        inertial_guess=problem.inertial_guess,
+        weight=problem.gravity * problem.masses,
+    )
+
+
+def predict_acceleration(network: Network, problem: FrameProblem, state: ClothState) -> Prediction:
+    """Integrate the network's acceleration, as the paper does.
+
+    Source: the paper's method section, Q' = Q + A dt and X' = X + Q' dt, in HOOD's per-frame units.
+    """
+    inputs = graph_inputs(problem, state)
+    graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
+    output = apply_model(network, graph, problem.garment)
+    velocity = inputs.velocity + scale_output(network, output)
+    return Prediction(pin(problem, inputs.position + velocity)[None])
+
+
+def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach: bool = False) -> Prediction:
+    """Correct the solver's own initial guess, step by step.
+
+    Before each step the potential's gradient, and the preconditioned step down it, are taken at the last
+    positions. With gates the network adds to a preconditioned gradient method with momentum: a new network is
+    plain preconditioned descent.
+
+    Args:
+        network: One that reads the potential's gradient.
+        problem: The frame's problem.
+        state: Cloth at t.
+        detach: Stop gradients between steps, and those of the weights that combine directions: each step is then
+            trained to do its best from where it begins.
+    """
+    garment, material, config = problem.garment, problem.material, network.config
+    inputs = graph_inputs(problem, state)
+    graph = build_frame_graph(garment, material, inputs, config.graph)
+    guess = initial_guess(problem)
+    zeros = jnp.zeros_like(guess.position)
+    inputs = inputs.replace(
+        guess=guess.position, gradient=zeros, step=zeros, correction=zeros, previous_gradient=zeros
+    )
+    encoded = encode_frame(network, graph)
+    longest: Array = graph.globals["edge_length"]  # type: ignore[index, assignment]: jraph's trees
+
+    def one_step(carry: GraphInputs, _):
+        point = evaluate(required(carry, "guess"), problem)
+        # The stretch energy grows with the fourth power of a displacement: from a torn-up state, full steps would
+        # overshoot further each time. The bound is a trust region of one mesh spacing.
+        step = solve_stiffness(stiffness(problem, point.position), -point.gradient)
+        step = step * (longest / jnp.maximum(safe_norm(step, keepdims=True), longest))
+        inputs = carry.replace(gradient=point.gradient, step=step)
+        changing = build_refinement_graph(garment, material, inputs, graph)
+        output = apply_refinement(network, encoded, changing, garment)
+        move = scale_output(network, output[:, :3])
+        if config.has_gates:  # one per vertex scales the step (1 + gate), another the last correction
+            move = move + (1.0 + output[:, 3:4]) * step + output[:, 4:5] * required(inputs, "correction")
+        if config.is_combined:
+            directions = jnp.stack([move, inputs.step, inputs.correction])
+            if problem.pin_targets is not None:
+                directions = jnp.where(garment.is_pinned[:, None], 0.0, directions)
+            move = combine_directions(
+                lambda x: potential(x, problem), point, directions, fixed_weights=detach
+            )
+        position = pin(problem, inputs.guess + move)
+        onward = jax.lax.stop_gradient(position) if detach else position
+        later = inputs.replace(
+            guess=onward, correction=onward - point.position, previous_gradient=point.gradient
+        )
+        return later, (position, point)
+
+    _, (positions, starts) = jax.lax.scan(one_step, inputs, None, length=config.refinement_steps)
+    lowest = jnp.nanargmin(starts.value)
+    return Prediction(positions, guess, jax.tree.map(lambda rows: rows[lowest], starts))

@@ -1,4 +1,4 @@
-"""What the networks of this package share: options, new weights, and how they predict."""
+"""What the networks of this package share: options, new weights, stacks of layers, and how they predict."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ import jax
 import jax.numpy as jnp
 import jraph
 import numpy as np
+from jaxtyping import Array, Float
 
 from eslr_jax.errors import CheckpointError
 from eslr_jax.networks import features, normalizer
-from eslr_jax.networks.apply import Places
-from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, feature_sizes
+from eslr_jax.networks.apply import Places, predict_acceleration, refine
+from eslr_jax.networks.attention import orthogonal_projection
+from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, Topology, feature_sizes
+from eslr_jax.networks.dense import MLP
 from eslr_jax.networks.network import Example, Network, Prediction, Statistics, System
-from eslr_jax.networks.refine import predict_acceleration, refine
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, CoarseEdges
 
+CORRECTION_GAIN = 0.02  # a new network hardly moves the guess that it corrects
 _MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
 
 
@@ -78,8 +81,12 @@ class Architecture(System):
 
     def new_network(self, seed: int = 0, example: Example | None = None) -> Network:
         """Return a network with new weights, which fits any garment; see `System`."""
-        params = draw_weights(jax.jit(lambda: _declare(self)["params"])(), seed)
-        return Network(params, self, _new_statistics(self), self.draw_constants())
+
+        @jax.jit
+        def declare() -> Any:
+            return self.module.init(jax.random.key(0), *_example(self), _new_statistics(self))["params"]
+
+        return Network(draw_weights(declare(), seed), self, _new_statistics(self), self.draw_constants())
 
     def predict(
         self, network: Network, problem: FrameProblem, state: ClothState, *, detach: bool
@@ -105,12 +112,7 @@ class Architecture(System):
 
 
 def draw_weights(spreads: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Return weights as modules declare them, with the kernels drawn; see `dense.kernel_spread`.
-
-    Args:
-        spreads: Weights of a module's `init`.
-        seed: Of the normal numbers that kernels are multiplied by.
-    """
+    """Return weights of a module's `init` with the kernels drawn; see `dense.kernel_spread`."""
     generator = np.random.default_rng(seed)
 
     def draw(path, spread):
@@ -130,12 +132,6 @@ def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
     """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(network.parts)
     return {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
-
-
-def _declare(config: Architecture) -> dict[str, Any]:
-    """Return weights as their modules declare them, before anything is drawn; see `dense.kernel_spread`."""
-    graph, places = _example(config)
-    return cast(dict[str, Any], config.module.init(jax.random.key(0), graph, places, _new_statistics(config)))
 
 
 def _new_statistics(config: Architecture) -> Statistics:
@@ -180,3 +176,76 @@ def _example(config: Architecture) -> tuple[jraph.GraphsTuple, Places]:
     )
     width = getattr(config, "embedding_size", 0)  # what attention reads, where there is any
     return graph, Places(zeros((2, width)), jnp.ones(2, bool))
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoBranches(Architecture):
+    """Options of a network whose decoder reads a stack of LSDMP layers and one of GSA blocks.
+
+    The paper is silent on the fields marked "open". Their defaults fit its parameter counts, or else follow
+    MeshGraphNet and HOOD. `networks.lsdmp` lists the open points that are no options.
+    """
+
+    message_passing_steps: int = 15  # LSDMP or MeshGraphNet layers (paper, Table V)
+    smoothing_steps: int = 3  # Laplacian smoothings per layer (paper, eq. 3); 0 is MeshGraphNet
+    attention_blocks: int = 4  # GSA blocks; 0 leaves the branch out
+    attention_size: int = 64  # open: q, k, v width, one head; fits the paper's parameter count
+    attention_features: int = 266  # open: random features, floor(64 ln 64), the Performer default
+    embedding_size: int = 8  # open: k of the geodesic embedding
+    embedding_mode: Literal["raw", "canonical", "landmarks"] = "canonical"  # axes of the embedding
+    seed: int = 0  # of the random attention features
+
+    is_attention_normed: ClassVar[bool] = False  # see `gsa.GsaBlock`
+
+    @property
+    def garment_options(self) -> dict[str, Any]:
+        """Arguments of `assets.load_garment` for a garment that the network reads."""
+        return {"embedding_size": self.embedding_size, "embedding_mode": self.embedding_mode}
+
+    def draw_constants(self) -> dict[str, Any]:
+        """Return the random directions of the attention."""
+        if not self.attention_blocks:
+            return {}
+        directions = orthogonal_projection(self.attention_features, self.attention_size, self.seed)
+        return {"projection": jnp.asarray(directions, jnp.float32)}
+
+
+def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
+    """Return the decoder of the latents of one or more branches, side by side, into a vector and gates."""
+    size = config.latent_size
+    return MLP(
+        num_branches * size,
+        size,
+        5 if config.has_gates else 3,
+        config.hidden_layers,
+        norm=False,
+        output_gain=CORRECTION_GAIN if config.reads_gradient else 1.0,
+        precision=config.precision,
+    )
+
+
+def stack(module: type[nn.Module], config: Architecture, length: int, **attributes: Any) -> nn.Module:
+    """Return `length` copies of a module, each with its own weights, compiled once.
+
+    `Architecture.remat` says what the backward pass keeps of a layer: everything ("none" is recomputed), the
+    results of its matrix products ("products"), or its inputs alone ("layers": a third of the memory, for a
+    quarter more time). The module's first attribute is the configuration.
+    """
+    if config.remat != "none":
+        keeps = jax.checkpoint_policies.dots_saveable if config.remat == "products" else None
+        module = nn.remat(module, prevent_cse=False, policy=keeps)
+    scanned = nn.scan(
+        module,
+        variable_axes={"params": 0},
+        split_rngs={"params": True},
+        in_axes=nn.broadcast,
+        length=length,
+    )
+    return scanned(config, **attributes)
+
+
+def world_mask(graph: jraph.GraphsTuple, dtype) -> Float[Array, "vertices 1"]:
+    """Return one for every vertex with a world edge, zero for the others; zeros without a body."""
+    rows = graph.nodes["garment"].shape[0]
+    mask = cast(Topology, graph.globals).get("world_mask", jnp.zeros(rows, bool))
+    return mask.astype(dtype)[:, None]

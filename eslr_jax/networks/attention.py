@@ -90,11 +90,7 @@ def linear_attention(
 ) -> Float[Array, "rows width"]:
     """Return for every query the average of `values`, weighted by its attention; in time linear in the rows.
 
-    Args:
-        query_features: Positive features of the queries, shape [rows, features].
-        key_features: Positive features of the keys, shape [rows, features].
-        values: Rows to average, shape [rows, width].
-        mask: Which rows may be attended to, shape [rows]; None for all.
+    Features are positive. `mask` says which rows may be attended to.
     """
     if mask is not None:
         key_features = jnp.where(mask[:, None], key_features, 0)

@@ -28,9 +28,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
-from eslr_jax.networks.inputs import GraphInputs, required
+from eslr_jax.networks.features import GraphInputs, required
 from eslr_jax.numerics import safe_norm
-from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
+from eslr_jax.types import CoarseEdges, Garment, Material
 
 COARSE_SETS = ("coarse0", "coarse1", "coarse2")
 """Edge sets of a garment's coarse levels, finest first (HOOD)."""
@@ -64,13 +64,7 @@ class Topology(TypedDict, total=False):
 def build_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph of a frame, or of one refinement step.
-
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body.
-        kind: Features and sets of edges; static.
+    """Return the graph of a frame, or of one refinement step; `kind` is static.
 
     Raises:
         ConfigError: The network is hierarchical and the garment has no coarse levels.
@@ -84,14 +78,7 @@ def build_graph(
 def build_frame_graph(
     garment: Garment, material: Material, inputs: GraphInputs, kind: GraphKind
 ) -> jraph.GraphsTuple:
-    """Return the graph with the features that stay for a whole frame, which are all of HOOD's.
-
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body.
-        kind: Features and sets of edges; static.
-    """
+    """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
     is_hood = not kind.reads_gradient
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
@@ -128,9 +115,15 @@ def build_frame_graph(
             away = safe_norm(inputs.contacts.points - inputs.position)
         mask = (jnp.abs(away) <= kind.world_edge_radius) & garment.vertex_mask
         topology["world_mask"] = mask
+        contacts, velocity = inputs.contacts, required(inputs, "body_velocity")
         if is_hood:
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
-        body, world = _world_rows(inputs.contacts, inputs, is_hood)
+            body = features.hood_body_features(velocity, contacts.normals, inputs.timestep)
+            world = features.hood_world_features(contacts, inputs)
+        else:
+            inertial_guess = required(inputs, "inertial_guess")
+            body = features.frame_body_features(velocity, contacts, inputs.timestep)
+            world = features.frame_world_features(inputs.position, contacts, inertial_guess)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
         senders["world"] = receivers["world"] = jnp.arange(mask.shape[0])
         if kind.has_reverse_edges:
@@ -167,12 +160,6 @@ def build_refinement_graph(
     garment: Garment, material: Material, inputs: GraphInputs, frame_graph: jraph.GraphsTuple
 ) -> jraph.GraphsTuple:
     """Return the features that change with every refinement step, on the topology of `frame_graph`.
-
-    Args:
-        garment: Rest mesh and topology.
-        material: Fabric.
-        inputs: State of garment and body, with the guess and the potential's gradient there.
-        frame_graph: Graph of `build_frame_graph`.
 
     Raises:
         ValueError: A field of `inputs` that these features need is None.
@@ -228,30 +215,12 @@ def incoming_edges(
 ) -> Int[Array, "vertices degree"]:
     """Return the mesh edges that enter every vertex; they are consecutive, as edges are sorted by receiver.
 
-    Args:
-        neighbor_mask: Which neighbours of a vertex are real, shape [vertices, degree]; real ones come first.
-        num_edges: Number of mesh edges, which pads the table.
+    Real neighbours come first in `neighbor_mask`. The table is padded with `num_edges`.
     """
     degrees = jnp.sum(neighbor_mask, axis=1, dtype=jnp.int32)
     first = jnp.cumsum(degrees) - degrees
     edges = first[:, None] + jnp.arange(neighbor_mask.shape[1], dtype=jnp.int32)[None]
     return jnp.where(neighbor_mask, edges, num_edges)
-
-
-def _world_rows(
-    contacts: Contacts, inputs: GraphInputs, is_hood: bool
-) -> tuple[Float[Array, "vertices _"], Float[Array, "vertices _"]]:
-    """Return the features of body rows and of world edges, unmasked."""
-    velocity = required(inputs, "body_velocity")
-    if is_hood:
-        return (
-            features.hood_body_features(velocity, contacts.normals, inputs.timestep),
-            features.hood_world_features(contacts, inputs),
-        )
-    return (
-        features.frame_body_features(velocity, contacts, inputs.timestep),
-        features.frame_world_features(inputs.position, contacts, required(inputs, "inertial_guess")),
-    )
 
 
 def _mask_rows(

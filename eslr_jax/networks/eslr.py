@@ -20,12 +20,11 @@ from jaxtyping import Array, Float, Int
 from eslr_jax.errors import ConfigError
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
-from eslr_jax.networks.branches import TwoBranches, make_decoder, stack, world_mask
+from eslr_jax.networks.architecture import TwoBranches, make_decoder, stack, world_mask
 from eslr_jax.networks.build import GraphKind, Rows, feature_sizes
 from eslr_jax.networks.dense import kernel_spread
 from eslr_jax.networks.gsa import GsaBlock
-from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents
-from eslr_jax.networks.mlp import MLP
+from eslr_jax.networks.lsdmp import Latents, LayerTables, LsdmpLayer, WorldLatents, make_mlp
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.normalizer import normalize
 from eslr_jax.networks.operators import mesh_tables, sum_receivers
@@ -34,21 +33,16 @@ from eslr_jax.types import Normalizer
 VELOCITY_COLUMNS = 3  # HOOD puts the type embedding behind them
 
 
-class EncodedWorld(NamedTuple):
-    """The part of `Encoded` that a body adds."""
-
-    body: Float[Array, "vertices latent"]  # finished: a body row has no features that change
-    edges: Float[Array, "vertices hidden"]  # body to garment
-    reverse: Float[Array, "vertices hidden"] | None  # garment to body; None where body rows are constant
-
-
 class Encoded(NamedTuple):
-    """Hidden layers of the encoders, as far as a frame's constant features decide them."""
+    """Hidden layers of the encoders, as far as a frame's constant features decide them.
+
+    Body rows are finished: they have no features that change.
+    """
 
     garment: Float[Array, "vertices hidden"]
     mesh: Float[Array, "edges hidden"]
     tables: LayerTables
-    world: EncodedWorld | None  # None in a scene without a body
+    world: WorldLatents | None  # None in a scene without a body
 
 
 class GraphModule(nn.Module):
@@ -106,24 +100,19 @@ class EncodeProcessDecode(GraphModule):
 
     def setup(self) -> None:
         """Declare encoders, stacks and decoder."""
-        config = self.config
-        size, sizes = config.latent_size, feature_sizes(config.graph)
-
-        def encoder(input_size: int) -> MLP:
-            return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
-
+        config, sizes = self.config, feature_sizes(self.config.graph)
         if not config.reads_gradient:
             self.type_embedding = self.param(
                 "type_embedding",
                 kernel_spread(features.NUM_TYPES),
                 (features.NUM_TYPES, features.NUM_TYPES),
             )
-            self.garment_encoder = encoder(sizes["garment"] + features.NUM_TYPES)
+            self.garment_encoder = make_mlp(config, sizes["garment"] + features.NUM_TYPES)
         else:
-            self.garment_encoder = encoder(sizes["garment"])
-            self.body_encoder = encoder(sizes["body"])
-        self.mesh_encoder = encoder(sizes["mesh"])
-        self.world_encoder = encoder(sizes["world"])
+            self.garment_encoder = make_mlp(config, sizes["garment"])
+            self.body_encoder = make_mlp(config, sizes["body"])
+        self.mesh_encoder = make_mlp(config, sizes["mesh"])
+        self.world_encoder = make_mlp(config, sizes["world"])
         self.layers = stack(LsdmpLayer, config, config.message_passing_steps)
         if config.attention_blocks:
             self.blocks = stack(GsaBlock, config, config.attention_blocks)
@@ -134,22 +123,11 @@ class EncodeProcessDecode(GraphModule):
     def __call__(
         self, graph: jraph.GraphsTuple, places: Places, statistics: Statistics | None = None
     ) -> Float[Array, "vertices outputs"]:
-        """Return the raw output for a whole graph.
-
-        Args:
-            graph: Graph of `build_graph`.
-            places: Embedding and mask of the vertices.
-            statistics: Normalisers of the rows "garment" (and body), "mesh" and "world", for HOOD's features.
-        """
+        """Return the raw output for a whole graph; `statistics` are the normalisers of HOOD's features."""
         return self.process(self.encode_frame(graph, statistics), places)
 
     def encode_frame(self, graph: jraph.GraphsTuple, statistics: Statistics | None = None) -> Encoded:
-        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame.
-
-        Args:
-            graph: Graph of `build_graph` or of `build_frame_graph`.
-            statistics: Normalisers, see `__call__`.
-        """
+        """Return the encoders' first layers, for a whole graph or for the features that stay for a frame."""
         nodes, edges = self.normalized(graph, statistics)
         dtype = nodes["garment"].dtype
         world = None
@@ -160,7 +138,7 @@ class EncodeProcessDecode(GraphModule):
                 for name in ("world", "world_reverse")
                 if name in edges
             }
-            world = EncodedWorld(
+            world = WorldLatents(
                 body=body_encoder(nodes["body"]),
                 edges=first_layers["world"],
                 reverse=first_layers.get("world_reverse"),
@@ -173,12 +151,7 @@ class EncodeProcessDecode(GraphModule):
         )
 
     def encode_refinement(self, encoded: Encoded, changing: jraph.GraphsTuple) -> Encoded:
-        """Add the features of a refinement step to those of its frame.
-
-        Args:
-            encoded: Hidden layers of `encode_frame` for the frame's features.
-            changing: Graph of `build_refinement_graph`.
-        """
+        """Add the features of a refinement step, of `build_refinement_graph`, to those of its frame."""
         nodes, edges, world = changing.nodes, changing.edges, encoded.world
         if world is not None:
             rows = self.world_encoder.start(edges["world"], features.WORLD_FRAME_SIZE)
@@ -191,7 +164,12 @@ class EncodeProcessDecode(GraphModule):
         )
 
     def process(self, encoded: Encoded, places: Places) -> Float[Array, "vertices outputs"]:
-        """Finish the encoders, run both stacks and decode."""
+        """Finish the encoders, run both stacks and decode.
+
+        Raises:
+            ConfigError: The garment has another number of geodesic coordinates than the network reads.
+        """
+        config = self.config
         vertices = self.garment_encoder.finish(encoded.garment)
         mesh = self.mesh_encoder.finish(encoded.mesh)
         world = None
@@ -201,26 +179,7 @@ class EncodeProcessDecode(GraphModule):
             world = WorldLatents(given.body, finish(given.edges), reverse)
         latents = Latents(vertices, mesh, sum_receivers(mesh, encoded.tables.mesh), world)
         latents, _ = self.layers(latents, encoded.tables)
-        return self.decode(latents.garment, vertices, places)
-
-    def decode(
-        self,
-        processed: Float[Array, "vertices latent"],
-        encoded: Float[Array, "vertices latent"],
-        places: Places,
-    ) -> Float[Array, "vertices outputs"]:
-        """Run the attention branch and decode.
-
-        Args:
-            processed: Vertex latents behind the stack of layers, shape [vertices, latent].
-            encoded: Vertex latents of the encoder, from which attention starts, shape [vertices, latent].
-            places: Embedding and mask of the vertices.
-
-        Raises:
-            ConfigError: The garment has another number of geodesic coordinates than the network reads.
-        """
-        config = self.config
-        hidden = self.decoder.start(processed, 0, bias=True)
+        hidden = self.decoder.start(latents.garment, 0, bias=True)
         if config.attention_blocks:
             size = places.embedding.shape[1]
             if size != config.embedding_size:
@@ -228,7 +187,7 @@ class EncodeProcessDecode(GraphModule):
                     f"the garment has {size} geodesic coordinates and the model embedding_size = "
                     f"{config.embedding_size}; prepare the garment with that embedding_size"
                 )
-            attended, _ = self.blocks(encoded, (*places, self.projection.value))
+            attended, _ = self.blocks(vertices, (*places, self.projection.value))
             hidden = hidden + self.decoder.start(attended, config.latent_size)
         return self.decoder.finish(hidden)
 

@@ -1,4 +1,4 @@
-"""Node and edge features of two kinds: HOOD's, and scaled ones with the gradient of the potential.
+"""What a graph is built from, and its features: HOOD's, or scaled ones with the potential's gradient.
 
 HOOD's features are raw, and the model normalises them by running statistics. Features of the kind
 "gradient" are divided by fixed physical scales. What grows with the mesh spacing is divided by the
@@ -11,10 +11,10 @@ Source: HOOD's `models/baselines.py` and `utils/connectivity.py` for the first k
 from __future__ import annotations
 
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.networks.inputs import GraphInputs, required
 from eslr_jax.numerics import safe_norm, safe_normalize, sum_incident, vertex_normals
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.types import CoarseEdges, Contacts, Garment, Material
@@ -43,6 +43,44 @@ HOOD_NODE_SIZE = 11  # + 9 embedding columns = 20
 HOOD_NODE_STATIC = 3  # last columns, which are not normalised
 HOOD_MESH_SIZE, HOOD_MESH_STATIC = 12, 3
 HOOD_WORLD_SIZE = 9
+
+
+@struct.dataclass
+class GraphInputs:
+    """State of a garment and of the body beside it, at a frame or at one refinement step of a frame.
+
+    Lengths are in metres. Velocities are in metres per frame, the unit of HOOD's features. Pinned vertices
+    already have their next target as `position`, and their way to it as `velocity`.
+
+    `contacts` and `body_velocity` are None in a scene without a body. Only features of the kind "gradient" read
+    the fields from `inertial_guess` on. `correction` and `previous_gradient` are None or zero at the first
+    refinement step of a frame.
+    """
+
+    position: Float[Array, "vertices 3"]  # [m]
+    velocity: Float[Array, "vertices 3"]  # [m per frame]
+    timestep: Float[Array, ""]  # [s]
+    contacts: Contacts | None = None
+    body_velocity: Float[Array, "vertices 3"] | None = None  # of the nearest body points [m per frame]
+    inertial_guess: Float[Array, "vertices 3"] | None = None  # where inertia alone leads [m]
+    guess: Float[Array, "vertices 3"] | None = None  # what the step corrects [m]
+    gradient: Float[Array, "vertices 3"] | None = None  # of the potential at `guess` [N]
+    step: Float[Array, "vertices 3"] | None = None  # preconditioned step down that gradient [m]
+    weight: Float[Array, " vertices"] | None = None  # m g [N]
+    correction: Float[Array, "vertices 3"] | None = None  # that led to `guess` [m]
+    previous_gradient: Float[Array, "vertices 3"] | None = None  # before that correction [N]
+
+
+def required(inputs: GraphInputs, name: str) -> Array:
+    """Return a field of `inputs` that a kind of features cannot do without.
+
+    Raises:
+        ValueError: The field is None.
+    """
+    value = getattr(inputs, name)
+    if value is None:
+        raise ValueError(f"GraphInputs.{name} is None, but the features of this model need it; set it")
+    return value
 
 
 def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -158,11 +196,7 @@ def hood_edge_features(
 ) -> Float[Array, "edges 12"]:
     """Return sender minus receiver 3 [m], its norm, the same at rest 4, timestep [s], material inputs 3.
 
-    Args:
-        garment: Rest mesh.
-        material: Fabric.
-        inputs: State of the garment.
-        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
+    Edges are the garment's own, or those of a coarse level.
     """
     current = _edge_vectors(edges, inputs.position)
     rest = _edge_vectors(edges, garment.sewn_positions)
@@ -283,11 +317,7 @@ def frame_mesh_features(
 ) -> Float[Array, "edges 8"]:
     """Return sender minus receiver 3, the same at rest 3, rest length less one, in mean lengths; strain.
 
-    Args:
-        garment: Rest mesh.
-        position: Positions [m].
-        edges: Whose senders and receivers are meant: the garment's own, or those of a coarse level.
-        edge_length: Their mean length at rest [m].
+    Positions [m] and the mean length at rest [m] are those of `edges`: the garment's own, or of a coarse level.
     """
     current = _edge_vectors(edges, position)
     rest = _edge_vectors(edges, garment.sewn_positions)

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from eslr_jax.networks import attention
-from eslr_jax.networks.branches import TwoBranches
-from eslr_jax.networks.dense import add_bias, kernel_spread, layer_norm, matmul
-from eslr_jax.networks.mlp import MLP
+from eslr_jax.networks.architecture import TwoBranches
+from eslr_jax.networks.dense import MLP, add_bias, kernel_spread, layer_norm, matmul
 
 EMBEDDING_UNIT = 0.5  # [m]; a garment then spans a few units, like the latents beside it
 QUERY_GAIN = 0.3  # initial size of queries and keys: random features are accurate where they are small
@@ -39,9 +38,7 @@ class GsaBlock(nn.Module):
     ):
         """Return the next latents, in the form that `nn.scan` asks for.
 
-        Args:
-            x: Vertex latents, shape [vertices, latent].
-            inputs: Geodesic embedding [m], vertex mask and random directions.
+        `inputs` are the geodesic embedding [m], the vertex mask and random directions.
         """
         config, (embedding, mask, projection) = self.config, inputs
         size, width, precision = config.attention_size, config.latent_size, config.precision

@@ -24,17 +24,15 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 import jraph
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
-from eslr_jax.networks.architecture import Architecture
-from eslr_jax.networks.branches import make_decoder, stack, world_mask
+from eslr_jax.networks.architecture import Architecture, make_decoder, stack, world_mask
 from eslr_jax.networks.build import COARSE_SETS, NUM_LEVELS, GraphKind, Rows, feature_sizes, join_features
 from eslr_jax.networks.dense import kernel_spread
 from eslr_jax.networks.eslr import VELOCITY_COLUMNS, GraphModule
 from eslr_jax.networks.lsdmp import WorldLatents, make_mlp
-from eslr_jax.networks.mlp import MLP
 from eslr_jax.networks.network import Statistics, network
 from eslr_jax.networks.operators import (
     MeshTables,
@@ -101,9 +99,10 @@ class HoodLayer(nn.Module):
 
     def setup(self) -> None:
         """Declare a perceptron per edge set, one of world edges and one of vertices."""
-        self.edge_mlps = {name: make_mlp(self.config, 3) for name in self.sets}
-        self.world_mlp = make_mlp(self.config, 3)
-        self.vertex_mlp = make_mlp(self.config, 2 + len(self.sets))
+        size = self.config.latent_size
+        self.edge_mlps = {name: make_mlp(self.config, 3 * size) for name in self.sets}
+        self.world_mlp = make_mlp(self.config, 3 * size)
+        self.vertex_mlp = make_mlp(self.config, (2 + len(self.sets)) * size)
 
     def __call__(self, latents: StageLatents, tables: StageTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
@@ -140,22 +139,18 @@ class HierarchicalNetwork(GraphModule):
     def setup(self) -> None:
         """Declare embeddings, encoders, stages and decoder."""
         config, sizes = self.config, feature_sizes(self.config.graph)
-        size, types = config.latent_size, 0 if config.reads_gradient else features.NUM_TYPES
-
-        def encoder(input_size: int) -> MLP:
-            return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
-
+        types = 0 if config.reads_gradient else features.NUM_TYPES
         if types:
             self.type_embedding = self.param("type_embedding", kernel_spread(types), (types, types))
         else:
-            self.body_encoder = encoder(sizes["body"])
+            self.body_encoder = make_mlp(config, sizes["body"])
         self.level_embedding = self.param(
             "level_embedding", kernel_spread(NUM_LEVELS), (NUM_LEVELS, NUM_LEVELS)
         )
-        self.garment_encoder = encoder(sizes["garment"] + types + NUM_LEVELS)
-        self.mesh_encoder = encoder(sizes["mesh"])
-        self.coarse_encoders = {name: encoder(sizes["mesh"]) for name in COARSE_SETS}
-        self.world_encoder = encoder(sizes["world"])
+        self.garment_encoder = make_mlp(config, sizes["garment"] + types + NUM_LEVELS)
+        self.mesh_encoder = make_mlp(config, sizes["mesh"])
+        self.coarse_encoders = {name: make_mlp(config, sizes["mesh"]) for name in COARSE_SETS}
+        self.world_encoder = make_mlp(config, sizes["world"])
         self.stages = [stack(HoodLayer, config, config.steps_per_stage, sets=sets) for sets in STAGES]
         self.decoder = make_decoder(config)
 
@@ -189,8 +184,10 @@ class HierarchicalNetwork(GraphModule):
         tables = {name: coarse_tables(graph, level) for level, name in enumerate(COARSE_SETS)}
         tables["mesh"] = mesh_tables(graph, vertices.dtype)
         for sets, layers in zip(STAGES, self.stages, strict=True):
-            kept = kept_vertices(graph, sets)[:, None]
-            mask = jnp.where(kept, world_mask(graph, vertices.dtype), 0.0)
+            mask = world_mask(graph, vertices.dtype)
+            if "mesh" not in sets:  # which joins all vertices
+                kept = [graph.globals["coarse"][COARSE_SETS.index(name)].is_kept for name in sets]
+                mask = jnp.where(jnp.any(jnp.stack(kept), axis=0)[:, None], mask, 0.0)
             state = StageLatents(garment, {name: latents[name] for name in sets}, world)
             state, _ = layers(state, StageTables({name: tables[name] for name in sets}, mask))
             garment, world, latents = state.garment, state.world, latents | state.edges
@@ -221,11 +218,3 @@ def vertex_levels(graph: jraph.GraphsTuple) -> Int[Array, " vertices"]:
     """Return the coarsest level that every vertex is on; 0 is the mesh."""
     levels = [jnp.where(level.is_kept, k + 1, 0) for k, level in enumerate(graph.globals["coarse"])]
     return jnp.max(jnp.stack(levels), axis=0)
-
-
-def kept_vertices(graph: jraph.GraphsTuple, sets: tuple[str, ...]) -> Bool[Array, " vertices"]:
-    """Return which vertices some edge set of a stage joins; all of them on the mesh."""
-    coarse = graph.globals["coarse"]
-    kept = [jnp.ones_like(coarse[0].is_kept)] if "mesh" in sets else []
-    kept += [coarse[COARSE_SETS.index(name)].is_kept for name in sets if name != "mesh"]
-    return jnp.any(jnp.stack(kept), axis=0)

@@ -23,9 +23,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from eslr_jax.networks.architecture import Architecture
-from eslr_jax.networks.branches import TwoBranches
-from eslr_jax.networks.mlp import MLP
+from eslr_jax.networks.architecture import Architecture, TwoBranches
+from eslr_jax.networks.dense import MLP
 from eslr_jax.networks.operators import (
     MeshTables,
     sum_neighbors,
@@ -66,11 +65,12 @@ class LsdmpLayer(nn.Module):
 
     def setup(self) -> None:
         """Declare the perceptrons."""
-        self.mesh_mlp = make_mlp(self.config, 3)
-        self.world_mlp = make_mlp(self.config, 3)
-        self.vertex_mlp = make_mlp(self.config, 3)
+        size = self.config.latent_size
+        self.mesh_mlp = make_mlp(self.config, 3 * size)
+        self.world_mlp = make_mlp(self.config, 3 * size)
+        self.vertex_mlp = make_mlp(self.config, 3 * size)
         if self.config.smoothing_steps:
-            self.smooth_mlp = make_mlp(self.config, 1)
+            self.smooth_mlp = make_mlp(self.config, size)
 
     def __call__(self, latents: Latents, tables: LayerTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
@@ -128,10 +128,10 @@ class LsdmpLayer(nn.Module):
         return latents._replace(garment=latents.garment + self.smooth_mlp(garment), world=world)
 
 
-def make_mlp(config: Architecture, num_pieces: int) -> MLP:
-    """Return a perceptron from a few concatenated latents to one."""
+def make_mlp(config: Architecture, input_size: int) -> MLP:
+    """Return a perceptron from features or concatenated latents to a latent."""
     size = config.latent_size
-    return MLP(num_pieces * size, size, size, config.hidden_layers, precision=config.precision)
+    return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
 
 
 def propagate(

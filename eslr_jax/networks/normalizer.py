@@ -52,10 +52,6 @@ def merge(seen: Normalizer, new: Normalizer) -> Normalizer:
     N rows with mean M and squared deviations S meet n rows with m and s. With delta = m - M,
     M' = M + delta n / (N + n) and S' = S + s + delta^2 N n / (N + n).
 
-    Args:
-        seen: Statistics so far.
-        new: Statistics of one more graph.
-
     Source: Chan, Golub and LeVeque (1979), eq. 2.1.
     """
     total = seen.count + new.count
@@ -76,9 +72,6 @@ def is_warming_up(statistics: Mapping[str, Normalizer]) -> Bool[Array, ""]:
 
     HOOD only collects statistics until then, and leaves weights and optimiser unchanged. The normaliser that saw
     most graphs counts: a scene without a body never adds to the one of world edges.
-
-    Args:
-        statistics: Normalisers by name, the entry "statistics" of a network's weights.
     """
     if not statistics:
         return jnp.array(False)

@@ -30,12 +30,7 @@ class MeshTables(NamedTuple):
 
 
 def mesh_tables(graph: jraph.GraphsTuple, dtype) -> MeshTables:
-    """Return the tables that messages along a graph's mesh edges follow.
-
-    Args:
-        graph: A graph of `networks.build`.
-        dtype: Floating type of the degrees.
-    """
+    """Return the tables that messages along a graph's mesh edges follow; degrees are of `dtype`."""
     senders, incoming = graph.senders["mesh"], graph.globals["incoming_edges"]
     num_vertices, num_edges = incoming.shape[0], senders.shape[0]
     padded = jnp.concatenate([senders, jnp.full(1, num_vertices, senders.dtype)])
@@ -49,12 +44,7 @@ def mesh_tables(graph: jraph.GraphsTuple, dtype) -> MeshTables:
 
 
 def coarse_tables(graph: jraph.GraphsTuple, level: int) -> MeshTables:
-    """Return the tables that messages along a coarse level's edges follow; there is nothing to smooth.
-
-    Args:
-        graph: A graph of `networks.build` for a hierarchical network.
-        level: Index of the level; 0 is the finest.
-    """
+    """Return the tables that messages along a coarse level's edges follow, 0 the finest; nothing is smoothed."""
     edges, name = graph.globals["coarse"][level], f"coarse{level}"
     num_vertices = edges.is_kept.shape[0]
     return MeshTables(
@@ -79,11 +69,10 @@ def take_receivers(
     return _take(x, tables.receivers)
 
 
-def _take_receivers_backward(tables, cotangent):
-    return sum_receivers(cotangent, tables), None
-
-
-take_receivers.defvjp(lambda x, tables: (take_receivers(x, tables), tables), _take_receivers_backward)
+take_receivers.defvjp(
+    lambda x, tables: (take_receivers(x, tables), tables),
+    lambda tables, cotangent: (sum_receivers(cotangent, tables), None),
+)
 
 
 @jax.custom_vjp
@@ -95,11 +84,10 @@ def take_senders(x: Float[Array, "vertices features"], tables: MeshTables) -> Fl
     return _take(x, tables.senders)
 
 
-def _take_senders_backward(tables, cotangent):
-    return sum_receivers(_take(cotangent, tables.reverse_edges), tables), None
-
-
-take_senders.defvjp(lambda x, tables: (take_senders(x, tables), tables), _take_senders_backward)
+take_senders.defvjp(
+    lambda x, tables: (take_senders(x, tables), tables),
+    lambda tables, cotangent: (sum_receivers(_take(cotangent, tables.reverse_edges), tables), None),
+)
 
 
 @jax.custom_vjp

@@ -10,8 +10,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar, Literal
 
-from eslr_jax.networks.architecture import Architecture
-from eslr_jax.networks.branches import TwoBranches
+from eslr_jax.networks.architecture import Architecture, TwoBranches
 from eslr_jax.networks.eslr import EncodeProcessDecode
 from eslr_jax.networks.network import network
 

@@ -17,10 +17,9 @@ from jaxtyping import Array, Float
 
 from eslr_jax.networks import features
 from eslr_jax.networks.apply import Places
-from eslr_jax.networks.branches import make_decoder, stack, world_mask
+from eslr_jax.networks.architecture import make_decoder, stack, world_mask
 from eslr_jax.networks.build import feature_sizes
 from eslr_jax.networks.lsdmp import make_mlp
-from eslr_jax.networks.mlp import MLP
 from eslr_jax.networks.network import network
 from eslr_jax.networks.operators import MeshTables, mesh_tables, sum_neighbors
 from eslr_jax.networks.refinement import GatedRefinement
@@ -65,7 +64,7 @@ class SmoothingLayer(nn.Module):
 
     def setup(self) -> None:
         """Declare the perceptron."""
-        self.vertex_mlp = make_mlp(self.config, 1 + self.config.smoothing_steps)
+        self.vertex_mlp = make_mlp(self.config, (1 + self.config.smoothing_steps) * self.config.latent_size)
 
     def __call__(self, latents: Float[Array, "vertices latent"], tables: MeshTables):
         """Return the next latents, in the form that `nn.scan` asks for."""
@@ -87,13 +86,7 @@ class SmoothingNetwork(nn.Module):
         config, sizes = self.config, feature_sizes(self.config.graph)
         self.body_column = sizes["garment"]  # of the encoder's input
         self.world_column = sizes["garment"] + sizes["body"]
-        self.encoder = MLP(
-            self.world_column + sizes["world"],
-            config.latent_size,
-            config.latent_size,
-            config.hidden_layers,
-            precision=config.precision,
-        )
+        self.encoder = make_mlp(config, self.world_column + sizes["world"])
         self.layers = stack(SmoothingLayer, config, config.layers)
         self.decoder = make_decoder(config)
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from flax.serialization import to_state_dict
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -66,16 +64,9 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
         system = read_system(values)
     except ConfigError as error:
         raise CheckpointError(f"{path} is for another architecture: {error}") from error
-    network = Network(config=system, **_parts(read_arrays(path, content="model"), path))
-    system.check(network)
-    return network, training
-
-
-def _parts(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
-    """Return the fields of a network from arrays by path."""
     floats = {
         name: jnp.asarray(value, jnp.float32 if value.dtype.kind == "f" else value.dtype)
-        for name, value in arrays.items()
+        for name, value in read_arrays(path, content="model").items()
     }
     try:
         tree = {"params": {}} | unflatten_dict(floats, sep="/")
@@ -83,4 +74,6 @@ def _parts(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
         tree["statistics"] = {name: Normalizer(**fields) for name, fields in statistics.items()}
     except (AttributeError, IndexError, TypeError) as error:
         raise CheckpointError(f"{path} holds no tree of weights; export the model again") from error
-    return tree
+    network = Network(config=system, **tree)
+    system.check(network)
+    return network, training

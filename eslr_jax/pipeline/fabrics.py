@@ -14,9 +14,8 @@ from jaxtyping import Bool, Float
 from eslr_jax.errors import ConfigError
 from eslr_jax.fabric.materials import COTTON, WOVEN, Weave, fabric_material, fabric_names, isotropic_nearest
 from eslr_jax.fabric.validate import MATERIAL_RANGES
-from eslr_jax.mesh.plate import prepare_plate
+from eslr_jax.mesh.plate import prepare_plate, warp_directions
 from eslr_jax.mesh.topology import find_hinges, vertex_areas
-from eslr_jax.mesh.weave import warp_directions
 from eslr_jax.networks.features import (
     BENDING_RANGE,
     DENSITY_RANGE,

@@ -20,15 +20,9 @@ SERIES_BELOW = 1e-2  # [rad^2], where the truncated series are exact to float32 
 
 
 def rotation_matrix(rotation: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Return the matrix I + a K + b K^2 of an axis-angle vector, smooth at zero.
+    """Return the matrix I + a K + b K^2 of an axis-angle vector [rad], smooth at zero.
 
     K is the cross-product matrix of `rotation`, a = sin(t)/t, b = (1 - cos(t))/t^2, t = |rotation|.
-
-    Args:
-        rotation: Axis times angle [rad], shape [3].
-
-    Returns:
-        Rotation matrix, shape [3, 3].
 
     Source: Rodrigues' formula.
     """
@@ -123,13 +117,8 @@ def skin_frames(
 ) -> Float[Array, "frames vertices 3"]:
     """Return skinned points of every frame [m], shape [frames, vertices, 3].
 
-    One frame after the other: a vmap would hold frames x vertices x influences matrices at once.
-
-    Args:
-        positions: Rest points [m], shape [vertices, 3].
-        weights: Skin weights, rows sum to one, shape [vertices, influences].
-        indices: Joint of each weight, shape [vertices, influences].
-        transforms: Affine map of each joint in every frame, shape [frames, joints, 3, 4].
+    One frame after the other: a vmap would hold frames x vertices x influences matrices at once. Arguments are
+    those of `skin`, the maps for every frame.
     """
     return jax.lax.map(lambda frame: skin(positions, weights, indices, frame), transforms)
 
@@ -137,12 +126,7 @@ def skin_frames(
 def skin_garment(
     garment: Garment, transforms: Float[Array, "frames joints 3 4"]
 ) -> Float[Array, "frames vertices 3"]:
-    """Return the garment carried by the joints [m], shape [frames, vertices, 3].
-
-    Args:
-        garment: Rest mesh with its skin weights.
-        transforms: Maps from rest to posed points, shape [frames, joints, 3, 4].
-    """
+    """Return the garment carried by the joints [m], shape [frames, vertices, 3]; see `skin_frames`."""
     return skin_frames(garment.rest_positions, garment.skin_weights, garment.skin_indices, transforms)
 
 

@@ -94,7 +94,13 @@ def loop_motion(motion: Motion, seconds: float) -> Motion:
     weight = share**2 * (3.0 - 2.0 * share)
     while len(rotations) < wanted:
         seam = len(rotations) - overlap
-        turn = _level_turn(rotations[seam, 0], motion.rotations[0, 0])
+        # The turn about the vertical that brings the first root rotation closest to that at the seam.
+        between = (
+            Rotation.from_rotvec(rotations[seam, 0]) * Rotation.from_rotvec(motion.rotations[0, 0]).inv()
+        )
+        matrix = between.as_matrix()
+        yaw = np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2])
+        turn = Rotation.from_euler("y", yaw)
         head[:, 0] = (turn * Rotation.from_rotvec(motion.rotations[:, 0])).as_rotvec()
         root = turn.apply(motion.translations)
         root = root + (translations[seam] - root[0]) * [1.0, 0.0, 1.0]
@@ -103,12 +109,6 @@ def loop_motion(motion: Motion, seconds: float) -> Motion:
         rotations = np.concatenate([rotations[:seam], joined, head[overlap:]])
         translations = np.concatenate([translations[:seam], path, root[overlap:]])
     return dataclasses.replace(motion, rotations=rotations[:wanted], translations=translations[:wanted])
-
-
-def _level_turn(end: NDArray, start: NDArray) -> Rotation:
-    """Return the turn about the vertical that brings one axis-angle rotation closest to another, `end`."""
-    matrix = (Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()).as_matrix()
-    return Rotation.from_euler("y", np.arctan2(matrix[0, 2] - matrix[2, 0], matrix[0, 0] + matrix[2, 2]))
 
 
 def with_settling(poses: BodyMotion, num_frames: int, body: Body | None = None) -> BodyMotion:

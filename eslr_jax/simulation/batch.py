@@ -100,17 +100,13 @@ def simulate_batch(
             if (larger := enlarge_buffers(scene, one)) is not None:
                 one = simulate(params, larger, config=config, raises=False).trajectory
                 one = hold_last(one, scene.num_frames)  # it ends where something else goes wrong
-            done[i] = _first_vertices(one, garments[i].vertex_mask.shape[0])
+            count = garments[i].vertex_mask.shape[0]  # without the rows that padding added
+            done[i] = one.replace(
+                positions=one.positions[:, :count],
+                velocities=one.velocities[:, :count],
+                friction_loads=one.friction_loads[:, :count],
+            )
     return [done[i] for i in range(len(garments))]
-
-
-def _first_vertices(trajectory: Trajectory, count: int) -> Trajectory:
-    """Return a trajectory without the rows that padding added."""
-    return trajectory.replace(
-        positions=trajectory.positions[:, :count],
-        velocities=trajectory.velocities[:, :count],
-        friction_loads=trajectory.friction_loads[:, :count],
-    )
 
 
 def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> list[list[int]]:

@@ -187,10 +187,9 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
     def with_start(first: Array, values: Array) -> Array:
         return jnp.concatenate([first[None], values])
 
-    def after_nothing(values: Array) -> Array:
-        return jnp.concatenate([jnp.zeros_like(values[:1]), values])
-
-    reports = jax.tree.map(after_nothing, frames.reports)
+    reports = jax.tree.map(
+        lambda leaf: with_start(jnp.zeros(leaf.shape[1:], leaf.dtype), leaf), frames.reports
+    )
     is_good = end.first_bad_frame < 0
     return Trajectory(
         positions=with_start(start.position, frames.positions),

@@ -84,7 +84,7 @@ def simulate(
     while larger is not None:
         scene = larger
         trajectory, spent = _in_chunks(
-            jax.tree.map(jnp.asarray, params), scene, config, _Loop(pace, on_frames, is_stopping), done
+            jax.tree.map(jnp.asarray, params), scene, config, done, pace, on_frames, is_stopping
         )
         passes.append(spent)
         larger, kept = enlarge_buffers(scene, trajectory), good_frames(trajectory)
@@ -93,39 +93,27 @@ def simulate(
         done = kept if kept.num_frames > 1 else None  # what fitted stands
     if raises:
         raise_for_status(trajectory)
-    return Simulation(trajectory, _timing(passes), scene)
-
-
-class _Spent(NamedTuple):
-    """What one pass over a scene took."""
-
-    compile_s: float = 0.0
-    run_s: float = 0.0
-    frames: int = 0  # that ran, of the last chunk also those beyond the end
-
-
-def _timing(passes: list[_Spent]) -> Timing:
-    """Return the timing of all passes over a scene, also of those whose buffers were too small."""
-    frames = sum(spent.frames for spent in passes)
-    frame_ms = 1e3 * sum(spent.run_s for spent in passes) / max(frames, 1)
-    return Timing(sum(spent.compile_s for spent in passes), frame_ms)
+    compile_s, run_s, frames = map(sum, zip(*passes, strict=True))
+    return Simulation(trajectory, Timing(compile_s, 1e3 * run_s / max(frames, 1)), scene)
 
 
 _join = jax.jit(join_frames)
 
 
-class _Loop(NamedTuple):
-    """What the host does between chunks; see `simulate`."""
-
-    pace: Pace | None
-    on_frames: Callable[[int, int], None]
-    is_stopping: Callable[[], bool]
-
-
 def _in_chunks(
-    params: Network | None, scene: Scene, config: SimConfig, loop: _Loop, before: Trajectory | None
-) -> tuple[Trajectory, _Spent]:
-    """Simulate a scene a few frames at a time, and time compilation apart."""
+    params: Network | None,
+    scene: Scene,
+    config: SimConfig,
+    before: Trajectory | None,
+    pace: Pace | None,
+    on_frames: Callable[[int, int], None],
+    is_stopping: Callable[[], bool],
+) -> tuple[Trajectory, tuple[float, float, int]]:
+    """Simulate a scene a few frames at a time; see `simulate`.
+
+    Returns:
+        The trajectory; the seconds that it compiled and ran; the frames that ran, also those beyond the end.
+    """
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     inputs = frame_inputs(jax.device_get(scene))  # cut on the host, where it compiles nothing
     constant = jax.tree.map(jnp.asarray, _without_frames(scene))
@@ -139,10 +127,10 @@ def _in_chunks(
     start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))
     begin = 0 if before is None else before.num_frames - 1
     if before is not None and begin >= total:  # nothing is left
-        return before, _Spent()
+        return before, (0.0, 0.0, 0)
     state, done, seconds, compile_s = start, [], 0.0, 0.0
     for first in range(begin, total, chunk):
-        bound = None if loop.pace is None else jnp.int32(iterations)  # all numbers share a program
+        bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
         arguments = (params, constant, state, part(first), bound)
         began = time.perf_counter()
         program = find_program(_scan, config, arguments)
@@ -151,30 +139,25 @@ def _in_chunks(
         end, frames = jax.block_until_ready(program(*arguments))
         took = time.perf_counter() - began
         seconds += took
-        if loop.pace is not None:
-            iterations = loop.pace(iterations, took * 1e3 / chunk)
+        if pace is not None:
+            iterations = pace(iterations, took * 1e3 / chunk)
         count = min(chunk, total - first)
         done.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], frames))
         bad = int(end.first_bad_frame) - int(scene.initial_state.frame)
         is_bad = int(end.status) != Status.OK and bad <= total
         if count == chunk or is_bad:
             state = end
-        loop.on_frames(first + count, total)
-        if is_bad or loop.is_stopping():
+        on_frames(first + count, total)
+        if is_bad or is_stopping():
             break
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *done)
     trajectory = _join(start, joined, state)
     if before is not None:
-        trajectory = _appended(before, trajectory)
-    return trajectory, _Spent(compile_s, seconds, chunk * len(done))
-
-
-def _appended(before: Trajectory, after: Trajectory) -> Trajectory:
-    """Return a trajectory and the one that begins with its last frame as one."""
-    bad = after.first_bad_frame
-    after = after.replace(first_bad_frame=jnp.where(bad < 0, bad, bad + before.num_frames - 1))
-    tail = _slice_frames(after, slice(1, None))
-    return _map_frames(lambda first, second: jnp.concatenate([first, second]), tail, before)
+        bad = trajectory.first_bad_frame
+        trajectory = trajectory.replace(first_bad_frame=jnp.where(bad < 0, bad, bad + begin))
+        tail = _slice_frames(trajectory, slice(1, None))
+        trajectory = _map_frames(lambda first, second: jnp.concatenate([first, second]), tail, before)
+    return trajectory, (compile_s, seconds, chunk * len(done))
 
 
 def _slice_frames(trajectory: Trajectory, frames: slice) -> Trajectory:

@@ -162,7 +162,9 @@ def next_state(
     # A network moves padding too; with its speed carried on it would come to look like thrown cloth.
     position = jnp.where(problem.garment.vertex_mask[:, None], position, problem.position)
     # A gradient that is not finite stops the solver where it began, at positions that are.
-    status = state.status | status | problem_status(problem)
+    status = state.status | status
+    for term, data in problem.parts:  # such as too small a buffer or too fast a body
+        status = status | term.status(problem, data)
     status = status | _finiteness(position) | _finiteness(jnp.asarray(residual))
     frame = state.frame + 1
     return ClothState(
@@ -191,14 +193,6 @@ def past_state(
     """
     is_known = jnp.asarray(residual) <= MOST_RESIDUAL
     return PastState(before.position, before.velocity, timestep, is_known)
-
-
-def problem_status(problem: FrameProblem) -> Int[Array, ""]:
-    """Return the status bits that the terms raise, such as too small a buffer or too fast a body."""
-    status = jnp.int32(Status.OK)
-    for term, data in problem.parts:
-        status = status | term.status(problem, data)
-    return status
 
 
 def buffer_demands(problem: FrameProblem) -> dict[str, Int[Array, ""]]:

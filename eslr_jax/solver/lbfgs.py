@@ -126,7 +126,8 @@ def minimize(
         return _flat(balance(_vectors(force)))
 
     def value_and_gradient(x: Float[Array, " n"]):
-        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(tuple(_split(x)))
+        split = tuple(jax.lax.split(x, (x.size // 3,) * 3))
+        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(split)
         # Written over x one by one: joined at once, XLA computes them in a loop that it can't vectorise.
         gradient = x
         for axis, part in enumerate(parts):
@@ -204,11 +205,6 @@ def _flat(vectors: Float[Array, "vertices 3"]) -> Float[Array, " n"]:
     return vectors.T.reshape(-1)
 
 
-def _split(flat: Float[Array, " n"]) -> list[Array]:
-    """Return the components of flat vectors."""
-    return jax.lax.split(flat, (flat.size // 3,) * 3)
-
-
 def _vectors(flat: Float[Array, " n"]) -> Float[Array, "vertices 3"]:
     """Return flat vectors in rows."""
     return flat.reshape(3, -1).T
@@ -245,12 +241,9 @@ def _advance(state: _State, point: Point, inverse: Inverse) -> _State:
 
 
 def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, slope: Array):
-    """Halve the step until the energy falls enough; keep the old point if it never does.
+    """Halve the step until the energy falls enough; return the point's parts and whether it is another one.
 
     The first pass of `minimize` goes to the start, whatever its energy.
-
-    Returns:
-        The point, its value and its gradient, and whether it is another point than before.
     """
     is_first = state.iterations < 0
     slack = _rounding(state.value)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components
 from eslr_jax.terms.problem import FrameProblem
@@ -33,13 +33,9 @@ class Stiffness:
 def hessian_diagonal(
     problem: FrameProblem, position: Float[Array, "vertices 3"]
 ) -> Float[Array, " vertices"]:
-    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at `position`.
+    """Return a positive stiffness per vertex [N/m]: the sum of the terms' own estimates at positions [m].
 
     Padded vertices get one, so that dividing by it is safe.
-
-    Args:
-        problem: The frame's problem.
-        position: Where contact and friction are linearised [m], shape [vertices, 3].
     """
     return jnp.where(problem.garment.vertex_mask, sum_diagonals(problem, position), 1.0)
 
@@ -55,23 +51,23 @@ def sum_diagonals(
     return sum(diagonals, jnp.zeros_like(x[0]))
 
 
+def free_vertices(problem: FrameProblem) -> Bool[Array, " vertices"]:
+    """Return which vertices the solver moves: neither padding nor pinned."""
+    garment = problem.garment
+    return garment.vertex_mask if problem.pin_targets is None else garment.vertex_mask & ~garment.is_pinned
+
+
 def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the diagonal at `position` with the springs that share out its membrane part.
 
     Every edge gets the smaller of what its two ends can give, so the matrix is symmetric and diagonally
-    dominant. A cotangent Laplacian measured no better, and can lose definiteness on obtuse triangles.
-
-    Args:
-        problem: The frame's problem.
-        position: Where contact and friction are linearised [m], shape [vertices, 3].
+    dominant. A cotangent Laplacian measured no better, and can lose definiteness on obtuse triangles. Contact and
+    friction are linearised at `position` [m].
     """
     garment = problem.garment
-    is_free = garment.vertex_mask
-    if problem.pin_targets is not None:
-        is_free = is_free & ~garment.is_pinned
     degree = jnp.maximum(jnp.sum(garment.neighbor_mask, axis=1, dtype=garment.rest_areas.dtype), 1)
     elastic = sum_diagonals(problem, position, lambda term: term.is_elastic)
-    share = jnp.where(is_free, elastic / degree, 0.0)
+    share = jnp.where(free_vertices(problem), elastic / degree, 0.0)
     springs = jnp.minimum(share[:, None], share[garment.neighbors])
     return Stiffness(
         diagonal=hessian_diagonal(problem, position),
@@ -80,18 +76,16 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     )
 
 
-def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
+def stretched_stiffness(
+    problem: FrameProblem, position: Float[Array, "vertices 3"], at_rest: Stiffness | None = None
+) -> Stiffness:
     """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
 
     A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal changes by
     the sum of the changes of a vertex's springs, and no more: with a larger diagonal long waves converge slowly
-    (experiments/tried.md). Networks take `stiffness`, which they were trained with.
-
-    Args:
-        problem: The frame's problem.
-        position: Where springs, contact and friction are linearised [m], shape [vertices, 3].
+    (experiments/tried.md). Networks take `stiffness`, which they were trained with. It may be given as `at_rest`.
     """
-    matrix = stiffness(problem, position)
+    matrix = stiffness(problem, position) if at_rest is None else at_rest
     squared, rest = (
         _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.sewn_positions)
     )

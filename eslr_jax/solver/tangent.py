@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.numerics import Vector3, components, segment_sum
-from eslr_jax.solver.preconditioner import hessian_diagonal, sum_diagonals
+from eslr_jax.solver.preconditioner import free_vertices, hessian_diagonal, sum_diagonals
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.term import mesh_corners
 from eslr_jax.types import Garment
@@ -35,17 +35,9 @@ class Tangent(NamedTuple):
 
 
 def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tangent:
-    """Return the potential's Hessian.
-
-    Args:
-        problem: The frame's problem.
-        position: Where it is taken [m], shape [vertices, 3].
-    """
+    """Return the potential's Hessian at positions [m]."""
     garment = problem.garment
     position = pin(problem, position)
-    is_free = garment.vertex_mask
-    if problem.pin_targets is not None:
-        is_free = is_free & ~garment.is_pinned
     x = components(position)
     faces, hinges, vertices = (_element_blocks(on, x, problem) for on in ("faces", "hinges", "vertices"))
     rest = [
@@ -65,7 +57,7 @@ def tangent(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Tang
     num_slots, num_vertices = columns.shape
     rows = segment_sum(values, slots, num_slots * num_vertices)
     blocks = rows.reshape(num_vertices, num_slots, 3, 3).transpose(1, 2, 3, 0)
-    return Tangent(columns, blocks.at[0].add(vertices), others, is_free[None])
+    return Tangent(columns, blocks.at[0].add(vertices), others, free_vertices(problem)[None])
 
 
 def _element_blocks(on: str, x: Vector3, problem: FrameProblem) -> Float[Array, "size size items"]:

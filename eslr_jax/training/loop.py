@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -12,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
@@ -29,9 +32,11 @@ from eslr_jax.training.checkpoint import (
     write_run_config,
 )
 from eslr_jax.training.data import TrainingData
-from eslr_jax.training.seeds import make_seeds_step, seed_configs, seed_folders, stack_seeds, take_seed
 from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make_train_step, replicate
 
+_AXES = TrainState(network=0, optimizer=0, pools=0, key=0, step=None, skipped=0)  # type: ignore[arg-type]
+_ARENA_MAX, _MMAP_MAX, _TRIM_THRESHOLD, _TOP_PAD = -8, -4, -1, -2  # of glibc's malloc.h
+_DRAWN = ("stretch", "bending", "inertia", "collision", "friction")  # terms
 _SHARES = ("resets", "overflows", "skipped")  # shares of the trajectories of a step
 
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -64,7 +69,7 @@ def train(
         on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
 
     Returns:
-        The last state; of several seeds stacked, see `training.seeds`.
+        The last state; of several seeds stacked, see `stack_seeds`.
 
     Raises:
         CheckpointError: `out` holds another run, or none to resume; or `initial` does not fit `config.model`.
@@ -100,7 +105,8 @@ def train(
     began, first = time.perf_counter(), int(state.step)
     spent = core_seconds(folders[0]) - time.process_time()
     with ExitStack() as stack:
-        logs = [stack.enter_context(_metrics_file(folder).open("a")) for folder in folders]
+        name = "metrics.jsonl" if is_first_process() else os.devnull  # which is no file of the folder
+        logs = [stack.enter_context((folder / name).open("a")) for folder in folders]
         stop = stack.enter_context(Interruption())
         for step in range(first, config.steps):
             resolution = step % len(step_functions)
@@ -132,7 +138,10 @@ def train(
                     )
             if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
-            if _is_stopping(stop, done):
+            is_stopping = stop.is_wanted
+            if jax.process_count() > 1:  # several stop after the same step, as jax.distributed agrees on
+                is_stopping = multihost_utils.reached_preemption_sync_point(done)
+            if is_stopping:
                 if done % config.checkpoint_every:
                     checkpoints.save(state)
                 break
@@ -149,15 +158,8 @@ def _first_state(
     states = [init_train_state(one, datasets) for one in seed_configs(config)]
     if initial is not None:  # copies, since a step donates its state
         initial = initial.replace(config=config.model)
-        states = [state.replace(network=jax.tree.map(jax.numpy.array, initial)) for state in states]
+        states = [state.replace(network=jax.tree.map(jnp.array, initial)) for state in states]
     return stack_seeds(states) if config.seeds > 1 else states[0]
-
-
-def _is_stopping(stop: Interruption, done: int) -> bool:
-    """Tell whether to stop after a step: several processes after the same one, as jax.distributed agrees on."""
-    if jax.process_count() > 1:
-        return multihost_utils.reached_preemption_sync_point(done)
-    return stop.is_wanted
 
 
 def export(state: TrainState, config: TrainConfig, paths: list[Path], earlier: Mapping[str, Any]) -> None:
@@ -185,11 +187,7 @@ def core_seconds(out: Path) -> float:
 
 
 def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:
-    """Check that a run may begin or go on in a folder.
-
-    Raises:
-        CheckpointError: The folder holds another run, one of another configuration, or none to resume.
-    """
+    """Raise a CheckpointError where a folder holds another run or configuration, or no run to resume."""
     if not resume:
         if has_checkpoint(out):
             raise CheckpointError(f"{out} already holds a training run; add --resume or choose another --out")
@@ -201,11 +199,6 @@ def _check_run(config: TrainConfig, out: Path, resume: bool) -> None:
         raise CheckpointError(
             f"{out} holds a run of {before.steps} steps; it can be extended to more, not cut to {config.steps}"
         )
-
-
-def _metrics_file(folder: Path) -> Path:
-    """Return where a process writes metrics."""
-    return folder / "metrics.jsonl" if is_first_process() else Path(os.devnull)
 
 
 def _forget_after(metrics: Path, step: int) -> None:
@@ -266,3 +259,90 @@ def _check_skipped(
         f"are in {states}. Begin another run with a lower learning_rate; --start-from {weights[0]} keeps what "
         "was learned"
     )
+
+
+def seed_configs(config: TrainConfig) -> list[TrainConfig]:
+    """Return the run of each seed alone."""
+    return [dataclasses.replace(config, seed=config.seed + k, seeds=1) for k in range(config.seeds)]
+
+
+def seed_folders(config: TrainConfig, out: Path) -> list[Path]:
+    """Return where metrics and network of each seed lie: `out`, or with several seeds a folder for each."""
+    if config.seeds == 1:
+        return [out]
+    return [out / f"seed-{one.seed}" for one in seed_configs(config)]
+
+
+def stack_seeds(states: list[TrainState]) -> TrainState:
+    """Return states of equal step as one, along a new first axis."""
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    return stacked.replace(step=states[0].step)  # one for all: a batch of steps would be one of garments too
+
+
+def take_seed(state: TrainState, place: int) -> TrainState:
+    """Return one seed's state."""
+    one = jax.tree.map(lambda leaf: leaf[place], state.replace(step=None))
+    return one.replace(step=state.step)
+
+
+def make_seeds_step(config: TrainConfig, resolution: int) -> Callable:
+    """Return the jitted step of all seeds: (states, data) -> (states, metrics); the states are donated.
+
+    The seeds are a batch axis of one step: at 1k vertices a GPU spends it on starting kernels, whose number does
+    not grow with the seeds.
+
+    Arguments are those of `make_train_step`.
+    """
+    step = jax.vmap(make_train_step(config, resolution), in_axes=(_AXES, None), out_axes=(_AXES, 0))
+    return jax.jit(step, donate_argnums=0)
+
+
+def keep_memory() -> None:
+    """Make glibc keep freed memory: one arena, no mapping per allocation, nothing given back.
+
+    A training step on a CPU takes a hundred megabytes of temporary buffers and frees them. By default glibc
+    returns them to the kernel, and a third of a step is page faults. Call it before the first array. Without
+    glibc it does nothing.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is None:
+        return
+    for option, value in ((_ARENA_MAX, 1), (_MMAP_MAX, 0), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 2**28)):
+        mallopt(option, value)
+
+
+def plot_curves(folder: Path, config: TrainConfig) -> Path | None:
+    """Draw the curves of a run's `metrics.jsonl` into `curves.png` (extra `plot`); None without it or metrics."""
+    try:
+        import matplotlib
+    except ImportError:
+        return None
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    if not records:
+        return None
+    steps = [record["step"] for record in records]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    losses = [record["loss"] for record in records]
+    spans_decades = not 0 < max(losses) < 10 * min(losses)
+    left.plot(steps, losses)
+    left.set(xlabel="step", ylabel=f"loss, {_unit(config)}", yscale="symlog" if spans_decades else "linear")
+    for term in _DRAWN:
+        right.plot(steps, [max(record[term], 1e-7) for record in records], label=term)
+    right.set(xlabel="step", ylabel="energy at the prediction, median [J]", yscale="log")
+    right.legend()
+    with atomic_write(folder / "curves.png") as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
+    plt.close(figure)
+    return folder / "curves.png"
+
+
+def _unit(config: TrainConfig) -> str:
+    """Return what a run's loss is measured in, see `training.loss`."""
+    if config.iterations:
+        return "mean logarithm of the shares of gap and squared distance that are left"
+    if config.refinement_weights == "contraction":
+        return "mean share of a pass's gap that it leaves"
+    return "J" if config.energy_set == "hood" else "in units of lifting the garment by 1 cm"

@@ -35,15 +35,6 @@ class LossReport(NamedTuple):
     inertial_energy: Float[Array, ""]  # potential at the pushed-out inertial guess [J]
 
 
-class _Optimum(NamedTuple):
-    """Where the solver found a frame's minimum, and where it would have begun."""
-
-    position: Float[Array, "vertices 3"]  # [m]
-    value: Float[Array, ""]  # [J]
-    guess: Float[Array, "vertices 3"]  # [m]
-    guess_value: Float[Array, ""]  # [J]
-
-
 def physics_loss(
     network: Network,
     problem: FrameProblem,
@@ -51,15 +42,7 @@ def physics_loss(
     config: TrainConfig,
     terms_of: EnergyTerms = potential_terms,
 ) -> tuple[Float[Array, ""], LossReport]:
-    """Return the loss, without unit or in joules (set "hood"), and its report.
-
-    Args:
-        network: The network.
-        problem: The frame's problem.
-        state: Cloth at t.
-        config: Which refinement steps count; static.
-        terms_of: The set of energies.
-    """
+    """Return the loss of a set of energies, without unit or in joules (set "hood"), and its report."""
     positions = network.predict(problem, state, detach=True).positions
     terms = jax.vmap(terms_of, in_axes=(0, None))(positions, problem)
     energies = sum(terms.values())
@@ -70,8 +53,8 @@ def physics_loss(
         start = Start(jax.lax.stop_gradient(positions[-1]), guess_value)
         minimum = solve(problem, start, iterations=config.iterations)
         onward = pin(problem, minimum.position)
-        optimum = _Optimum(onward, minimum.value, guess, guess_value)
-        loss = _mean_start_error(positions, energies, optimum, problem)
+        optimum = onward, minimum.value
+        loss = _mean_start_error(problem, optimum, (guess, guess_value), (positions, energies))
     elif config.refinement_weights == "contraction":
         loss = _mean_contraction(jnp.concatenate([jnp.reshape(guess_value, 1), energies]))
     else:
@@ -86,27 +69,29 @@ def physics_loss(
 
 
 def _mean_start_error(
-    positions: Float[Array, "steps vertices 3"],
-    energies: Float[Array, " steps"],
-    optimum: _Optimum,
     problem: FrameProblem,
+    optimum: tuple[Array, Array],
+    guess: tuple[Array, Array],
+    predictions: tuple[Array, Array],
 ) -> Float[Array, ""]:
     """Return how far predictions are from the optimum: mean logarithm of the shares of gap and squared distance.
+
+    All are positions [m] with their potential [J]; predictions along a leading axis of steps.
 
     Both shares are relative to the pushed-out inertial guess. The gap alone is mostly stretch, which the solver's
     first iterations remove. The solver needs many iterations where distances are long and energies small.
     """
 
     def squared_distance(position: Float[Array, "vertices 3"]) -> Float[Array, ""]:
-        offset = jnp.where(problem.garment.vertex_mask[:, None], position - optimum.position, 0.0)
+        offset = jnp.where(problem.garment.vertex_mask[:, None], position - optimum[0], 0.0)
         return jnp.sum(offset * offset)
 
     def log_share(left: Array, whole: Array) -> Array:
         return jnp.log(jnp.maximum(left / whole, 0.0) + _MIN_GAP)
 
-    initial_gap = jnp.maximum(optimum.guess_value - optimum.value, _MIN_INITIAL_GAP)
-    distance = jnp.maximum(squared_distance(optimum.guess), _MIN_DISTANCE**2)
-    gap, apart = energies - optimum.value, jax.vmap(squared_distance)(positions)
+    initial_gap = jnp.maximum(guess[1] - optimum[1], _MIN_INITIAL_GAP)
+    distance = jnp.maximum(squared_distance(guess[0]), _MIN_DISTANCE**2)
+    gap, apart = predictions[1] - optimum[1], jax.vmap(squared_distance)(predictions[0])
     return jnp.mean(0.5 * log_share(gap, initial_gap) + 0.5 * log_share(apart, distance))
 
 

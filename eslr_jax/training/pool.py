@@ -60,11 +60,8 @@ def empty_pool(data: TrainingData, slots_per_garment: int) -> Slot:
 def start_trajectory(key: Array, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:
     """Start at a random frame of a random clip on a body of random shape: skinned, noisy, pushed out of it.
 
-    Args:
-        key: Random key.
-        data: Garments, clips and body.
-        index: Number of the garment.
-        config: Noise, girth, shapes, materials and how often the body stands still; static.
+    `index` is the garment's. `config`, static, says how large noise, girth and shapes are, and how often a
+    fabric is random and the body stands still.
     """
     keys = jax.random.split(key, 7)
     garment = data.garment(index)

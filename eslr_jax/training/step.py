@@ -16,11 +16,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import Criterion, TrainConfig
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.networks.apply import measure_statistics, merge_statistics
+from eslr_jax.networks.apply import graph_inputs, measure_statistics, merge_statistics
 from eslr_jax.networks.build import build_graph
 from eslr_jax.networks.network import Network
 from eslr_jax.networks.normalizer import is_warming_up
-from eslr_jax.networks.refine import graph_inputs
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.potential import potential_terms
@@ -77,28 +76,22 @@ def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 def init_train_state(config: TrainConfig, datasets: tuple[TrainingData, ...]) -> TrainState:
     """Return the state before the first step."""
 
-    def example() -> tuple[FrameProblem, ClothState]:
-        @jax.jit
-        def first(data: TrainingData) -> tuple[FrameProblem, ClothState]:
-            slot = start_trajectory(jax.random.key(config.seed), data, jnp.int32(0), config)
-            return slot_problem(slot, data, jnp.int32(0), config), slot.state
+    @jax.jit
+    def first(data: TrainingData) -> tuple[FrameProblem, ClothState]:
+        slot = start_trajectory(jax.random.key(config.seed), data, jnp.int32(0), config)
+        return slot_problem(slot, data, jnp.int32(0), config), slot.state
 
-        return first(datasets[0])
-
-    network = config.model.new_network(config.seed, example)
+    network = config.model.new_network(config.seed, lambda: first(datasets[0]))
+    # A batch takes every trajectory at most once.
+    slots = [max(config.slots_per_garment, -(-config.batch_size // data.num_garments)) for data in datasets]
     return TrainState(
         network=network,
         optimizer=make_optimizer(config).init(network.params),
-        pools=tuple(empty_pool(data, _slots_per_garment(config, data)) for data in datasets),
+        pools=tuple(map(empty_pool, datasets, slots)),
         key=jax.random.key_data(jax.random.key(config.seed)),
         step=jnp.int32(0),
         skipped=jnp.int32(0),
     )
-
-
-def _slots_per_garment(config: TrainConfig, data: TrainingData) -> int:
-    """Return how many trajectories of a garment are kept alive: a batch takes every one at most once."""
-    return max(config.slots_per_garment, -(-config.batch_size // data.num_garments))
 
 
 def make_mesh(config: TrainConfig) -> Mesh | None:
@@ -256,8 +249,7 @@ def _sample_gradient(
         graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
         acceleration = _skinned_acceleration(slot, data, index)
         statistics = measure_statistics(network, graph, problem.garment, acceleration)
-    horizon = _Horizon(progress.horizon, config.reset_stretch, config.reset_displacement)
-    moved, is_astray = _advance(slot, problem, report, data, horizon)
+    moved, is_astray = _advance(slot, problem, report, data, config, progress.horizon)
     overflow = moved.state.status & Status.SELF_CONTACT_OVERFLOW
     is_good = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
     slot = _choose(is_good, moved, slot.replace(is_done=jnp.ones((), bool)))
@@ -346,14 +338,6 @@ def _hood_terms(
     return terms_of
 
 
-class _Horizon(NamedTuple):
-    """When a trajectory ends."""
-
-    frames: Int[Array, ""]
-    reset_stretch: float
-    reset_displacement: float  # [m]
-
-
 class Progress(NamedTuple):
     """How far a run is."""
 
@@ -378,7 +362,12 @@ def curriculum(config: TrainConfig, step: Int[Array, ""] | int) -> Progress:
 
 
 def _advance(
-    slot: Slot, problem: FrameProblem, report: LossReport, data: TrainingData, horizon: _Horizon
+    slot: Slot,
+    problem: FrameProblem,
+    report: LossReport,
+    data: TrainingData,
+    config: TrainConfig,
+    horizon: Int[Array, ""],
 ) -> tuple[Slot, Bool[Array, ""]]:
     """Move the trajectory on with the network's prediction, and tell whether it has gone astray.
 
@@ -388,10 +377,10 @@ def _advance(
     state = next_state(report.onward, problem, slot.state, jnp.int32(0))
     stretch = jnp.max(principal_stretches(report.onward, problem.garment)[0])
     moved = jnp.max(jnp.abs(state.position - slot.state.position))
-    is_astray = ~(stretch < horizon.reset_stretch) | ~(moved < horizon.reset_displacement)
+    is_astray = ~(stretch < config.reset_stretch) | ~(moved < config.reset_displacement)
     is_astray |= (state.status & Status.BODY_TOO_FAST) > 0  # contacts can't follow: no frame for learning
     age, frame = slot.age + 1, data.next_frame(slot.frame, slot.before)
-    is_done = is_astray | (age >= horizon.frames)
+    is_done = is_astray | (age >= horizon)
     return slot.replace(state=state, frame=frame, before=slot.frame, age=age, is_done=is_done), is_astray
 
 

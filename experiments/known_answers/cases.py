@@ -16,7 +16,7 @@ from scipy.special import ellipe, ellipk
 
 from eslr_jax.config import SimConfig
 from eslr_jax.fabric.materials import COTTON, Weave, stretch_stiffness
-from eslr_jax.mesh.weave import warp_directions
+from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.numerics import components, dot3, sub3
 from eslr_jax.pipeline.fabrics import Described, on_threads
 from eslr_jax.simulation.rollout import rollout_scene

@@ -14,7 +14,7 @@ import numpy as np
 from hard_cases.build import make_cloth, make_scene
 
 from eslr_jax.config import SimConfig
-from eslr_jax.mesh.weave import warp_directions
+from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.pipeline.fabrics import describe_fabric, on_threads
 from eslr_jax.simulation.rollout import rollout_scene
 from known_answers.sheets import irregular, triangulate

@@ -9,8 +9,7 @@ import trimesh
 from eslr_jax import numerics
 from eslr_jax.contact.search import PosedSurface, nearest_faces, opposing_faces
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.groups import compact_groups
-from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.mesh.surface import compact_groups, prepare_surface
 
 
 @pytest.fixture(scope="module")

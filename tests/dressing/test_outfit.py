@@ -9,7 +9,7 @@ from outfits import OUTFITS, count_pairs, load
 
 from eslr_jax.errors import MeshError
 from eslr_jax.fabric.materials import fabric_material
-from eslr_jax.mesh.weave import warp_directions
+from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.pipeline.assets import prepare_stored
 from eslr_jax.pipeline.dressing.outfit import LAYER_GAP, combine_garments
 from eslr_jax.pipeline.fabrics import garment_material, worn_fabrics

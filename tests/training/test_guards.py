@@ -19,7 +19,7 @@ from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train, window_metrics
 from eslr_jax.training.loss import LossReport
 from eslr_jax.training.pool import start_trajectory
-from eslr_jax.training.step import _advance, _Horizon, init_train_state, make_train_step, slot_problem
+from eslr_jax.training.step import _advance, init_train_state, make_train_step, slot_problem
 
 
 @pytest.fixture(scope="module")
@@ -149,9 +149,8 @@ def advance(config, small_data):
 
     @jax.jit
     def at(onward, frames, state):
-        horizon = _Horizon(frames, config.reset_stretch, config.reset_displacement)
         report = LossReport(onward, {}, jnp.float32(0.0))
-        return _advance(slot.replace(state=state), problem, report, small_data, horizon)
+        return _advance(slot.replace(state=state), problem, report, small_data, config, frames)
 
     return slot, lambda onward, frames, state=slot.state: at(
         jnp.asarray(onward, jnp.float32), jnp.int32(frames), state

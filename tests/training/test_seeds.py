@@ -13,8 +13,7 @@ import pytest
 
 from eslr_jax.config import TrainConfig
 from eslr_jax.pipeline.assets.models import load_model, model_record
-from eslr_jax.training.loop import train
-from eslr_jax.training.seeds import make_seeds_step, stack_seeds, take_seed
+from eslr_jax.training.loop import make_seeds_step, stack_seeds, take_seed, train
 from eslr_jax.training.step import init_train_state, make_train_step
 
 STEPS = 5

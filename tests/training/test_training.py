@@ -206,7 +206,7 @@ def test_kept_memory_is_not_asked_for_again():
     code = """
 import resource, sys
 import numpy as np
-from eslr_jax.training.memory import keep_memory
+from eslr_jax.training.loop import keep_memory
 if sys.argv[1] == "keep":
     keep_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -60,10 +60,7 @@ class Train:
         """Train, draw the curves, and print where the networks are."""
         from eslr_jax.pipeline.assets.models import load_model, model_record
         from eslr_jax.pipeline.assets.training import load_training_data
-        from eslr_jax.training.loop import is_first_process, train
-        from eslr_jax.training.memory import keep_memory
-        from eslr_jax.training.plot import plot_curves
-        from eslr_jax.training.seeds import seed_folders
+        from eslr_jax.training.loop import is_first_process, keep_memory, plot_curves, seed_folders, train
 
         if self.keys:
             return _show_keys()
