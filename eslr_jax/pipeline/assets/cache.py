@@ -96,7 +96,9 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
     with contextlib.suppress(AssetError, OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, arrays)
-        _remove_oldest(path.parent)
+        entries = sorted(path.parent.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
+        for oldest in entries[:-MAX_ENTRIES]:
+            oldest.unlink(missing_ok=True)
     return arrays
 
 
@@ -124,10 +126,3 @@ def cached_struct(key: str, kind: type[Struct], make: Callable[[], Struct]) -> S
 
     arrays = dict(cached_arrays(key, make_arrays))
     return kind(**ast.literal_eval(str(arrays.pop(_STATIC))), **arrays)
-
-
-def _remove_oldest(folder: Path) -> None:
-    """Remove the least recently used entries beyond `MAX_ENTRIES`."""
-    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
-    for path in entries[:-MAX_ENTRIES]:
-        path.unlink(missing_ok=True)

@@ -106,11 +106,16 @@ def load_garment_file(
         on_source: Function that is told of a mesh before it is fitted.
     """
     if not is_path(str(name)):
-        _refuse_fit(str(name), fit or FitOptions())
+        options = fit or FitOptions()
+        usual = vars(FitOptions()) | {"scale": options.scale}
+        given = [field for field, value in vars(options).items() if value != usual[field]]
+        if given:
+            names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
+            raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
         stored = read_garment_npz(
             find_asset("garment", f"{name}_{'4k' if vertices in _REFINED else vertices}")
         )
-        stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
+        stored = _carried(stored, body, options.scale, cache=cache)
         return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
     path = garment_path(name)
     if path.is_file() and is_garment_file(path):
@@ -144,15 +149,6 @@ def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
             f"--vertices {vertices} is for bundled garments, and the mesh of a file stays as it is; leave "
             "it out, or remesh the file: eslr fit --edge-length"
         )
-
-
-def _refuse_fit(name: str, options: FitOptions) -> None:
-    """Raise a ConfigError if a bundled garment is given an option of a fit, except its scale."""
-    usual = vars(FitOptions()) | {"scale": options.scale}
-    given = [field for field, value in vars(options).items() if value != usual[field]]
-    if given:
-        names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
-        raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
 
 
 def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:

@@ -136,12 +136,7 @@ def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
 
 
 def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
-    """Return the options of an interrupted simulation, what is simulated, and the frames that are done.
-
-    Raises:
-        AssetError: The folder holds no interrupted simulation.
-        ConfigError: An option is given that is not the simulation's own.
-    """
+    """Return the options of an interrupted simulation, what is simulated, and the frames that are done."""
     from eslr_jax.pipeline.formats.garment import read_garment_npz
     from eslr_jax.simulation.archive import read_tree
 
@@ -267,13 +262,7 @@ def _announce(options: Options, setting: _Setting) -> None:
 
 
 def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simulation:
-    """Compile and simulate with progress; Ctrl-C ends it after the frames in work.
-
-    Args:
-        setting: What is simulated, and how.
-        done: First frames of the scene, simulated before.
-        stop: Takes Ctrl-C over once the first frames are done.
-    """
+    """Compile and simulate with progress; Ctrl-C ends it after the frames in work."""
     import jax
 
     from eslr_jax.pipeline.report.metrics import measure_frames

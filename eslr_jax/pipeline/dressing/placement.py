@@ -125,7 +125,12 @@ def find_placement(
         )
     ]
     sample = sample_garment(positions, faces)
-    known = _known_candidates(sample, orientations, postures, stays=keep_place)
+    known = []  # every orientation at the known origins, in every posture
+    for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
+        # A garment that stays is not moved by the little that the soles of a body miss height 0.
+        floors = [at for at in posture.stands if not keep_place or np.linalg.norm(at) > _SOLES]
+        for at, origin in [*((at, "floor") for at in floors), (np.zeros(3), "body")]:
+            known.append(_scored(start, sample, postures, posture=k, translation=at, origin=origin))
     best, rival = _choose(known, sample, postures)
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
@@ -151,21 +156,6 @@ def find_placement(
     if units == "auto":
         warnings += _scale_warning(best, sample, postures)
     return dataclasses.replace(best, confidence=confidence, warnings=tuple(warnings))
-
-
-def _known_candidates(
-    sample: Sample, orientations: list[Placement], postures: list[Posture], *, stays: bool
-) -> list[Placement]:
-    """Return every orientation at the known origins, in every posture.
-
-    A garment that stays is not moved by the little that the soles of a body miss height 0.
-    """
-    found = []
-    for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
-        floors = [at for at in posture.stands if not stays or np.linalg.norm(at) > _SOLES]
-        for at, origin in [*((at, "floor") for at in floors), (np.zeros(3), "body")]:
-            found.append(_scored(start, sample, postures, posture=k, translation=at, origin=origin))
-    return found
 
 
 def _scored(start: Placement, sample: Sample, postures: list[Posture], **changes) -> Placement:

@@ -66,12 +66,8 @@ def _smoothed(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return entries that move old vertices towards the mean of their neighbours.
 
-    Args:
-        edges: Shape [edges, 2].
-        is_boundary: Of every edge.
-        count: Vertices.
-        share_of: Share that an inner vertex of so many edges takes of the mean.
-        at_boundary: Share that a boundary vertex takes of its two neighbours along the boundary.
+    `share_of` has the share of the mean that an inner vertex of so many edges takes, `at_boundary` is that of a
+    boundary vertex, of its two neighbours along the boundary.
     """
     degree = np.bincount(edges.ravel(), minlength=count)
     on_boundary = np.zeros(count, bool)

@@ -74,11 +74,7 @@ def export_trajectory(
 
 
 def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, AnimatedMesh]:
-    """Return the garment in the vertex order of its file, and the body if there is one.
-
-    Raises:
-        AssetError: The garment is not the one that was simulated.
-    """
+    """Return the garment in the vertex order of its file, and the body if there is one."""
     faces, uvs, places = run.faces, None, np.arange(run.positions.shape[1])
     if garment is not None:
         if not np.array_equal(garment.faces, faces):

@@ -100,8 +100,7 @@ def _add_targets(
 ) -> tuple[list[gltf.Attributes], np.ndarray]:
     """Add the principal shapes of offsets [frames, vertices, 3] and of the normals that go with them.
 
-    Returns:
-        The targets, and their weights [frames, targets], which are at most one: Blender's sliders end at ten.
+    Return the targets, and weights [frames, targets] of at most one: Blender's sliders end at ten.
     """
     if not offsets.size:
         return [], np.zeros((len(offsets), 0), np.float32)

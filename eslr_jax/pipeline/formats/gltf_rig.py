@@ -139,7 +139,21 @@ def _read_joints(document: GltfDocument) -> _Joints:
     frames: dict[int, np.ndarray] = {}
     spaces: dict[int, np.ndarray] = {}
     for number, skin in enumerate(skins):
-        nodes, bind = _read_skin(document, skin, number)
+        nodes = skin.get("joints", [])
+        if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
+            raise document.fail(f"has skin {number} without joints, or with one twice")
+        for node in nodes:
+            document.item("nodes", node)
+        bind = np.tile(np.eye(4), (len(nodes), 1, 1))
+        if "inverseBindMatrices" in skin:
+            values = document.array(skin["inverseBindMatrices"])
+            if values.shape[1:] != (16,) or len(values) < len(nodes):
+                raise document.fail(
+                    f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints"
+                )
+            bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
+        if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
+            raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
         user = users.get(number)
         spaces[number] = _bind_space(document, world, nodes, bind, user)
         rest = spaces[number] @ np.linalg.inv(bind)
@@ -159,24 +173,6 @@ def _read_joints(document: GltfDocument) -> _Joints:
     rest_frames = np.stack([frames[node] for node in nodes])
     skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest_frames[:, :3, 3])
     return _Joints(nodes, rest_frames, skeleton, spaces)
-
-
-def _read_skin(document: GltfDocument, skin: dict[str, Any], number: int) -> tuple[list[int], np.ndarray]:
-    """Return a skin's joint nodes and its inverse bind matrices [joints, 4, 4]."""
-    nodes = skin.get("joints", [])
-    if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
-        raise document.fail(f"has skin {number} without joints, or with one twice")
-    for node in nodes:
-        document.item("nodes", node)
-    bind = np.tile(np.eye(4), (len(nodes), 1, 1))
-    if "inverseBindMatrices" in skin:
-        values = document.array(skin["inverseBindMatrices"])
-        if values.shape[1:] != (16,) or len(values) < len(nodes):
-            raise document.fail(f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints")
-        bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
-    if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
-        raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
-    return nodes, bind
 
 
 def _bind_space(

@@ -183,11 +183,7 @@ def run_live(
 
 
 def _one_frame(live: Live, choice: Choice) -> bool:
-    """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did.
-
-    Raises:
-        EslrError: What is chosen does not load, or the body is too fast.
-    """
+    """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did."""
     if choice != live.refused:
         live.refused = None  # chosen once more, it is tried and told once more
     is_due, is_anew = _is_due(live, choice), live.anew.is_set()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -86,20 +85,17 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     # Nobody enlarges its buffers here.
     layers = Repulsion(num_rows=default_rows(garment.vertex_mask.shape[0]))
     terms = scene_terms(Collision(has_skin=True), layers, Air((0.0, 0.0, 0.0)), no_hand())
-    begin = partial(_begin_compiling, material)
-    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
-    return _staged(scene, material)
-
-
-def _begin_compiling(material: Material, scene: Scene) -> None:
-    """Begin to compile the step of a scene, of which the shapes are known."""
 
     def first_step(scene: Scene) -> tuple:
         stage = _staged(scene, material)
         frame = jax.tree.map(lambda leaf: leaf[0], stage.inputs)
         return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
 
-    begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+    def begin(scene: Scene) -> None:
+        begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+
+    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
+    return _staged(scene, material)
 
 
 def _staged(scene: Scene, material: Material) -> Stage:

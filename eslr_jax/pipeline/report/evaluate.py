@@ -118,11 +118,7 @@ def _gaps(
 
 
 def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:
-    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on.
-
-    Raises:
-        EslrError: The solver's rollout goes wrong.
-    """
+    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on."""
     simulation = simulate(network, scene, config=config, raises=network is None)
     return hold_last(simulation.trajectory, scene.num_frames)
 

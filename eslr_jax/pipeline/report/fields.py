@@ -70,7 +70,10 @@ def run_field(run: Run, name: str) -> Field:
     if name == "stretch":
         values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    values = _problem_values(run, name)
+    trajectory = run_trajectory(run)
+    states, _ = trajectory_states(trajectory, run.scene)
+    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
+    values = np.concatenate([np.zeros_like(values[:1]), values])
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
     # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
     low, high = (
@@ -92,14 +95,6 @@ def _stretches(
         return scatter_corners(weights * larger[:, None], garment.face_incidence) / jnp.maximum(total, 1e-12)
 
     return jax.lax.map(frame, positions)
-
-
-def _problem_values(run: Run, name: str) -> Float[np.ndarray, "frames vertices"]:
-    """Return a value [J] of the frames' minimisation problems; the first frame has none."""
-    trajectory = run_trajectory(run)
-    states, _ = trajectory_states(trajectory, run.scene)
-    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
-    return np.concatenate([np.zeros_like(values[:1]), values])
 
 
 @partial(jax.jit, static_argnames="name")

@@ -35,7 +35,14 @@ def foreign_trajectory(
         iterations: Iterations that it spent on every frame.
     """
     x = jnp.asarray(positions, jnp.float32)
-    v = _velocities(x, scene) if velocities is None else jnp.asarray(velocities, jnp.float32)
+    if velocities is None:
+        # Implicit Euler: (x_t - x_{t-1}) / dt. BDF2, from frame 2 on: (3 x_t - 4 x_{t-1} + x_{t-2}) / (2 dt).
+        moved = jnp.diff(x, axis=0) / scene.timestep
+        if scene.initial_state.past is not None:
+            moved = jnp.concatenate([moved[:1], 1.5 * moved[1:] - 0.5 * moved[:-1]])
+        v = jnp.concatenate([scene.initial_state.velocity[None], moved])
+    else:
+        v = jnp.asarray(velocities, jnp.float32)
     loads = find_friction_loads(x, v, scene) if friction_loads is None else jnp.asarray(friction_loads)
     unknown = jnp.full(len(x), jnp.nan)
     return Trajectory(
@@ -49,17 +56,6 @@ def foreign_trajectory(
         status=jnp.int32(0),
         first_bad_frame=jnp.int32(-1),
     )
-
-
-def _velocities(x: Float[Array, "frames vertices 3"], scene: Scene) -> Float[Array, "frames vertices 3"]:
-    """Return the velocities [m/s] with which a scene's integrator arrives at positions [m].
-
-    Implicit Euler: (x_t - x_{t-1}) / dt. BDF2: (3 x_t - 4 x_{t-1} + x_{t-2}) / (2 dt), from the second frame on.
-    """
-    moved = jnp.diff(x, axis=0) / scene.timestep
-    if scene.initial_state.past is not None:
-        moved = jnp.concatenate([moved[:1], 1.5 * moved[1:] - 0.5 * moved[:-1]])
-    return jnp.concatenate([scene.initial_state.velocity[None], moved])
 
 
 @jax.jit

@@ -49,7 +49,12 @@ def pose_sequence(
     faces = np.asarray(sequence.faces, np.int64)
     extent = float(np.ptp(sequence.positions[0], axis=0).max())
     scaled = metres_per_unit(sequence.name, extent, units) * sequence.positions
-    rest, positions = scaled[0], _resample(scaled, sequence.fps, fps)
+    # By straight lines between frames.
+    at = np.arange(count_resampled(len(scaled), sequence.fps, fps)) * (sequence.fps / fps)
+    before = np.clip(at.astype(int), 0, max(len(scaled) - 2, 0))
+    share = np.clip(at - before, 0.0, 1.0)[:, None, None]
+    after = np.minimum(before + 1, len(scaled) - 1)
+    rest, positions = scaled[0], (1 - share) * scaled[before] + share * scaled[after]
     check_outward(rest, faces, name=sequence.name)
     sides = np.ptp(rest, axis=0)
     if sides[2] == sides.max() and sides[1] < UPRIGHT * sides[2]:
@@ -84,22 +89,10 @@ def pose_sequence(
     return body, body_motion(body, *moved, fps=fps)
 
 
-def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
-    """Return positions at another frame rate, by straight lines between frames."""
-    count = count_resampled(len(positions), fps_in, fps_out)
-    at = np.arange(count) * (fps_in / fps_out)
-    before = np.clip(at.astype(int), 0, max(len(positions) - 2, 0))
-    share = np.clip(at - before, 0.0, 1.0)[:, None, None]
-    after = np.minimum(before + 1, len(positions) - 1)
-    return (1 - share) * positions[before] + share * positions[after]
-
-
 def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Divide a surface into patches with soft borders.
+    """Return the largest weights of soft-bordered patches at every vertex, and their patches; and all weights.
 
-    Returns:
-        The largest weights of every vertex, which sum to one, and their patches, shape [vertices, influences];
-        and all weights, shape [vertices, patches].
+    Shapes are [vertices, influences], where rows sum to one, twice, and [vertices, patches].
     """
     edges = unique_edges(faces)
     lengths = np.maximum(np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1), 1e-9)
