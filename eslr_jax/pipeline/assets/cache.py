@@ -80,12 +80,7 @@ def content_key(*parts: Any) -> str:
 
 
 def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the arrays of an entry; compute and store them if the entry is missing.
-
-    Args:
-        key: Name of the entry, from `content_key`.
-        make: Computes the arrays.
-    """
+    """Return the arrays of an entry, named by `content_key`; make and store them if the entry is missing."""
     path = cache_folder() / f"{key}.npz"
     if path.exists():
         with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again

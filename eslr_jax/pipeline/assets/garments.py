@@ -135,15 +135,7 @@ def load_garment_file(
 
 
 def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
-    """Check that a resolution other than the usual one is asked for bundled garments.
-
-    Args:
-        names: Garments by name or path.
-        vertices: Resolution of those that are bundled.
-
-    Raises:
-        ConfigError: All of them are files, which have their own.
-    """
+    """Raise a ConfigError if only files, which have a resolution of their own, are asked for in another one."""
     if vertices != "1k" and all(map(is_path, names)):
         raise ConfigError(
             f"--vertices {vertices} is for bundled garments, and the mesh of a file stays as it is; leave "

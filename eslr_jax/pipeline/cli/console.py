@@ -127,11 +127,10 @@ def leave_at_once() -> Iterator[None]:
 
 
 def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
-    """Print what a person wants to know of a trajectory first: words, then figures.
+    """Print what a person wants to know of a trajectory first: words, then figures, `more` of them last.
 
-    Args:
-        report: Of `trajectory_report`, and of `wear_report` where the body is known, see `describe_report`.
-        more: Other figures by name; they come last.
+    The report is that of `trajectory_report`, and of `wear_report` where the body is known, see
+    `describe_report`.
     """
     from eslr_jax.pipeline.report.words import describe_report
 

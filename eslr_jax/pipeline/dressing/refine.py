@@ -22,12 +22,7 @@ class Refinement(NamedTuple):
 
 
 def refine(faces: Int[np.ndarray, "faces 3"], num_vertices: int, scheme: str) -> Refinement:
-    """Refine a triangle mesh several times.
-
-    Args:
-        faces: Oriented triangles of a manifold mesh, shape [faces, 3].
-        num_vertices: Number of vertices.
-        scheme: One letter per step: t triples the number of faces, q quadruples it.
+    """Refine an oriented manifold mesh by a scheme of letters: t triples the number of faces, q quadruples it.
 
     Source: t: Kobbelt 2000, doi 10.1145/344779.344835, with a boundary that stays; q: Loop 1987.
     """

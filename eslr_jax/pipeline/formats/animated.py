@@ -147,11 +147,7 @@ def split_seams(
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the area-weighted face normals around each vertex.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
+    """Average the area-weighted face normals around each vertex; faces are counter-clockwise seen from outside.
 
     Returns:
         Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
@@ -230,16 +226,10 @@ def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
 
 
 def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Return what to add to the rest vertices so that the joints move them to given positions.
-
-    Args:
-        skin: The skin.
-        rest: Vertex positions at rest [m], shape [vertices, 3].
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        tolerance: Distance that needs no correction [m].
+    """Return what to add to the rest vertices so that the joints move them to given positions [m].
 
     Returns:
-        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance.
+        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
     """
     weights, indices = influences(skin)
     rows = np.repeat(np.arange(len(rest)), weights.shape[1])
@@ -270,13 +260,8 @@ def write_frames(
 ) -> None:
     """Write one file per frame into a new folder, which appears when it is complete.
 
-    Names sort alphabetically in the order of the frames.
-
-    Args:
-        folder: Path of the folder, which must be empty or not exist.
-        mesh: The mesh in motion.
-        suffix: Of the files.
-        content: From the positions of a frame, [vertices, 3] in float32, to the bytes of its file.
+    Names sort alphabetically in the order of the frames. `content` makes the bytes of a file of a frame's
+    positions, [vertices, 3] in float32.
     """
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):

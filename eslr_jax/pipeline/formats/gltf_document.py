@@ -254,9 +254,7 @@ class GltfDocument:
     def world_matrices(self, animated: dict[tuple[int, str], np.ndarray], num_frames: int) -> np.ndarray:
         """Return the matrix from every node to the world, [frames, nodes, 4, 4].
 
-        Args:
-            animated: Values by node and path, shape [frames, 3 or 4]; other nodes are at rest.
-            num_frames: Number of frames.
+        `animated` has values by node and path, shape [frames, 3 or 4]; other nodes are at rest.
         """
         result = np.tile(np.eye(4), (num_frames, len(self.parents), 1, 1))
         nodes = self.items("nodes")

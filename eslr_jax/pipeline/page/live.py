@@ -152,13 +152,7 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
 def run_live(
     live: Live, *, until: threading.Event | None = None, on_frame: Callable[[], None] = lambda: None
 ) -> None:
-    """Simulate and show frame after frame, and follow the controls; return when `until` is set.
-
-    Args:
-        live: Of `open_live`.
-        until: Ends it.
-        on_frame: Called after every frame.
-    """
+    """Simulate and show frame after frame, and follow the controls; return when `until` is set."""
     until = until or threading.Event()
     due = time.perf_counter()
     try:
@@ -327,10 +321,7 @@ def restart(live: Live) -> None:
 def next_iterations(iterations: int, took: float, timestep: float) -> int:
     """Return how many iterations the next frame gets at most, to keep up with real time.
 
-    Args:
-        iterations: Of the frames before, at most.
-        took: Time that they took [s].
-        timestep: Time that there is [s].
+    The frames before had `iterations` at most, and took [s] of the timestep [s].
     """
     share = (timestep - _PAGE) / took
     wanted = 0.9 * share * iterations if share < 1.0 else 1.1 * iterations + 1.0

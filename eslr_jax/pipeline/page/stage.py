@@ -125,14 +125,9 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
 def advance(
     stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int, tolerance: float
 ) -> Step:
-    """Step the cloth while the body moves from one frame to a neighbour.
+    """Step the cloth while the body moves from the first of two neighbouring frames to the other.
 
-    Args:
-        stage: Of `set_stage`.
-        state: Cloth at the first of the two frames.
-        frames: Two neighbouring frames.
-        iterations: Of the solver, at most.
-        tolerance: Share of the initial gap at which the frame may end.
+    The frame may end at a tolerance: a share of its initial gap.
     """
     now, then = frames
     inputs = stage.inputs if then > now else stage.back
@@ -156,15 +151,10 @@ def _step(
 
 
 def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
-    """Return the vertex that a ray points at.
+    """Return the vertex [m] that a ray from an origin [m] along a direction of unit length points at.
 
     It is the first vertex along the ray, among those that are at most a centimetre farther from the ray than the
     nearest one.
-
-    Args:
-        positions: Vertices [m].
-        origin: Where the ray begins [m].
-        direction: Where it goes; unit length.
     """
     offset = positions - np.asarray(origin)
     along = offset @ np.asarray(direction)

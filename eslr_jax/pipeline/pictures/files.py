@@ -14,11 +14,7 @@ from eslr_jax.pipeline.extras import require
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write a picture as PNG, atomically.
-
-    Args:
-        path: The file.
-        image: sRGB values, uint8, shape [height, width, 3].
+    """Write a picture, sRGB in uint8 [height, width, 3], as PNG, atomically.
 
     Raises:
         AssetError: If the file can't be written.

@@ -41,13 +41,7 @@ def intersecting_pairs(
 
     Two triangles intersect where an edge of one pierces the other. Faces that share a vertex touch by
     construction and are left out. So are pairs of body faces: real bodies intersect themselves. Positions that
-    are not finite have no pairs.
-
-    Args:
-        cloth: Cloth vertex positions [m], shape [vertices, 3]; padded vertices, which no face uses, do no harm.
-        cloth_faces: Cloth triangles, shape [faces, 3].
-        body: Body vertex positions [m], shape [body_vertices, 3]; None without a body.
-        body_faces: Body triangles, shape [body_faces, 3]; None without a body.
+    are not finite have no pairs. Padded vertices, which no face uses, do no harm.
 
     Raises:
         MissingExtraError: The IPC Toolkit is not installed.

@@ -23,9 +23,8 @@ class Words(NamedTuple):
 def describe_report(report: dict[str, Any]) -> Words:
     """Put a run's report into words.
 
-    Args:
-        report: Values of `trajectory_report`, of `wear_report`, and the `tolerance` that was asked for with the
-            share of frames within it, `within_tolerance`.
+    It has the values of `trajectory_report` and of `wear_report`, the `tolerance` that was asked for, and the
+    share of frames within it, `within_tolerance`.
     """
     good, warnings = words = Words([], [])
     if report["error"] is not None:
@@ -83,9 +82,7 @@ def describe_report(report: dict[str, Any]) -> Words:
 def describe_start(crossing: dict[str, Any] | None, *, is_put_on: bool) -> str | None:
     """Return a warning where cloth begins deeper behind cloth than self-contact pulls it back; else None.
 
-    Args:
-        crossing: Of `report.start_crossing`.
-        is_put_on: The garment begins on the body's rest pose, whatever the motion is.
+    `crossing` is of `report.start_crossing`; `is_put_on`: the garment begins on the body's rest pose.
     """
     if crossing is None or crossing["depth_mm"] <= _UNTANGLED_MM:
         return None

@@ -175,11 +175,7 @@ def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: S
 
 
 def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
-    """Make the hips of a skeleton joint 0, since a motion's translation is that of joint 0.
-
-    Returns:
-        The skeleton, and the old index of each of its joints.
-    """
+    """Make the hips joint 0, as motions have it; return the skeleton, and the old index of each of its joints."""
     hips = find_parts(skeleton)["", "hips"][0]
     neighbors: dict[int, list[int]] = {}
     for joint, parent in enumerate(skeleton.parents):
