@@ -97,13 +97,7 @@ def load_garment_file(
 ) -> GarmentFile:
     """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
 
-    Args:
-        name: Garment; see `load_garment`, also for the other arguments.
-        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
-        body: Body that is to wear it.
-        fit: Options of the fit.
-        cache: Keep the result for the next time.
-        on_source: Function that is told of a mesh before it is fitted.
+    Arguments are those of `load_garment`; `on_source` is told of a mesh before it is fitted.
     """
     if not is_path(str(name)):
         options = fit or FitOptions()

@@ -121,11 +121,7 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
 
 
 def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
-    """Read a motion with the skeleton of its file.
-
-    Args:
-        file: Path of a file of one of `registry.suffixes_of("motion")`; an .amc has its .asf beside it.
-        clip: Which of several animations.
+    """Read a motion, or one of several clips, with the skeleton of its file; an .amc has its .asf beside it.
 
     Raises:
         AssetError: The file is missing, damaged, or of an unknown kind.

@@ -36,7 +36,11 @@ def main() -> None:
     warnings.showwarning = lambda message, category, *_: say(str(message))  # one line on stderr
     sys.path.append(os.getcwd())  # last: where networks of one's own are found, as MODULE:NAME
     try:
-        _refuse_repetition(sys.argv[1:])
+        arguments = sys.argv[1:]  # of an option that is given twice, the second value would silently win
+        options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
+        for option in options:
+            if options.count(option) > 1 and arguments[0] not in _REPEATABLE.get(option, ()):
+                raise ConfigError(f"{option} is given twice; give it once")
         try:
             with leave_at_once():
                 app.cli(prog="eslr")()
@@ -52,11 +56,3 @@ def main() -> None:
     except KeyboardInterrupt:
         say("eslr: interrupted")
         sys.exit(EXIT_CODE)
-
-
-def _refuse_repetition(arguments: list[str]) -> None:
-    """Refuse an option that is given twice: the second value would silently replace the first."""
-    options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
-    for option in options:
-        if options.count(option) > 1 and arguments[0] not in _REPEATABLE.get(option, ()):
-            raise ConfigError(f"{option} is given twice; give it once")

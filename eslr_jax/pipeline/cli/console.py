@@ -132,7 +132,7 @@ def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
     The report is that of `trajectory_report`, and of `wear_report` where the body is known, see
     `describe_report`.
     """
-    from eslr_jax.pipeline.report.words import describe_report
+    from eslr_jax.pipeline.report.report import describe_report
 
     if "slide_m" in report:  # else the body is not known whole
         words = describe_report(report)

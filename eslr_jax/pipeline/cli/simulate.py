@@ -235,8 +235,7 @@ def _announce(options: Options, setting: _Setting) -> None:
     """Say what a person wants to know before the simulation begins."""
     from eslr_jax.pipeline.dressing.report import LARGE, describe_fit, describe_transfer
     from eslr_jax.pipeline.fabrics import beyond_training
-    from eslr_jax.pipeline.report.report import start_crossing
-    from eslr_jax.pipeline.report.words import describe_start
+    from eslr_jax.pipeline.report.report import describe_start, start_crossing
     from eslr_jax.pose.timing import begins_at_rest
 
     method, stored, scene = setting.method, setting.stored, setting.scene

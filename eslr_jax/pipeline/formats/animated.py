@@ -115,12 +115,7 @@ def _check_mesh(mesh: AnimatedMesh) -> None:
 def split_seams(
     faces: np.ndarray, num_vertices: int, corner_uvs: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Give each vertex one texture coordinate by splitting the vertices on seams.
-
-    Args:
-        faces: Triangles, shape [faces, 3].
-        num_vertices: Number of vertices.
-        corner_uvs: Texture coordinate of every corner, shape [faces, 3, 2]; None splits nothing.
+    """Give each vertex one texture coordinate by splitting the vertices on seams, if there are `corner_uvs`.
 
     Returns:
         Faces; the old vertex of each new one, where old vertices come first and in order; and texture coordinates
@@ -169,11 +164,7 @@ def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray,
     """Find few shapes whose weighted sums are the offsets of every frame (principal component analysis).
 
     A shape is `basis.T @ offsets`, and `basis[t]` holds its weight in frame t. Other values per frame, such as
-    normals, may be projected on the same basis.
-
-    Args:
-        offsets: Offsets of the vertices [m], shape [frames, vertices, 3].
-        tolerance: Largest error of any vertex in any frame [m].
+    normals, may be projected on the same basis. No vertex is off by more than the tolerance [m] in any frame.
 
     Returns:
         Basis [frames, shapes] with orthonormal columns, and the shapes [shapes, vertices, 3] [m].

@@ -327,14 +327,11 @@ class GltfDocument:
 
 
 def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sample key frames at given times; before the first key and after the last one values are constant.
+    """Sample key frames at given times [s]; before the first key and after the last one values are constant.
 
-    Args:
-        path: "rotation" (quaternions x, y, z, w), "translation", "scale" or "weights".
-        kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
-        times: Times of the keys [s], ascending.
-        values: Values of the keys, shape [keys, components], or [3 keys, components] for cubic splines.
-        at: Times of the samples [s]; the result has shape [samples, components].
+    `path` is "rotation" (quaternions x, y, z, w; by slerp where linear), "translation", "scale" or "weights".
+    `kind` is "LINEAR", "STEP" or "CUBICSPLINE", whose values are [3 keys, components]: in-tangent, value and
+    out-tangent of every key. Others are [keys, components], and the result is [samples, components].
 
     Source: glTF 2.0, appendix C.
     """

@@ -51,12 +51,8 @@ def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
 def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
 
-    It has the shape that the file's weights of morph targets give it.
-
-    Args:
-        path: Path of a .gltf, .glb or .vrm file.
-        meshes: Names of the meshes, or of their nodes, that make up the body, as in "Skin,Hat"; "" is all that
-            are skinned.
+    It has the shape that the file's weights of morph targets give it. `meshes` names the meshes, or their nodes,
+    that make up the body, as in "Skin,Hat"; "" is all that are skinned.
     """
     document = GltfDocument(path)
     joints = _read_joints(document)

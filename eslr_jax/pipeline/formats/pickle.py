@@ -60,8 +60,8 @@ class _Reconstructor(_Stub):
 def make_stub(convert: Callable[[Any, _Plain], Any]) -> type:
     """Return a class of stubs for one global.
 
-    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does the same for
-    what the stub holds.
+    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does so for what
+    they hold.
     """
     return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
 

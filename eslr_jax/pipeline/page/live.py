@@ -114,11 +114,8 @@ class Live:
 def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int = 8080) -> Live:
     """Serve a page on which cloth moves while it is simulated; `run_live` simulates.
 
-    Args:
-        choice: What is on stage first.
-        out: Folder that recordings are written to, in the folders 1, 2, and so on.
-        host: Address to listen on; only this machine by default.
-        port: Port, or the next free one.
+    A choice is on stage first. Recordings are written to `out`, in the folders 1, 2, and so on. By default only
+    this machine sees the page, at a port or the next free one.
 
     Raises:
         AssetError: There is no such body.

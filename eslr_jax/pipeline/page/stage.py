@@ -74,11 +74,6 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
 
     It is stepped by BDF2 in air. Changes of fabric, wind, hand and tolerance do not compile anew.
 
-    Args:
-        garment: A prepared garment.
-        poses: The body in motion, two frames or more.
-        material: Fabric.
-
     Raises:
         MotionError: The motion has fewer than two frames.
     """

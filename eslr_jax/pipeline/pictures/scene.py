@@ -79,11 +79,11 @@ def trace_picture(
     size: tuple[int, int],
     samples: int,
 ) -> np.ndarray:
-    """Trace one picture.
+    """Trace one picture; the lights turn with the camera.
 
     Args:
         surfaces: What stands in the studio.
-        camera: Where to look from; the lights turn with it.
+        camera: Where to look from.
         ground_height: Height of the floor [m].
         size: Width and height [pixels].
         samples: Camera rays per pixel, rounded up to a square number.

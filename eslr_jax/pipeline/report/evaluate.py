@@ -78,9 +78,13 @@ def evaluate(
                 return prepare_scene(cloth, poses, surface=surface)
 
             if options.gap_frames:
-                on_truth, on_policy = _gaps(network, scene_of(options.gap_frames), config, options.every)
-                forced.append(on_truth)
-                policy.append(on_policy)
+                scene = scene_of(options.gap_frames)
+                compared = GapOptions(every=options.every, refined=(config.iterations,))
+                truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
+                # From the optimum's states, and from those of the network's own rollout.
+                for stepper, steps, gaps in ((None, truth, forced), (network, config, policy)):
+                    trajectory = _roll(stepper, scene, steps)
+                    gaps.append(jax.device_get(measure_gap(network, trajectory, scene, compared)))
             scene = scene_of(options.rollout_frames)
             free = _roll(network, scene, config)
             optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
@@ -102,19 +106,6 @@ def evaluate(
         "rollout": _pool_rollouts(scenes) | {"drift_mm_s": largest, "drift_mm_s_of": drifts},
         "scenes": scenes,
     }
-
-
-def _gaps(
-    network: Network, scene: Scene, config: SimConfig, every: int
-) -> tuple[OptimalityGap, OptimalityGap]:
-    """Return the gaps from the optimum's states and from those of the network's own rollout."""
-    options = GapOptions(every=every, refined=(config.iterations,))
-    measured = []
-    truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
-    for stepper, steps in ((None, truth), (network, config)):
-        trajectory = _roll(stepper, scene, steps)
-        measured.append(jax.device_get(measure_gap(network, trajectory, scene, options)))
-    return measured[0], measured[1]
 
 
 def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:

@@ -65,7 +65,16 @@ def run_field(run: Run, name: str) -> Field:
     if name == "repulsion-energy" and run.scene.term(Repulsion) is None:
         raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
-        return _distances(run)
+        trajectory = run.trajectory
+        assert trajectory.body is not None
+        values = np.empty(trajectory.positions.shape[:2], np.float32)
+        faces = trajectory.body.faces
+        tracks = zip(trajectory.positions, trajectory.body.positions, strict=True)
+        for frame, (cloth, body) in enumerate(tracks):
+            normals = vertex_normals(body, faces)
+            _, nearest = cKDTree(body).query(cloth)
+            values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
+        return Field(values, 0.0, 0.06, "m")
     garment = run.scene.garment
     if name == "stretch":
         values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
@@ -116,10 +125,7 @@ def energy_shares(
 ) -> Float[Array, " vertices"]:
     """Share the energy of the terms of one name out over the vertices [J]; the shares add up to it.
 
-    Args:
-        name: Of one of the problem's terms.
-        position: Positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
+    The frame's problem has these terms, and the cloth is at the position at t + 1 [m].
     """
     x = components(pin(problem, position))
     parts = [
@@ -154,17 +160,3 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
 
     works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
     return product(jnp.asarray(0.5 * weights, position.dtype), works)
-
-
-def _distances(run: Run) -> Field:
-    """Return the height of every vertex over the tangent plane of the nearest body vertex [m]."""
-    trajectory = run.trajectory
-    if trajectory.body is None:
-        raise AssetError(f"{run.name} has no body, and so no distance to it")
-    values = np.empty(trajectory.positions.shape[:2], np.float32)
-    faces = trajectory.body.faces
-    for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body.positions, strict=True)):
-        normals = vertex_normals(body, faces)
-        _, nearest = cKDTree(body).query(cloth)
-        values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
-    return Field(values, 0.0, 0.06, "m")

@@ -62,13 +62,7 @@ def foreign_trajectory(
 def find_friction_loads(
     positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
 ) -> Float[Array, "frames vertices"]:
-    """Return the friction loads [N] of a trajectory that does not tell them.
-
-    Args:
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        velocities: Vertex velocities [m/s], shape [frames, vertices, 3].
-        scene: Its scene.
-    """
+    """Return the friction loads [N] of a trajectory that does not tell them; it is in m and m/s."""
 
     def advance(load, frame):
         position, velocity, past, reached, inputs = frame
@@ -89,9 +83,7 @@ def find_friction_loads(
 def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
     """Return a trajectory with energies, residuals and pairs of cloth at its positions; frame 0 has none.
 
-    Args:
-        trajectory: Of any simulator; its own energies, residuals and demand of pairs are replaced by ours.
-        scene: Its scene.
+    Those of the simulator that it is of are replaced by ours.
     """
 
     def measure(

@@ -33,10 +33,11 @@ def pose_sequence(
     """Return a moving mesh as a body, and as that body in motion.
 
     The vertices move as in the sequence, resampled in time by straight lines. Patches of the surface stand for
-    joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame.
+    joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame,
+    which is the rest pose.
 
     Args:
-        sequence: The mesh in motion; its first frame is the rest pose.
+        sequence: The mesh in motion.
         fps: Frames per second of the simulation.
         num_frames: Number of frames to keep; None keeps all.
         units: Unit of the mesh, or metres per unit; by default recognised, see `metres_per_unit`.
@@ -71,7 +72,17 @@ def pose_sequence(
             )
         positions = positions[:num_frames]
     weights, indices, dense = _patch_weights(rest, faces)
-    transforms, centers = _fit_patches(positions, rest, dense)
+    # The best rigid motion of every patch: Kabsch 1976 (doi:10.1107/S0567739476001873).
+    share = dense / np.maximum(dense.sum(axis=0), 1e-12)
+    centers = share.T @ rest
+    transforms = np.empty((len(positions), dense.shape[1], 3, 4))
+    moments = np.einsum("vp,va->vpa", share, rest) - share[:, :, None] * centers
+    for frame, points in enumerate(positions):
+        middle = share.T @ points
+        covariance = np.einsum("va,vpb->pab", points, moments)
+        turned = nearest_rotations(covariance)
+        transforms[frame, :, :, :3] = turned
+        transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
     patches = dense.shape[1]
     body = Body(
         rest_positions=jnp.asarray(rest, jnp.float32),
@@ -113,21 +124,3 @@ def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
     indices = np.argsort(-dense, axis=1, kind="stable")[:, :used]
     weights = np.take_along_axis(dense, indices, axis=1)
     return weights / weights.sum(1, keepdims=True), indices, dense
-
-
-def _fit_patches(positions: NDArray, rest: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
-    """Return each patch's best rigid motion, shape [frames, patches, 3, 4], and rest centre, [patches, 3].
-
-    Source: Kabsch 1976 (doi:10.1107/S0567739476001873).
-    """
-    share = weights / np.maximum(weights.sum(axis=0), 1e-12)
-    centers = share.T @ rest
-    transforms = np.empty((len(positions), weights.shape[1], 3, 4))
-    moments = np.einsum("vp,va->vpa", share, rest) - share[:, :, None] * centers
-    for frame, points in enumerate(positions):
-        middle = share.T @ points
-        covariance = np.einsum("va,vpb->pab", points, moments)
-        turned = nearest_rotations(covariance)
-        transforms[frame, :, :, :3] = turned
-        transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
-    return transforms, centers
