@@ -117,10 +117,13 @@ def on_threads(
     warp: Float[np.ndarray, "faces 2"],
     fabrics: Sequence[tuple[Bool[np.ndarray, " faces"], Described]],
 ) -> Material:
-    """Return a material with the weave of fabrics on a garment, of which networks read the isotropic sheet.
+    """Return a material with the weave of fabrics on a garment.
 
-    `warp` is that of `warp_directions` on the garment's real faces. Every fabric has its faces among them, and
-    later ones replace earlier ones.
+    Args:
+        sheet: What networks read, and vertices weigh.
+        garment: Prepared garment.
+        warp: Direction of the warp on its real faces, of `warp_directions`.
+        fabrics: The real faces of each fabric; later ones replace earlier ones.
     """
     count, num_faces = len(warp), len(np.asarray(garment.rest_areas))
     stiffness, rigidity = np.zeros((num_faces, 4)), np.zeros((count, 2))

@@ -95,17 +95,11 @@ def find_placement(
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
-    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The
-    confidence compares the best placement with the next best one that differs from it.
-
-    Args:
-        positions: Vertex positions as the file has them.
-        faces: Triangles of a welded mesh.
-        postures: The body in the poses that the garment may have been modelled on; the rest pose first.
-        options: Unit, axes and whether the place is kept, where they are known.
-        is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
-        facing: Direction that the body faces; +Z if not given. The nearest axis is taken.
-        name: Name of the garment in messages.
+    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
+    compares the best placement with the next best one that differs from it. Postures are those that the garment
+    may have been modelled on, the rest pose first. Options tell what is known of unit, axes and place. A file
+    that `is_metric` has metres and Y up, unless others are given. The body faces +Z or the axis nearest to
+    `facing`.
 
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where

@@ -48,7 +48,20 @@ class GltfDocument:
         data = path.read_bytes()
         self._blob: bytes | None = None
         if data[:4] == struct.pack("<I", _MAGIC):
-            data = self._split(data)
+            version, _ = struct.unpack_from("<II", data, 4)  # of a GLB: a JSON chunk, and a binary one
+            if version != 2:
+                raise self.fail(f"is glTF {version}, not 2")
+            chunks: dict[int, bytes] = {}
+            offset = 12
+            while offset + 8 <= len(data):
+                length, kind = struct.unpack_from("<II", data, offset)
+                chunk = data[offset + 8 : offset + 8 + length]
+                if len(chunk) < length:
+                    raise self.fail("is truncated")
+                chunks.setdefault(kind, chunk)
+                offset += 8 + length
+            self._blob = chunks.get(_BIN)
+            data = chunks.get(_JSON, b"")
         self.tables: dict[str, Any] = json.loads(data.decode("utf-8-sig"))
         if not isinstance(self.tables, dict) or not str(
             _table(self.tables.get("asset")).get("version")
@@ -59,23 +72,6 @@ class GltfDocument:
             raise AssetError(
                 f"{path} needs {', '.join(sorted(needed))}, which is not read; export it without compression"
             )
-
-    def _split(self, data: bytes) -> bytes:
-        """Return the JSON chunk of a GLB and keep the binary one."""
-        version, _ = struct.unpack_from("<II", data, 4)
-        if version != 2:
-            raise self.fail(f"is glTF {version}, not 2")
-        chunks: dict[int, bytes] = {}
-        offset = 12
-        while offset + 8 <= len(data):
-            length, kind = struct.unpack_from("<II", data, offset)
-            chunk = data[offset + 8 : offset + 8 + length]
-            if len(chunk) < length:
-                raise self.fail("is truncated")
-            chunks.setdefault(kind, chunk)
-            offset += 8 + length
-        self._blob = chunks.get(_BIN)
-        return chunks.get(_JSON, b"")
 
     def fail(self, cause: str) -> AssetError:
         """Return an error about this file."""

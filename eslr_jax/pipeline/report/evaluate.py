@@ -40,11 +40,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a network.
 
-    Args:
-        network: The network.
-        options: Split, garments, clips and lengths.
-        iterations: Solver iterations behind the network.
-        on_scene: Called after each garment and clip with the count, the total and a label.
+    `iterations` are those of the solver behind the network. `on_scene` is called after each garment and clip
+    with the count, the total and a label.
 
     Returns:
         Plain values: teacher-forced and on-policy gap [J] beside that of L-BFGS from the same states, and

@@ -51,10 +51,6 @@ def run_field(run: Run, name: str) -> Field:
     are those of the frame's minimisation problem, per area, see `energy_shares` and `gap_shares`; `distance`
     is to the tangent plane of the nearest body vertex.
 
-    Args:
-        run: Of `read_run`.
-        name: One of `FIELDS`.
-
     Raises:
         AssetError: The field is unknown, or the run lacks what it needs.
     """
@@ -143,11 +139,7 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
     The share of a vertex is the work of the remaining force at it along its straight way x* + s (x - x*) to the
     optimum, which is the integral of grad P . (x - x*) over s. The differences of `energy_shares` at x and x*
     also add up to the gap. But they show the energy that the terms exchange, which is of first order in x - x*,
-    while the gap is of second order.
-
-    Args:
-        position: Any stepper's positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
+    while the gap is of second order. The position is any stepper's at t + 1 [m].
     """
     start = Start(position, potential(pushed_out_guess(problem), problem))
     minimum = solve(problem, start, iterations=_ITERATIONS, tolerance=_TOLERANCE)

@@ -192,13 +192,8 @@ def make_motion(
     if bones also move or stretch, so that a joint with skin is more than 1 cm away from its place in the file.
     On another rig, limbs point where the source's limbs point, and the rest of the body turns as the source has
     turned since its rest pose. Steps are scaled by the length of the legs, the floor is put at y = 0, and the
-    motion starts above the origin.
-
-    Args:
-        source: The motion of a file.
-        body: The body to move.
-        joint_map: Changes to the joint map, from joints of the body to joints of the source; "" keeps one still.
-        up: Axis that points up in the source: "y", "z", or "auto" to judge by how the source stands.
+    motion starts above the origin. The joint map is changed from joints of the body to joints of the source; ""
+    keeps one still. The source's axis "y" or "z" points up, or "auto" judges by how it stands.
 
     Raises:
         MotionError: No joint is known to both, or the source does not stand at rest.

@@ -34,13 +34,8 @@ def pose_sequence(
 
     The vertices move as in the sequence, resampled in time by straight lines. Patches of the surface stand for
     joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame,
-    which is the rest pose.
-
-    Args:
-        sequence: The mesh in motion.
-        fps: Frames per second of the simulation.
-        num_frames: Number of frames to keep; None keeps all.
-        units: Unit of the mesh, or metres per unit; by default recognised, see `metres_per_unit`.
+    which is the rest pose. `fps` are the simulation's; the first `num_frames` of its frames are kept, by default
+    all. The unit is by default recognised, see `metres_per_unit`.
 
     Raises:
         AssetError: The unit is unknown.
