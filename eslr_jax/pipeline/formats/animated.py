@@ -72,44 +72,41 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     if not meshes:
         raise MeshError("no mesh to write; give at least one")
     for mesh in meshes:
-        _check_mesh(mesh)
+        what, remedy = f"mesh {mesh.name}", "simulate it again"
+        arrays = {
+            key: np.asarray(value)
+            for key, value in vars(mesh).items()
+            if key in _LAYOUT and value is not None
+        }
+        if mesh.skin is not None:
+            arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+        check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+        if 0 in arrays["positions"].shape or not len(arrays["faces"]):
+            raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+        is_finite = np.isfinite(arrays["positions"]).all((1, 2))
+        if not is_finite.all():
+            raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+        if mesh.skin is None:
+            continue
+        if mesh.rest_positions is None:
+            raise MeshError(f"{what} has a skin and no rest positions; give both")
+        weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
+        if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
+            raise MeshError(
+                f"{what} has skin weights that are negative or don't sum to one; normalise them first"
+            )
+        matrices = transforms[..., :3]
+        gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
+        is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
+        is_rigid &= np.isfinite(transforms).all((2, 3))
+        if not is_rigid.all():
+            frame, joint = np.argwhere(~is_rigid)[0]
+            raise MotionError(
+                f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
+            )
     frames = {mesh.name: len(mesh.positions) for mesh in meshes}
     if len(set(frames.values())) > 1:
         raise MotionError(f"meshes need the same number of frames, these have {frames}")
-
-
-def _check_mesh(mesh: AnimatedMesh) -> None:
-    """Raise unless a mesh is finite, its parts and its joints fit each other, and these move rigidly."""
-    what, remedy = f"mesh {mesh.name}", "simulate it again"
-    arrays = {
-        key: np.asarray(value) for key, value in vars(mesh).items() if key in _LAYOUT and value is not None
-    }
-    if mesh.skin is not None:
-        arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
-    check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
-    if 0 in arrays["positions"].shape or not len(arrays["faces"]):
-        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
-    is_finite = np.isfinite(arrays["positions"]).all((1, 2))
-    if not is_finite.all():
-        raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
-    if mesh.skin is None:
-        return
-    if mesh.rest_positions is None:
-        raise MeshError(f"{what} has a skin and no rest positions; give both")
-    weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
-    if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
-        raise MeshError(
-            f"{what} has skin weights that are negative or don't sum to one; normalise them first"
-        )
-    matrices = transforms[..., :3]
-    gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
-    is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
-    is_rigid &= np.isfinite(transforms).all((2, 3))
-    if not is_rigid.all():
-        frame, joint = np.argwhere(~is_rigid)[0]
-        raise MotionError(
-            f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
-        )
 
 
 def split_seams(
