@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -214,28 +213,21 @@ def _read_node(
         points, faces = document.shaped_triangles(node, primitive)
         if np.linalg.det(space[:3, :3]) < 0:
             faces = faces[:, ::-1]
-        weights, local = _read_weights(document, attributes, len(points))
+        weights, followed = [], []
+        number = 0
+        while f"JOINTS_{number}" in attributes:
+            weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
+            followed.append(document.array(attributes[f"JOINTS_{number}"]))
+            if weights[-1].shape != (len(points), 4) or followed[-1].shape != (len(points), 4):
+                raise document.fail("has skin weights that don't fit its vertices")
+            number += 1
+        weight, chosen = np.concatenate(weights, axis=1), np.concatenate(followed, axis=1)
+        total = weight.sum(axis=1, keepdims=True)
+        if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
+            raise document.fail("has a vertex without skin weights")
+        weights, local = weight / total, np.where(weight > 0, chosen, 0.0)
         if local.max() >= len(order):
             raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
         world = points @ space[:3, :3].T + space[:3, 3]
         result.append((world, faces, weights, order[local.astype(np.int64)]))
     return result
-
-
-def _read_weights(
-    document: GltfDocument, attributes: dict[str, Any], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return all skin weights of a primitive, rows summing to one, and their joints, [vertices, influences]."""
-    weights, joints = [], []
-    number = 0
-    while f"JOINTS_{number}" in attributes:
-        weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
-        joints.append(document.array(attributes[f"JOINTS_{number}"]))
-        if weights[-1].shape != (count, 4) or joints[-1].shape != (count, 4):
-            raise document.fail("has skin weights that don't fit its vertices")
-        number += 1
-    weight, joint = np.concatenate(weights, axis=1), np.concatenate(joints, axis=1)
-    total = weight.sum(axis=1, keepdims=True)
-    if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
-        raise document.fail("has a vertex without skin weights")
-    return weight / total, np.where(weight > 0, joint, 0.0)
