@@ -9,15 +9,7 @@ from eslr_jax.errors import MissingExtraError
 
 
 def require(module: str, *, extra: str = "render", purpose: str = "this") -> ModuleType:
-    """Import an optional package.
-
-    Args:
-        module: Name of the module, e.g. "mitsuba".
-        extra: Name of this project's extra that installs the package.
-        purpose: What needs the package; begins the message.
-
-    Returns:
-        The module.
+    """Import an optional package of this project's `extra`; `purpose` begins the message where it is missing.
 
     Raises:
         MissingExtraError: The package is not installed; the message names the command that installs it.

@@ -222,11 +222,7 @@ def describe_fabric(text: str) -> Described:
 
 
 def _weave(values: dict[str, float], sheet: Material, text: str) -> Weave | None:
-    """Return the weave of numbers; what is missing along one thread is taken from the other, or from the sheet.
-
-    Raises:
-        ConfigError: The coupling is more than the two threads bear.
-    """
+    """Return the weave of numbers; what lacks along one thread is taken from the other, or from the sheet."""
     if not values:
         return None
 

@@ -11,9 +11,8 @@ from hard_cases.build import make_cloth, make_scene
 
 from eslr_jax.config import SimConfig
 from eslr_jax.pipeline.report.referee import judge
-from eslr_jax.pipeline.report.report import start_crossing, trajectory_report
+from eslr_jax.pipeline.report.report import describe_report, describe_start, start_crossing, trajectory_report
 from eslr_jax.pipeline.report.wear import wear_report
-from eslr_jax.pipeline.report.words import describe_report, describe_start
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.rollout import rollout_scene

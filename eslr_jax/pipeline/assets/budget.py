@@ -51,10 +51,7 @@ class Calibration:
     def cost(self, num_vertices: int, name: str = SOLVER, substeps: int = 1) -> Cost:
         """Return the cost of a frame, in proportion to the vertices from the size that was measured nearest by.
 
-        Args:
-            num_vertices: Of the garment.
-            name: `SOLVER`, or a network; of one that was not measured, the solver's part.
-            substeps: Of a frame.
+        Of a network that was not measured it is the solver's part.
         """
         nearest = min({cost.vertices for cost in self.costs}, key=lambda v: abs(math.log(v / num_vertices)))
         measured = {cost.name: cost for cost in self.costs if cost.vertices == nearest}
@@ -77,17 +74,10 @@ def first_iterations(cost: Cost, budget_ms: float) -> int:
 
 
 def keep_budget(cost: Cost, budget_ms: float) -> Callable[[int, float], int]:
-    """Return a `pace` for `simulate` that adapts the iterations, so that frames keep a budget.
+    """Return a `pace` for `simulate`: from the last frames' iterations and milliseconds to the next iterations.
 
     The time of the last frames gives the factor by which the device is slower or faster now than calibrated.
-
-    Args:
-        cost: Of a frame, as calibrated.
-        budget_ms: Milliseconds per frame.
-
-    Returns:
-        A function of the iterations of the last frames, and of the milliseconds that one of them took. It returns
-        the iterations of the next frames, but never too few for intact cloth: a smaller budget is missed.
+    There are never too few iterations for intact cloth: a smaller budget is missed.
     """
     least = min(cost.iterations_within(budget_ms), _FEWEST)
 

@@ -80,12 +80,7 @@ def content_key(*parts: Any) -> str:
 
 
 def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the arrays of an entry; compute and store them if the entry is missing.
-
-    Args:
-        key: Name of the entry, from `content_key`.
-        make: Computes the arrays.
-    """
+    """Return the arrays of an entry, named by `content_key`; make and store them if the entry is missing."""
     path = cache_folder() / f"{key}.npz"
     if path.exists():
         with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again
@@ -96,7 +91,9 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
     with contextlib.suppress(AssetError, OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, arrays)
-        _remove_oldest(path.parent)
+        entries = sorted(path.parent.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
+        for oldest in entries[:-MAX_ENTRIES]:
+            oldest.unlink(missing_ok=True)
     return arrays
 
 
@@ -124,10 +121,3 @@ def cached_struct(key: str, kind: type[Struct], make: Callable[[], Struct]) -> S
 
     arrays = dict(cached_arrays(key, make_arrays))
     return kind(**ast.literal_eval(str(arrays.pop(_STATIC))), **arrays)
-
-
-def _remove_oldest(folder: Path) -> None:
-    """Remove the least recently used entries beyond `MAX_ENTRIES`."""
-    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
-    for path in entries[:-MAX_ENTRIES]:
-        path.unlink(missing_ok=True)

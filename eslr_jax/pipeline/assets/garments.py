@@ -97,20 +97,19 @@ def load_garment_file(
 ) -> GarmentFile:
     """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
 
-    Args:
-        name: Garment; see `load_garment`, also for the other arguments.
-        vertices: Resolution of a bundled garment; from 50k on it is a refined 4k.
-        body: Body that is to wear it.
-        fit: Options of the fit.
-        cache: Keep the result for the next time.
-        on_source: Function that is told of a mesh before it is fitted.
+    Arguments are those of `load_garment`; `on_source` is told of a mesh before it is fitted.
     """
     if not is_path(str(name)):
-        _refuse_fit(str(name), fit or FitOptions())
+        options = fit or FitOptions()
+        usual = vars(FitOptions()) | {"scale": options.scale}
+        given = [field for field, value in vars(options).items() if value != usual[field]]
+        if given:
+            names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
+            raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
         stored = read_garment_npz(
             find_asset("garment", f"{name}_{'4k' if vertices in _REFINED else vertices}")
         )
-        stored = _carried(stored, body, (fit or FitOptions()).scale, cache=cache)
+        stored = _carried(stored, body, options.scale, cache=cache)
         return _refined(stored, _REFINED[vertices]) if vertices in _REFINED else stored
     path = garment_path(name)
     if path.is_file() and is_garment_file(path):
@@ -130,29 +129,12 @@ def load_garment_file(
 
 
 def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
-    """Check that a resolution other than the usual one is asked for bundled garments.
-
-    Args:
-        names: Garments by name or path.
-        vertices: Resolution of those that are bundled.
-
-    Raises:
-        ConfigError: All of them are files, which have their own.
-    """
+    """Raise a ConfigError if only files, which have a resolution of their own, are asked for in another one."""
     if vertices != "1k" and all(map(is_path, names)):
         raise ConfigError(
             f"--vertices {vertices} is for bundled garments, and the mesh of a file stays as it is; leave "
             "it out, or remesh the file: eslr fit --edge-length"
         )
-
-
-def _refuse_fit(name: str, options: FitOptions) -> None:
-    """Raise a ConfigError if a bundled garment is given an option of a fit, except its scale."""
-    usual = vars(FitOptions()) | {"scale": options.scale}
-    given = [field for field, value in vars(options).items() if value != usual[field]]
-    if given:
-        names = ", ".join(f"--{field.replace('_', '-')}" for field in given)
-        raise ConfigError(f"{name} is bundled: it is carried to a body, not fitted; leave out {names}")
 
 
 def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: bool) -> GarmentFile:

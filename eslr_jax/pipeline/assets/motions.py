@@ -72,7 +72,7 @@ def load_motion(
             return motion
         # An archive holds no skeleton, so that of the bundled body is used.
         return make_motion(skeleton_motion(motion, load_body()), body, joint_map=joint_map)
-    whole = read_skeleton_motion(file, clip)
+    whole = find_reader("motion", file)(file, clip)
     source, skipped = skip_start_pose(whole)
     if skipped:
         warnings.warn(skipped, stacklevel=2)
@@ -102,7 +102,7 @@ def moving_skeleton(name: str) -> SkeletonMotion:
     if _is_archived(name):
         return skeleton_motion(_bundled_motion(name), load_body())
     file, clip = split_name(name)
-    return read_skeleton_motion(file, clip)
+    return find_reader("motion", file)(file, clip)
 
 
 def read_joint_map(path: str | Path) -> dict[str, str]:
@@ -118,21 +118,6 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
             f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
         )
     return values
-
-
-def read_skeleton_motion(file: str | Path, clip: str = "") -> SkeletonMotion:
-    """Read a motion with the skeleton of its file.
-
-    Args:
-        file: Path of a file of one of `registry.suffixes_of("motion")`; an .amc has its .asf beside it.
-        clip: Which of several animations.
-
-    Raises:
-        AssetError: The file is missing, damaged, or of an unknown kind.
-        MotionError: The file holds no usable motion.
-        MissingExtraError: The file needs an extra that is not installed.
-    """
-    return find_reader("motion", file)(file, clip)
 
 
 def _is_archived(text: str) -> bool:

@@ -33,10 +33,14 @@ def main() -> None:
     gc.set_threshold(50_000)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("always", category=UserWarning, module="eslr_jax")
-    warnings.showwarning = _show_warning
+    warnings.showwarning = lambda message, category, *_: say(str(message))  # one line on stderr
     sys.path.append(os.getcwd())  # last: where networks of one's own are found, as MODULE:NAME
     try:
-        _refuse_repetition(sys.argv[1:])
+        arguments = sys.argv[1:]  # of an option that is given twice, the second value would silently win
+        options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
+        for option in options:
+            if options.count(option) > 1 and arguments[0] not in _REPEATABLE.get(option, ()):
+                raise ConfigError(f"{option} is given twice; give it once")
         try:
             with leave_at_once():
                 app.cli(prog="eslr")()
@@ -52,20 +56,3 @@ def main() -> None:
     except KeyboardInterrupt:
         say("eslr: interrupted")
         sys.exit(EXIT_CODE)
-
-
-def _show_warning(message, category, *_) -> None:
-    """Show a warning as one line on stderr."""
-    say(str(message))
-
-
-def _refuse_repetition(arguments: list[str]) -> None:
-    """Refuse an option that is given twice: the second value would silently replace the first.
-
-    Raises:
-        ConfigError: Names the option.
-    """
-    options = [text.partition("=")[0] for text in arguments if text.startswith("--")]
-    for option in options:
-        if options.count(option) > 1 and arguments[0] not in _REPEATABLE.get(option, ()):
-            raise ConfigError(f"{option} is given twice; give it once")

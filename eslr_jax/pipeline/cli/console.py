@@ -127,20 +127,19 @@ def leave_at_once() -> Iterator[None]:
 
 
 def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
-    """Print what a person wants to know of a trajectory first: words, then figures.
+    """Print what a person wants to know of a trajectory first: words, then figures, `more` of them last.
 
-    Args:
-        report: Of `trajectory_report`, and of `wear_report` where the body is known, see `describe_report`.
-        more: Other figures by name; they come last.
+    The report is that of `trajectory_report`, and of `wear_report` where the body is known, see
+    `describe_report`.
     """
-    from eslr_jax.pipeline.report.words import describe_report
+    from eslr_jax.pipeline.report.report import describe_report
 
     if "slide_m" in report:  # else the body is not known whole
         words = describe_report(report)
-        for text in words.good:
-            _print_word("good", "green", text)
-        for text in words.warnings:
-            _print_word("warning", "yellow", text)
+        for word, color, texts in (("good", "green", words.good), ("warning", "yellow", words.warnings)):
+            for text in texts:
+                line = Text.assemble((f"{word}: ", f"bold {color}"), (text, color))
+                Console().print(line, soft_wrap=True)
     terms = ", ".join(f"{name} {value:.4f}" for name, value in report["terms"].items() if value)
     rows = {
         "frames": f"{report['num_frames']} of {report['num_vertices']} vertices",
@@ -156,30 +155,19 @@ def print_report(report: dict[str, Any], more: dict[str, str]) -> None:
     for label, text in (rows | more).items():
         table.add_row(label, text)
     Console().print(table, markup=False, highlight=False)
-    if report["garments"]:
-        Console().print(_garment_table(report["garments"]), markup=False, highlight=False)
-
-
-def _garment_table(garments: dict[str, dict[str, Any]]) -> Table:
-    """Return stretch, penetration and, where they are counted, intersections of the garments of an outfit."""
-    formats: dict[str, tuple[str, Callable[[Any], str]]] = {
-        "num_vertices": ("vertices", str),
-        "p99_principal_stretch": ("stretch", "{:.3f}".format),
-        "max_principal_stretch": ("at most", "{:.3f}".format),
-        "penetration_max_mm": ("inside [mm]", "{:.2f}".format),
-        "penetrating_share": ("share", "{:.2%}".format),
-        "intersections_cloth": ("pairs", str),
-        "intersections_body": ("with the body", str),
-    }
-    measured = next(iter(garments.values()))
-    shown = {name: entry for name, entry in formats.items() if measured.get(name) is not None}
-    table = Table("garment", *(title for title, _ in shown.values()), box=None)
-    for name, row in garments.items():
-        table.add_row(name, *(write(row[key]) for key, (_, write) in shown.items()))
-    return table
-
-
-def _print_word(word: str, color: str, text: str) -> None:
-    """Print a line on stdout that begins with a word, which has a colour on a terminal."""
-    line = Text.assemble((f"{word}: ", f"bold {color}"), (text, color))
-    Console().print(line, soft_wrap=True)
+    if garments := report["garments"]:
+        formats: dict[str, tuple[str, Callable[[Any], str]]] = {
+            "num_vertices": ("vertices", str),
+            "p99_principal_stretch": ("stretch", "{:.3f}".format),
+            "max_principal_stretch": ("at most", "{:.3f}".format),
+            "penetration_max_mm": ("inside [mm]", "{:.2f}".format),
+            "penetrating_share": ("share", "{:.2%}".format),
+            "intersections_cloth": ("pairs", str),
+            "intersections_body": ("with the body", str),
+        }
+        measured = next(iter(garments.values()))
+        shown = {name: entry for name, entry in formats.items() if measured.get(name) is not None}
+        table = Table("garment", *(title for title, _ in shown.values()), box=None)
+        for name, row in garments.items():
+            table.add_row(name, *(write(row[key]) for key, (_, write) in shown.items()))
+        Console().print(table, markup=False, highlight=False)

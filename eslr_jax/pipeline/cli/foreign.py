@@ -57,9 +57,19 @@ class Fit:
         from eslr_jax.pipeline.assets import prepare_stored
         from eslr_jax.pipeline.dressing.report import describe_fit, describe_transfer
         from eslr_jax.pipeline.fabrics import garment_material
-        from eslr_jax.pipeline.formats.garment import write_garment_npz
+        from eslr_jax.pipeline.formats.garment import is_garment_file, write_garment_npz
 
-        self._check_files()
+        garment, out = self.garment, self.out
+        if out.suffix != ".npz":
+            raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
+        if Path(garment).is_file() and is_garment_file(garment):
+            raise AssetError(
+                f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh that it was "
+                "fitted from"
+            )
+        for given in (garment, self.body, self.made_for):
+            if given is not None and Path(given).is_file() and Path(given).resolve() == out.resolve():
+                raise AssetError(f"--out {out} is a file that is read, which would be lost; name another")
         use_compile_cache()
         with waiting("fitting"):
             rig = load_wearer(self.body, units=self.body_units, betas=self.betas)
@@ -86,22 +96,6 @@ class Fit:
             print(self.out)
             if has_picture:
                 print(drawn)
-
-    def _check_files(self) -> None:
-        """Raise unless the garment can be fitted, and the output written without a loss."""
-        from eslr_jax.pipeline.formats.garment import is_garment_file
-
-        garment, out = self.garment, self.out
-        if out.suffix != ".npz":
-            raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
-        if Path(garment).is_file() and is_garment_file(garment):
-            raise AssetError(
-                f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh that it was "
-                "fitted from"
-            )
-        for given in (garment, self.body, self.made_for):
-            if given is not None and Path(given).is_file() and Path(given).resolve() == out.resolve():
-                raise AssetError(f"--out {out} is a file that is read, which would be lost; name another")
 
     def _fitted(self, rig: Body) -> GarmentFile:
         """Return the garment, fitted to the body or carried to it from the one that it was made for."""

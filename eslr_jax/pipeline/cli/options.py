@@ -120,26 +120,16 @@ class Options:
 
 
 def refuse_given(reason: str, options: dict[str, bool]) -> None:
-    """Raise a ConfigError if an option is given that would do nothing.
-
-    Args:
-        reason: Why it would do nothing.
-        options: Whether each of them is given.
-    """
+    """Raise a ConfigError if an option is given that would do nothing, for a reason."""
     if given := [option for option, is_given in options.items() if is_given]:
         raise ConfigError(f"{reason}; leave out {', '.join(given)}")
 
 
 def parse_seconds(text: str, fps: float, *, option: str) -> float:
-    """Return a moment's time [s].
-
-    Args:
-        text: A frame, such as 375, or a time with its unit, such as 12.5s.
-        fps: Frames per second that frames are counted at.
-        option: What messages call the option.
+    """Return a moment's time [s], given as a frame, such as 375, or as a time with its unit, such as 12.5s.
 
     Raises:
-        ConfigError: The text is neither.
+        ConfigError: The text is neither; the message names the option.
     """
     try:
         seconds = float(text[:-1]) if text.endswith("s") else int(text) / fps

@@ -140,7 +140,14 @@ class Render:
         from eslr_jax.pipeline.report.run import read_run
 
         is_film = self.out.suffix.lower() == ".mp4"
-        self._check(is_film)
+        if not is_film and self.out.suffix.lower() != ".png":
+            raise AssetError(f"--out {self.out}: give a film, .mp4, or a picture, .png")
+        for name in ("frames", "width", "samples"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"--{name} {value}: give 1 or more")
+        if self.at is not None and (is_film or self.frames is not None):
+            raise ConfigError("--at is one picture: give a .png, and no --frames")
         content = read_run(self.run)
         trajectory = content.trajectory
         colors, bar = None, None
@@ -186,17 +193,6 @@ class Render:
                 sheet = contact_sheet(*meshes, timestep=trajectory.timestep, on_picture=advance, **look)
             write_png(self.out, finish(sheet))
         print(self.out)
-
-    def _check(self, is_film: bool) -> None:
-        """Check what needs no run."""
-        if not is_film and self.out.suffix.lower() != ".png":
-            raise AssetError(f"--out {self.out}: give a film, .mp4, or a picture, .png")
-        for name in ("frames", "width", "samples"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"--{name} {value}: give 1 or more")
-        if self.at is not None and (is_film or self.frames is not None):
-            raise ConfigError("--at is one picture: give a .png, and no --frames")
 
 
 def _frame_at(moment: str, trajectory: TrajectoryFile) -> int:

@@ -136,12 +136,7 @@ def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
 
 
 def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
-    """Return the options of an interrupted simulation, what is simulated, and the frames that are done.
-
-    Raises:
-        AssetError: The folder holds no interrupted simulation.
-        ConfigError: An option is given that is not the simulation's own.
-    """
+    """Return the options of an interrupted simulation, what is simulated, and the frames that are done."""
     from eslr_jax.pipeline.formats.garment import read_garment_npz
     from eslr_jax.simulation.archive import read_tree
 
@@ -240,8 +235,7 @@ def _announce(options: Options, setting: _Setting) -> None:
     """Say what a person wants to know before the simulation begins."""
     from eslr_jax.pipeline.dressing.report import LARGE, describe_fit, describe_transfer
     from eslr_jax.pipeline.fabrics import beyond_training
-    from eslr_jax.pipeline.report.report import start_crossing
-    from eslr_jax.pipeline.report.words import describe_start
+    from eslr_jax.pipeline.report.report import describe_start, start_crossing
     from eslr_jax.pose.timing import begins_at_rest
 
     method, stored, scene = setting.method, setting.stored, setting.scene
@@ -267,13 +261,7 @@ def _announce(options: Options, setting: _Setting) -> None:
 
 
 def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simulation:
-    """Compile and simulate with progress; Ctrl-C ends it after the frames in work.
-
-    Args:
-        setting: What is simulated, and how.
-        done: First frames of the scene, simulated before.
-        stop: Takes Ctrl-C over once the first frames are done.
-    """
+    """Compile and simulate with progress; Ctrl-C ends it after the frames in work."""
     import jax
 
     from eslr_jax.pipeline.report.metrics import measure_frames

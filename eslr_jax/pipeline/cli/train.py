@@ -101,11 +101,7 @@ class Train:
                 print(folder / "model.npz")
 
     def _configuration(self, out: Path) -> TrainConfig:
-        """Return the configuration of the recipe, or that of the run which goes on.
-
-        Raises:
-            ConfigError: There is none, or options contradict each other.
-        """
+        """Return the configuration of the recipe, or that of the run which goes on."""
         from eslr_jax.training.checkpoint import read_run_config
         from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config
 
@@ -127,11 +123,7 @@ class Train:
         return load_recipe(self.config, changes)
 
     def _join_processes(self, coordinator: str) -> None:
-        """Connect with the other processes of a training run.
-
-        Raises:
-            ConfigError: The processes are not all told, or do not answer.
-        """
+        """Connect with the other processes of a training run."""
         import jax
 
         is_automatic = coordinator == "auto"
@@ -177,11 +169,7 @@ def _show_keys() -> None:
 
 @contextlib.contextmanager
 def _training_progress(total: int, tensorboard: Path | None) -> Iterator[Any]:
-    """Show steps per second, the loss, its terms and the time left.
-
-    Raises:
-        MissingExtraError: TensorBoard's event files are asked for and its writer is not installed.
-    """
+    """Show steps per second, the loss, its terms and the time left."""
     open_events = None
     if tensorboard is not None:
         board = require("tensorboardX", extra="tensorboard", purpose="--tensorboard")

@@ -103,9 +103,8 @@ def lay_to_rest(
 ]:
     """Return a garment in the body's rest pose, given it on the body in another pose [m].
 
-    Returns:
-        Rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,
-        which is done in both poses unless `is_pushed` is false.
+    That is rest positions [m], skin weights and their joints, and what was inside the posed body; see `push_out`,
+    which is done in both poses unless `is_pushed` is false.
     """
     clear, penetration = push_out(placed, faces, posture) if is_pushed else (placed, {})
     is_loose = np.quantile(posture.heights(clear), 0.9) > _LOOSE

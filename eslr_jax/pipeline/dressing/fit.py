@@ -14,7 +14,7 @@ from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.pins import choose_pins
 from eslr_jax.pipeline.dressing.placement import find_placement
-from eslr_jax.pipeline.dressing.postures import Posture, arm_postures, rest_posture
+from eslr_jax.pipeline.dressing.postures import arm_postures, rest_posture
 from eslr_jax.pipeline.dressing.remesh import remesh
 from eslr_jax.pipeline.dressing.repair import (
     Cleaned,
@@ -79,7 +79,14 @@ def fit_garment(
     )
     posture = postures[placement.posture]
     clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
-    is_turned = _turned_faces(clean, posture)
+    # Faces are turned that disagree with neighbours, and parts that face the body.
+    turn = consistent_orientation(clean.positions, clean.faces)
+    crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
+    _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
+    outward = np.einsum("fx,fx->f", crosses, posture.normals[posture.touchable[nearest]])
+    _, component = vertex_components(clean.faces, len(clean.positions))
+    owner = component[clean.faces[:, 0]]
+    is_turned = turn ^ (np.bincount(owner, weights=outward) < 0)[owner]
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
 
@@ -190,17 +197,6 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]
     left = vertex_components(step.faces, len(step.positions))[0]
     joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])
     return joined, {"components_left": left}
-
-
-def _turned_faces(clean: Cleaned, posture: Posture) -> np.ndarray:
-    """Return a mask of the faces to turn: those that disagree with neighbours, and parts that face the body."""
-    turn = consistent_orientation(clean.positions, clean.faces)
-    crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
-    _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
-    outward = np.einsum("fx,fx->f", crosses, posture.normals[posture.touchable[nearest]])
-    _, component = vertex_components(clean.faces, len(clean.positions))
-    owner = component[clean.faces[:, 0]]
-    return turn ^ (np.bincount(owner, weights=outward) < 0)[owner]
 
 
 def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:

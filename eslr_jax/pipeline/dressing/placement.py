@@ -95,17 +95,11 @@ def find_placement(
     """Return the unit, axes, place and posture in which a garment fits the body best.
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
-    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The
-    confidence compares the best placement with the next best one that differs from it.
-
-    Args:
-        positions: Vertex positions as the file has them.
-        faces: Triangles of a welded mesh.
-        postures: The body in the poses that the garment may have been modelled on; the rest pose first.
-        options: Unit, axes and whether the place is kept, where they are known.
-        is_metric: The file's format prescribes metres and Y up, which hold unless others are given.
-        facing: Direction that the body faces; +Z if not given. The nearest axis is taken.
-        name: Name of the garment in messages.
+    costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
+    compares the best placement with the next best one that differs from it. Postures are those that the garment
+    may have been modelled on, the rest pose first. Options tell what is known of unit, axes and place. A file
+    that `is_metric` has metres and Y up, unless others are given. The body faces +Z or the axis nearest to
+    `facing`.
 
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where
@@ -125,7 +119,12 @@ def find_placement(
         )
     ]
     sample = sample_garment(positions, faces)
-    known = _known_candidates(sample, orientations, postures, stays=keep_place)
+    known = []  # every orientation at the known origins, in every posture
+    for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
+        # A garment that stays is not moved by the little that the soles of a body miss height 0.
+        floors = [at for at in posture.stands if not keep_place or np.linalg.norm(at) > _SOLES]
+        for at, origin in [*((at, "floor") for at in floors), (np.zeros(3), "body")]:
+            known.append(_scored(start, sample, postures, posture=k, translation=at, origin=origin))
     best, rival = _choose(known, sample, postures)
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
@@ -151,21 +150,6 @@ def find_placement(
     if units == "auto":
         warnings += _scale_warning(best, sample, postures)
     return dataclasses.replace(best, confidence=confidence, warnings=tuple(warnings))
-
-
-def _known_candidates(
-    sample: Sample, orientations: list[Placement], postures: list[Posture], *, stays: bool
-) -> list[Placement]:
-    """Return every orientation at the known origins, in every posture.
-
-    A garment that stays is not moved by the little that the soles of a body miss height 0.
-    """
-    found = []
-    for start, (k, posture) in itertools.product(orientations, enumerate(postures)):
-        floors = [at for at in posture.stands if not stays or np.linalg.norm(at) > _SOLES]
-        for at, origin in [*((at, "floor") for at in floors), (np.zeros(3), "body")]:
-            found.append(_scored(start, sample, postures, posture=k, translation=at, origin=origin))
-    return found
 
 
 def _scored(start: Placement, sample: Sample, postures: list[Posture], **changes) -> Placement:

@@ -160,14 +160,7 @@ def unpose(
     skin_indices: Int[np.ndarray, "vertices influences"],
     transforms: Float[np.ndarray, "joints 3 4"],
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m].
-
-    Args:
-        positions: Posed vertex positions [m].
-        skin_weights: Joint weights.
-        skin_indices: Joint of every weight.
-        transforms: Maps of the joints from the rest pose to the pose.
-    """
+    """Undo linear blend skinning: return the rest positions that blended maps take to posed positions [m]."""
     blended = _blend(skin_weights, skin_indices, transforms)
     return np.linalg.solve(blended[:, :, :3], (positions - blended[:, :, 3])[:, :, None])[:, :, 0]
 

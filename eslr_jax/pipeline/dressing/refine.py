@@ -22,12 +22,7 @@ class Refinement(NamedTuple):
 
 
 def refine(faces: Int[np.ndarray, "faces 3"], num_vertices: int, scheme: str) -> Refinement:
-    """Refine a triangle mesh several times.
-
-    Args:
-        faces: Oriented triangles of a manifold mesh, shape [faces, 3].
-        num_vertices: Number of vertices.
-        scheme: One letter per step: t triples the number of faces, q quadruples it.
+    """Refine an oriented manifold mesh by a scheme of letters: t triples the number of faces, q quadruples it.
 
     Source: t: Kobbelt 2000, doi 10.1145/344779.344835, with a boundary that stays; q: Loop 1987.
     """
@@ -66,12 +61,8 @@ def _smoothed(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return entries that move old vertices towards the mean of their neighbours.
 
-    Args:
-        edges: Shape [edges, 2].
-        is_boundary: Of every edge.
-        count: Vertices.
-        share_of: Share that an inner vertex of so many edges takes of the mean.
-        at_boundary: Share that a boundary vertex takes of its two neighbours along the boundary.
+    `share_of` has the share of the mean that an inner vertex of so many edges takes, `at_boundary` is that of a
+    boundary vertex, of its two neighbours along the boundary.
     """
     degree = np.bincount(edges.ravel(), minlength=count)
     on_boundary = np.zeros(count, bool)

@@ -52,7 +52,14 @@ def remesh(
             mesh = clustering.create_mesh().triangulate().clean()
             points, triangles = np.array(mesh.points, np.float64), np.array(mesh.regular_faces, np.int64)
             try:
-                triangles = _oriented(points, triangles, positions, faces)
+                # To the side that the source faces.
+                turn = consistent_orientation(points, triangles)
+                triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
+                nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
+                agreement = np.sum(
+                    face_cross_products(points, triangles) * face_cross_products(positions, faces)[nearest]
+                )
+                triangles = triangles if agreement > 0 else np.ascontiguousarray(triangles[:, ::-1])
                 points = _onto_open_edges(points, triangles, positions, faces)
                 validate_mesh(points, triangles, allow_components=True)
             except (MeshError, ValueError, KeyError) as error:
@@ -62,19 +69,6 @@ def remesh(
     raise MeshError(
         f"no clean mesh with edges of {edge_length:g} m was found ({cause}); choose another length"
     )
-
-
-def _oriented(
-    points: np.ndarray, triangles: np.ndarray, positions: np.ndarray, faces: np.ndarray
-) -> np.ndarray:
-    """Turn triangles to the side that the source faces."""
-    turn = consistent_orientation(points, triangles)
-    triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
-    nearest, _ = closest_points(points[triangles].mean(axis=1), positions, faces)
-    agreement = np.sum(
-        face_cross_products(points, triangles) * face_cross_products(positions, faces)[nearest]
-    )
-    return triangles if agreement > 0 else np.ascontiguousarray(triangles[:, ::-1])
 
 
 def _onto_open_edges(

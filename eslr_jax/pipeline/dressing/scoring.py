@@ -46,7 +46,16 @@ def sample_garment(positions: Float[np.ndarray, "vertices 3"], faces: Int[np.nda
     for loop in map(positions.__getitem__, loops if len(loops) > 1 else []):
         center = np.broadcast_to(loop.mean(axis=0), loop.shape)
         fans.append(np.stack([loop, np.roll(loop, -1, axis=0), center], axis=1))
-    return Sample(positions[points], _coarse_corners(positions, faces), np.concatenate(fans))
+    sampled = positions[points]
+    if len(faces) > _COARSE_FACES:  # vertices are merged by cells of a grid
+        size = 1.5 * np.sqrt(face_areas(positions, faces).sum() / _COARSE_FACES)
+        cells = np.floor((positions - positions.min(axis=0)) / size).astype(np.int64)
+        _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        cell = cell.ravel()
+        sums = [np.bincount(cell, positions[:, axis]) for axis in range(3)]
+        positions, faces = np.stack(sums, axis=1) / counts[:, None], cell[faces]
+        faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
+    return Sample(sampled, positions[faces], np.concatenate(fans))
 
 
 def fit_cost(points: Float[np.ndarray, "points 3"], posture: Posture) -> float:
@@ -104,16 +113,3 @@ def _crosses(segments: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _inside(heights: np.ndarray) -> np.ndarray:
     """Return the cost of every point's depth."""
     return np.clip(-heights, 0.0, _MAX_INSIDE) / _INSIDE
-
-
-def _coarse_corners(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the corners of all faces, after merging vertices by cells of a grid if there are many."""
-    if len(faces) > _COARSE_FACES:
-        size = 1.5 * np.sqrt(face_areas(positions, faces).sum() / _COARSE_FACES)
-        cells = np.floor((positions - positions.min(axis=0)) / size).astype(np.int64)
-        _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        cell = cell.ravel()
-        sums = [np.bincount(cell, positions[:, axis]) for axis in range(3)]
-        positions, faces = np.stack(sums, axis=1) / counts[:, None], cell[faces]
-        faces = faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)]
-    return positions[faces]

@@ -72,55 +72,47 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     if not meshes:
         raise MeshError("no mesh to write; give at least one")
     for mesh in meshes:
-        _check_mesh(mesh)
+        what, remedy = f"mesh {mesh.name}", "simulate it again"
+        arrays = {
+            key: np.asarray(value)
+            for key, value in vars(mesh).items()
+            if key in _LAYOUT and value is not None
+        }
+        if mesh.skin is not None:
+            arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
+        check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
+        if 0 in arrays["positions"].shape or not len(arrays["faces"]):
+            raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+        is_finite = np.isfinite(arrays["positions"]).all((1, 2))
+        if not is_finite.all():
+            raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+        if mesh.skin is None:
+            continue
+        if mesh.rest_positions is None:
+            raise MeshError(f"{what} has a skin and no rest positions; give both")
+        weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
+        if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
+            raise MeshError(
+                f"{what} has skin weights that are negative or don't sum to one; normalise them first"
+            )
+        matrices = transforms[..., :3]
+        gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
+        is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
+        is_rigid &= np.isfinite(transforms).all((2, 3))
+        if not is_rigid.all():
+            frame, joint = np.argwhere(~is_rigid)[0]
+            raise MotionError(
+                f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
+            )
     frames = {mesh.name: len(mesh.positions) for mesh in meshes}
     if len(set(frames.values())) > 1:
         raise MotionError(f"meshes need the same number of frames, these have {frames}")
 
 
-def _check_mesh(mesh: AnimatedMesh) -> None:
-    """Raise unless a mesh is finite, its parts and its joints fit each other, and these move rigidly."""
-    what, remedy = f"mesh {mesh.name}", "simulate it again"
-    arrays = {
-        key: np.asarray(value) for key, value in vars(mesh).items() if key in _LAYOUT and value is not None
-    }
-    if mesh.skin is not None:
-        arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
-    check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
-    if 0 in arrays["positions"].shape or not len(arrays["faces"]):
-        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
-    is_finite = np.isfinite(arrays["positions"]).all((1, 2))
-    if not is_finite.all():
-        raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
-    if mesh.skin is None:
-        return
-    if mesh.rest_positions is None:
-        raise MeshError(f"{what} has a skin and no rest positions; give both")
-    weights, transforms = arrays["skin_weights"], arrays["joint_transforms"]
-    if weights.min() < 0 or not np.allclose(weights.sum(1), 1, atol=1e-3):
-        raise MeshError(
-            f"{what} has skin weights that are negative or don't sum to one; normalise them first"
-        )
-    matrices = transforms[..., :3]
-    gram = np.einsum("tjab,tjac->tjbc", matrices, matrices)
-    is_rigid = (np.abs(gram - np.eye(3)) < _RIGID_TOLERANCE).all((2, 3)) & (np.linalg.det(matrices) > 0)
-    is_rigid &= np.isfinite(transforms).all((2, 3))
-    if not is_rigid.all():
-        frame, joint = np.argwhere(~is_rigid)[0]
-        raise MotionError(
-            f"{what}: joint {joint} is not rotated rigidly in frame {frame}; leave out its skin"
-        )
-
-
 def split_seams(
     faces: np.ndarray, num_vertices: int, corner_uvs: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Give each vertex one texture coordinate by splitting the vertices on seams.
-
-    Args:
-        faces: Triangles, shape [faces, 3].
-        num_vertices: Number of vertices.
-        corner_uvs: Texture coordinate of every corner, shape [faces, 3, 2]; None splits nothing.
+    """Give each vertex one texture coordinate by splitting the vertices on seams, if there are `corner_uvs`.
 
     Returns:
         Faces; the old vertex of each new one, where old vertices come first and in order; and texture coordinates
@@ -147,11 +139,7 @@ def split_seams(
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the area-weighted face normals around each vertex.
-
-    Args:
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, counter-clockwise seen from outside, shape [faces, 3].
+    """Average the area-weighted face normals around each vertex; faces are counter-clockwise seen from outside.
 
     Returns:
         Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
@@ -173,11 +161,7 @@ def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray,
     """Find few shapes whose weighted sums are the offsets of every frame (principal component analysis).
 
     A shape is `basis.T @ offsets`, and `basis[t]` holds its weight in frame t. Other values per frame, such as
-    normals, may be projected on the same basis.
-
-    Args:
-        offsets: Offsets of the vertices [m], shape [frames, vertices, 3].
-        tolerance: Largest error of any vertex in any frame [m].
+    normals, may be projected on the same basis. No vertex is off by more than the tolerance [m] in any frame.
 
     Returns:
         Basis [frames, shapes] with orthonormal columns, and the shapes [shapes, vertices, 3] [m].
@@ -230,16 +214,10 @@ def local_motion(skin: Skin) -> tuple[np.ndarray, np.ndarray]:
 
 
 def corrections(skin: Skin, rest: np.ndarray, positions: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Return what to add to the rest vertices so that the joints move them to given positions.
-
-    Args:
-        skin: The skin.
-        rest: Vertex positions at rest [m], shape [vertices, 3].
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        tolerance: Distance that needs no correction [m].
+    """Return what to add to the rest vertices so that the joints move them to given positions [m].
 
     Returns:
-        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance.
+        Offsets [m], shape [frames, vertices, 3], float32; None where the joints alone keep the tolerance [m].
     """
     weights, indices = influences(skin)
     rows = np.repeat(np.arange(len(rest)), weights.shape[1])
@@ -270,13 +248,8 @@ def write_frames(
 ) -> None:
     """Write one file per frame into a new folder, which appears when it is complete.
 
-    Names sort alphabetically in the order of the frames.
-
-    Args:
-        folder: Path of the folder, which must be empty or not exist.
-        mesh: The mesh in motion.
-        suffix: Of the files.
-        content: From the positions of a frame, [vertices, 3] in float32, to the bytes of its file.
+    Names sort alphabetically in the order of the frames. `content` makes the bytes of a file of a frame's
+    positions, [vertices, 3] in float32.
     """
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):

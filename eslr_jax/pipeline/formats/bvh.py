@@ -42,7 +42,24 @@ def read_bvh(path: Path, _clip: str = "") -> SkeletonMotion:
     values, frame_time = _read_frames(words, sum(len(joint.channels) for joint in joints))
     if not 1e-3 <= frame_time <= 1.0:
         raise MotionError(f"{path}: a frame time of {frame_time:g} s; expected 0.001 to 1")
-    return _pose(path.stem, joints, values, whole_rate(1.0 / frame_time))
+    fps = whole_rate(1.0 / frame_time)
+    rest = np.array([joint.offset for joint in joints])
+    local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
+    offsets = np.tile(rest, (len(values), 1, 1))
+    columns = iter(values.T)
+    for index, joint in enumerate(joints):
+        angles, axes = [], ""
+        for channel in joint.channels:
+            if channel.endswith("position"):
+                # A position replaces the offset: that is what exporters write and importers expect.
+                offsets[:, index, "XYZ".index(channel[0])] = next(columns)
+            else:
+                angles.append(np.remainder(next(columns) + 180.0, 360.0) - 180.0)
+                axes += channel[0]
+        if axes:
+            local[:, index] = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix()
+    names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
+    return pose_offsets(path.stem, names, parents, rest, local, offsets, fps)
 
 
 class _Words:
@@ -155,24 +172,3 @@ def _read_frames(words: _Words, num_channels: int) -> tuple[np.ndarray, float]:
     if is_bad.any():
         raise words.fail(f"frame {np.argmax(is_bad)} is not finite")
     return values, frame_time
-
-
-def _pose(name: str, joints: list[_Joint], values: np.ndarray, fps: float) -> SkeletonMotion:
-    """Return the motion that the values of the channels tell."""
-    rest = np.array([joint.offset for joint in joints])
-    local = np.tile(np.eye(3), (len(values), len(joints), 1, 1))
-    offsets = np.tile(rest, (len(values), 1, 1))
-    columns = iter(values.T)
-    for index, joint in enumerate(joints):
-        angles, axes = [], ""
-        for channel in joint.channels:
-            if channel.endswith("position"):
-                # A position replaces the offset: that is what exporters write and importers expect.
-                offsets[:, index, "XYZ".index(channel[0])] = next(columns)
-            else:
-                angles.append(np.remainder(next(columns) + 180.0, 360.0) - 180.0)
-                axes += channel[0]
-        if axes:
-            local[:, index] = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix()
-    names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
-    return pose_offsets(name, names, parents, rest, local, offsets, fps)

@@ -66,7 +66,19 @@ def export_trajectory(
         raise AssetError("this run has no body; export the garment")
     if garment is not None and content != "body":
         if kind == "scene" and len(garment.outfit) > 1:
-            meshes[:1] = _garments(both["garment"], garment.outfit)
+            cloth = both["garment"]
+            uvs = cloth.corner_uvs  # zeros are none
+            meshes[:1] = [
+                AnimatedMesh(
+                    name,
+                    cloth.positions[:, rows],
+                    cloth.faces[is_own] - rows.start,
+                    garment_color(number),
+                    corner_uvs=None if uvs is None or not uvs[is_own].any() else uvs[is_own],
+                    velocities=None if cloth.velocities is None else cloth.velocities[:, rows],
+                )
+                for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, garment.outfit))
+            ]
         if kind == "point cache":
             _warn_of_order(garment)
     write(path, meshes, run.timestep)
@@ -74,11 +86,7 @@ def export_trajectory(
 
 
 def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, AnimatedMesh]:
-    """Return the garment in the vertex order of its file, and the body if there is one.
-
-    Raises:
-        AssetError: The garment is not the one that was simulated.
-    """
+    """Return the garment in the vertex order of its file, and the body if there is one."""
     faces, uvs, places = run.faces, None, np.arange(run.positions.shape[1])
     if garment is not None:
         if not np.array_equal(garment.faces, faces):
@@ -124,19 +132,3 @@ def _warn_of_order(garment: GarmentFile) -> None:
             "keeps the order of the file, and lays each of them on the next vertex that was kept",
             stacklevel=3,
         )
-
-
-def _garments(cloth: AnimatedMesh, outfit: dict[str, int]) -> list[AnimatedMesh]:
-    """Return the garments of an outfit as a mesh each, in a colour each; zeros are no texture coordinates."""
-    uvs = cloth.corner_uvs
-    return [
-        AnimatedMesh(
-            name,
-            cloth.positions[:, rows],
-            cloth.faces[is_own] - rows.start,
-            garment_color(number),
-            corner_uvs=None if uvs is None or not uvs[is_own].any() else uvs[is_own],
-            velocities=None if cloth.velocities is None else cloth.velocities[:, rows],
-        )
-        for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, outfit))
-    ]

@@ -183,10 +183,6 @@ def in_vertex_order(sequence: MeshSequence, garment: GarmentFile) -> Float[np.nd
     format has joined or split the vertices of a seam. It need not have the same faces, as long as most edges are
     the same.
 
-    Args:
-        sequence: The garment in motion.
-        garment: The garment.
-
     Raises:
         MeshError: The sequence has other vertices, or another order.
     """

@@ -72,7 +72,16 @@ def _add_mesh(builder: _Builder, mesh: AnimatedMesh, timestep: float) -> None:
         attributes.TEXCOORD_0 = builder.add_vertices(flipped.astype(np.float32), gltf.VEC2)
     skin = None
     if mesh.skin is not None:
-        _add_influences(builder, attributes, mesh.skin, vertices)
+        weights, indices = (array[vertices] for array in influences(mesh.skin))
+        padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
+        dtype = np.uint8 if len(mesh.skin.parents) <= np.iinfo(np.uint8).max else np.uint16
+        for name, values in (
+            ("JOINTS", np.pad(indices, padding).astype(dtype)),
+            ("WEIGHTS", np.pad(weights, padding).astype(np.float32)),
+        ):
+            for number in range(values.shape[1] // _INFLUENCES_PER_SET):
+                part = values[:, number * _INFLUENCES_PER_SET : (number + 1) * _INFLUENCES_PER_SET]
+                setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
         skin = _add_skin(builder, mesh.name, mesh.skin, timestep)
     targets, weights = _add_targets(builder, base, offsets, faces, vertices)
     primitive = gltf.Primitive(
@@ -100,8 +109,7 @@ def _add_targets(
 ) -> tuple[list[gltf.Attributes], np.ndarray]:
     """Add the principal shapes of offsets [frames, vertices, 3] and of the normals that go with them.
 
-    Returns:
-        The targets, and their weights [frames, targets], which are at most one: Blender's sliders end at ten.
+    Return the targets, and weights [frames, targets] of at most one: Blender's sliders end at ten.
     """
     if not offsets.size:
         return [], np.zeros((len(offsets), 0), np.float32)
@@ -129,20 +137,6 @@ def _add_targets(
             )
         )
     return targets, (basis / largest).astype(np.float32)
-
-
-def _add_influences(builder: _Builder, attributes: gltf.Attributes, skin: Skin, vertices: np.ndarray) -> None:
-    """Add skin weights in as many sets of four as it takes to keep them all."""
-    weights, indices = (array[vertices] for array in influences(skin))
-    padding = ((0, 0), (0, -weights.shape[1] % _INFLUENCES_PER_SET))
-    dtype = np.uint8 if len(skin.parents) <= np.iinfo(np.uint8).max else np.uint16
-    for name, values in (
-        ("JOINTS", np.pad(indices, padding).astype(dtype)),
-        ("WEIGHTS", np.pad(weights, padding).astype(np.float32)),
-    ):
-        for number in range(values.shape[1] // _INFLUENCES_PER_SET):
-            part = values[:, number * _INFLUENCES_PER_SET : (number + 1) * _INFLUENCES_PER_SET]
-            setattr(attributes, f"{name}_{number}", builder.add_vertices(part, gltf.VEC4))
 
 
 def _add_skin(builder: _Builder, name: str, skin: Skin, timestep: float) -> int:

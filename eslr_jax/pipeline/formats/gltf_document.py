@@ -48,7 +48,20 @@ class GltfDocument:
         data = path.read_bytes()
         self._blob: bytes | None = None
         if data[:4] == struct.pack("<I", _MAGIC):
-            data = self._split(data)
+            version, _ = struct.unpack_from("<II", data, 4)  # of a GLB: a JSON chunk, and a binary one
+            if version != 2:
+                raise self.fail(f"is glTF {version}, not 2")
+            chunks: dict[int, bytes] = {}
+            offset = 12
+            while offset + 8 <= len(data):
+                length, kind = struct.unpack_from("<II", data, offset)
+                chunk = data[offset + 8 : offset + 8 + length]
+                if len(chunk) < length:
+                    raise self.fail("is truncated")
+                chunks.setdefault(kind, chunk)
+                offset += 8 + length
+            self._blob = chunks.get(_BIN)
+            data = chunks.get(_JSON, b"")
         self.tables: dict[str, Any] = json.loads(data.decode("utf-8-sig"))
         if not isinstance(self.tables, dict) or not str(
             _table(self.tables.get("asset")).get("version")
@@ -59,23 +72,6 @@ class GltfDocument:
             raise AssetError(
                 f"{path} needs {', '.join(sorted(needed))}, which is not read; export it without compression"
             )
-
-    def _split(self, data: bytes) -> bytes:
-        """Return the JSON chunk of a GLB and keep the binary one."""
-        version, _ = struct.unpack_from("<II", data, 4)
-        if version != 2:
-            raise self.fail(f"is glTF {version}, not 2")
-        chunks: dict[int, bytes] = {}
-        offset = 12
-        while offset + 8 <= len(data):
-            length, kind = struct.unpack_from("<II", data, offset)
-            chunk = data[offset + 8 : offset + 8 + length]
-            if len(chunk) < length:
-                raise self.fail("is truncated")
-            chunks.setdefault(kind, chunk)
-            offset += 8 + length
-        self._blob = chunks.get(_BIN)
-        return chunks.get(_JSON, b"")
 
     def fail(self, cause: str) -> AssetError:
         """Return an error about this file."""
@@ -254,9 +250,7 @@ class GltfDocument:
     def world_matrices(self, animated: dict[tuple[int, str], np.ndarray], num_frames: int) -> np.ndarray:
         """Return the matrix from every node to the world, [frames, nodes, 4, 4].
 
-        Args:
-            animated: Values by node and path, shape [frames, 3 or 4]; other nodes are at rest.
-            num_frames: Number of frames.
+        `animated` has values by node and path, shape [frames, 3 or 4]; other nodes are at rest.
         """
         result = np.tile(np.eye(4), (num_frames, len(self.parents), 1, 1))
         nodes = self.items("nodes")
@@ -329,14 +323,11 @@ class GltfDocument:
 
 
 def sample_keys(path: str, kind: str, times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sample key frames at given times; before the first key and after the last one values are constant.
+    """Sample key frames at given times [s]; before the first key and after the last one values are constant.
 
-    Args:
-        path: "rotation" (quaternions x, y, z, w), "translation", "scale" or "weights".
-        kind: "LINEAR" (slerp for rotations), "STEP" or "CUBICSPLINE" (in-tangent, value, out-tangent per key).
-        times: Times of the keys [s], ascending.
-        values: Values of the keys, shape [keys, components], or [3 keys, components] for cubic splines.
-        at: Times of the samples [s]; the result has shape [samples, components].
+    `path` is "rotation" (quaternions x, y, z, w; by slerp where linear), "translation", "scale" or "weights".
+    `kind` is "LINEAR", "STEP" or "CUBICSPLINE", whose values are [3 keys, components]: in-tangent, value and
+    out-tangent of every key. Others are [keys, components], and the result is [samples, components].
 
     Source: glTF 2.0, appendix C.
     """

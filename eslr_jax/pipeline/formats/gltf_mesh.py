@@ -74,7 +74,19 @@ def read_gltf_sequences(path: Path, name: str = "", fps: float | None = None) ->
             f"{path}: no mesh{name and f' named {name!r}'} is moved by shapes; it has {known}; export the "
             "garment with its shape keys"
         )
-    _check_one_clip(document, chosen)
+    # Animations of other nodes, such as a character's, may be as many as they like.
+    carriers = set()
+    for node in chosen:
+        while node >= 0 and node not in carriers:
+            carriers.add(node)
+            node = document.parents[node]
+    clips = [
+        {key[:2] for key in document.key_frames(entry, (*MOVES, "weights")) if key[0] in carriers}
+        for entry in document.items("animations")
+    ]
+    clips = [keyed for keyed in clips if keyed]
+    if sum(map(len, clips)) > len(set().union(*clips)):
+        raise AssetError(f"{document.path} holds {len(clips)} clips; export one")
     at, rate = document.sample_times([shapes[node][3] for node in chosen], fps)
     moves = [key for entry in animations for key in document.key_frames(entry)]
     moved = {
@@ -89,25 +101,6 @@ def read_gltf_sequences(path: Path, name: str = "", fps: float | None = None) ->
         label = path.name if len(found) == 1 else f"{path.name}#{found[node]}"
         sequences.append(MeshSequence(label, positions, faces, rate, found[node]))
     return sequences
-
-
-def _check_one_clip(document: GltfDocument, nodes: list[int]) -> None:
-    """Raise an AssetError if several animations give a mesh, or what carries it, the same values.
-
-    Animations of other nodes, such as a character's, may be as many as they like.
-    """
-    carriers = set()
-    for node in nodes:
-        while node >= 0 and node not in carriers:
-            carriers.add(node)
-            node = document.parents[node]
-    clips = [
-        {key[:2] for key in document.key_frames(entry, (*MOVES, "weights")) if key[0] in carriers}
-        for entry in document.items("animations")
-    ]
-    clips = [keyed for keyed in clips if keyed]
-    if sum(map(len, clips)) > len(set().union(*clips)):
-        raise AssetError(f"{document.path} holds {len(clips)} clips; export one")
 
 
 def _moved_by_shapes(

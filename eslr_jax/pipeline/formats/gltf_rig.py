@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,12 +50,8 @@ def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
 def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
 
-    It has the shape that the file's weights of morph targets give it.
-
-    Args:
-        path: Path of a .gltf, .glb or .vrm file.
-        meshes: Names of the meshes, or of their nodes, that make up the body, as in "Skin,Hat"; "" is all that
-            are skinned.
+    It has the shape that the file's weights of morph targets give it. `meshes` names the meshes, or their nodes,
+    that make up the body, as in "Skin,Hat"; "" is all that are skinned.
     """
     document = GltfDocument(path)
     joints = _read_joints(document)
@@ -139,7 +134,21 @@ def _read_joints(document: GltfDocument) -> _Joints:
     frames: dict[int, np.ndarray] = {}
     spaces: dict[int, np.ndarray] = {}
     for number, skin in enumerate(skins):
-        nodes, bind = _read_skin(document, skin, number)
+        nodes = skin.get("joints", [])
+        if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
+            raise document.fail(f"has skin {number} without joints, or with one twice")
+        for node in nodes:
+            document.item("nodes", node)
+        bind = np.tile(np.eye(4), (len(nodes), 1, 1))
+        if "inverseBindMatrices" in skin:
+            values = document.array(skin["inverseBindMatrices"])
+            if values.shape[1:] != (16,) or len(values) < len(nodes):
+                raise document.fail(
+                    f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints"
+                )
+            bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
+        if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
+            raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
         user = users.get(number)
         spaces[number] = _bind_space(document, world, nodes, bind, user)
         rest = spaces[number] @ np.linalg.inv(bind)
@@ -159,24 +168,6 @@ def _read_joints(document: GltfDocument) -> _Joints:
     rest_frames = np.stack([frames[node] for node in nodes])
     skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest_frames[:, :3, 3])
     return _Joints(nodes, rest_frames, skeleton, spaces)
-
-
-def _read_skin(document: GltfDocument, skin: dict[str, Any], number: int) -> tuple[list[int], np.ndarray]:
-    """Return a skin's joint nodes and its inverse bind matrices [joints, 4, 4]."""
-    nodes = skin.get("joints", [])
-    if not isinstance(nodes, list) or not nodes or len(set(map(str, nodes))) != len(nodes):
-        raise document.fail(f"has skin {number} without joints, or with one twice")
-    for node in nodes:
-        document.item("nodes", node)
-    bind = np.tile(np.eye(4), (len(nodes), 1, 1))
-    if "inverseBindMatrices" in skin:
-        values = document.array(skin["inverseBindMatrices"])
-        if values.shape[1:] != (16,) or len(values) < len(nodes):
-            raise document.fail(f"has skin {number} with {len(values)} bind matrices for {len(nodes)} joints")
-        bind = values[: len(nodes)].reshape(-1, 4, 4).swapaxes(1, 2)
-    if not np.isfinite(bind).all() or (np.abs(np.linalg.det(bind)) < 1e-12).any():
-        raise document.fail(f"has skin {number} with a bind matrix that can't be inverted")
-    return nodes, bind
 
 
 def _bind_space(
@@ -222,28 +213,21 @@ def _read_node(
         points, faces = document.shaped_triangles(node, primitive)
         if np.linalg.det(space[:3, :3]) < 0:
             faces = faces[:, ::-1]
-        weights, local = _read_weights(document, attributes, len(points))
+        weights, followed = [], []
+        number = 0
+        while f"JOINTS_{number}" in attributes:
+            weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
+            followed.append(document.array(attributes[f"JOINTS_{number}"]))
+            if weights[-1].shape != (len(points), 4) or followed[-1].shape != (len(points), 4):
+                raise document.fail("has skin weights that don't fit its vertices")
+            number += 1
+        weight, chosen = np.concatenate(weights, axis=1), np.concatenate(followed, axis=1)
+        total = weight.sum(axis=1, keepdims=True)
+        if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
+            raise document.fail("has a vertex without skin weights")
+        weights, local = weight / total, np.where(weight > 0, chosen, 0.0)
         if local.max() >= len(order):
             raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
         world = points @ space[:3, :3].T + space[:3, 3]
         result.append((world, faces, weights, order[local.astype(np.int64)]))
     return result
-
-
-def _read_weights(
-    document: GltfDocument, attributes: dict[str, Any], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return all skin weights of a primitive, rows summing to one, and their joints, [vertices, influences]."""
-    weights, joints = [], []
-    number = 0
-    while f"JOINTS_{number}" in attributes:
-        weights.append(document.array(attributes.get(f"WEIGHTS_{number}")))
-        joints.append(document.array(attributes[f"JOINTS_{number}"]))
-        if weights[-1].shape != (count, 4) or joints[-1].shape != (count, 4):
-            raise document.fail("has skin weights that don't fit its vertices")
-        number += 1
-    weight, joint = np.concatenate(weights, axis=1), np.concatenate(joints, axis=1)
-    total = weight.sum(axis=1, keepdims=True)
-    if not np.isfinite(weight).all() or (weight < 0).any() or (total <= 0).any():
-        raise document.fail("has a vertex without skin weights")
-    return weight / total, np.where(weight > 0, joint, 0.0)

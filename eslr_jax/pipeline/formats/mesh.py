@@ -69,8 +69,7 @@ def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, 
 def shared_vertices(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find vertices at bit-identical positions, which exporters split where normals or textures differ.
 
-    Args:
-        positions: Vertex positions, shape [vertices, 3], or in several shapes, [vertices, shapes, 3].
+    Positions have the shape [vertices, 3] or, in several shapes, [vertices, shapes, 3].
 
     Returns:
         Indices of the vertices to keep, in their order, and the place of every vertex among them.

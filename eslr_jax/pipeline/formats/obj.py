@@ -125,14 +125,9 @@ def obj_text(
     uvs: np.ndarray | None = None,
     uv_faces: np.ndarray | None = None,
 ) -> str:
-    """Return the text of an OBJ file; nine digits keep float32 positions exactly.
+    """Return the text of an OBJ file; nine digits keep float32 positions [m] exactly.
 
-    Args:
-        name: Name of the object.
-        positions: Vertex positions [m], shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        uvs: Texture coordinates, shape [uvs, 2].
-        uv_faces: Row of `uvs` for each corner, shape [faces, 3].
+    `uv_faces` has the row of `uvs`, shape [uvs, 2], for each corner, shape [faces, 3].
     """
     lines = [f"o {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(positions, np.float64))]
     if uvs is not None and uv_faces is not None:

@@ -60,8 +60,8 @@ class _Reconstructor(_Stub):
 def make_stub(convert: Callable[[Any, _Plain], Any]) -> type:
     """Return a class of stubs for one global.
 
-    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does the same for
-    what the stub holds.
+    `convert` makes plain data of a stub, with its `arguments` and `state`; its second argument does so for what
+    they hold.
     """
     return type("_Stub", (_Stub,), {"__slots__": (), "convert": convert})
 
@@ -219,10 +219,8 @@ def unpickle(
 ) -> Any:
     """Return the content of a pickle as plain data, see `read_pickle`; for `parsing`: it raises anything.
 
-    Args:
-        data: The pickle.
-        stubs: Further globals that it may name, as `module.name`, each with its class of `make_stub`.
-        find_persistent: Returns the stub for a persistent id, where the pickle may refer to data outside of it.
+    `stubs` are further globals that it may name, as `module.name`, each with its class of `make_stub`. Where the
+    pickle may refer to data outside of it, `find_persistent` returns the stub for a persistent id.
     """
     puts = (
         argument - count

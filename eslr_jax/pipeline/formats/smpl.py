@@ -89,10 +89,8 @@ def _is_smpl_model(path: Path) -> bool:
 def read_smpl_body(path: Path, _meshes: str = "") -> RiggedMesh:
     """Read the mean body of a model in the layout of SMPL, with its shape and pose blend shapes.
 
-    Args:
-        path: Path of an .npz or .pkl with v_template, f, weights, J_regressor, kintree_table, and optionally
-            shapedirs, posedirs and joint_names. A model with other than 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X)
-            joints needs joint_names.
+    It has v_template, f, weights, J_regressor, kintree_table, and optionally shapedirs, posedirs and
+    joint_names. A model with other than 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints needs joint_names.
     """
     if path.suffix.lower() == ".pkl":
         values = read_pickle(path, content="body")

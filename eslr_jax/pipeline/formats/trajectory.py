@@ -82,10 +82,6 @@ class TrajectoryFile:
 def write_trajectory(path: str | Path, trajectory: TrajectoryFile) -> None:
     """Write a trajectory, atomically.
 
-    Args:
-        path: Path of the file, usually `*.npz`.
-        trajectory: What to write.
-
     Raises:
         AssetError: The arrays disagree, the metadata is no JSON, or the file can't be written.
     """
@@ -124,12 +120,6 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
 
 def read_trajectory(path: str | Path) -> TrajectoryFile:
     """Read what `write_trajectory` wrote.
-
-    Args:
-        path: Path of the file.
-
-    Returns:
-        The trajectory.
 
     Raises:
         AssetError: The file is missing, truncated, damaged, or no trajectory.

@@ -114,11 +114,8 @@ class Live:
 def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int = 8080) -> Live:
     """Serve a page on which cloth moves while it is simulated; `run_live` simulates.
 
-    Args:
-        choice: What is on stage first.
-        out: Folder that recordings are written to, in the folders 1, 2, and so on.
-        host: Address to listen on; only this machine by default.
-        port: Port, or the next free one.
+    A choice is on stage first. Recordings are written to `out`, in the folders 1, 2, and so on. By default only
+    this machine sees the page, at a port or the next free one.
 
     Raises:
         AssetError: There is no such body.
@@ -152,13 +149,7 @@ def open_live(choice: Choice, *, out: Path, host: str = "127.0.0.1", port: int =
 def run_live(
     live: Live, *, until: threading.Event | None = None, on_frame: Callable[[], None] = lambda: None
 ) -> None:
-    """Simulate and show frame after frame, and follow the controls; return when `until` is set.
-
-    Args:
-        live: Of `open_live`.
-        until: Ends it.
-        on_frame: Called after every frame.
-    """
+    """Simulate and show frame after frame, and follow the controls; return when `until` is set."""
     until = until or threading.Event()
     due = time.perf_counter()
     try:
@@ -183,11 +174,7 @@ def run_live(
 
 
 def _one_frame(live: Live, choice: Choice) -> bool:
-    """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did.
-
-    Raises:
-        EslrError: What is chosen does not load, or the body is too fast.
-    """
+    """Follow the controls and, if the simulation plays, simulate and show a frame; return whether it did."""
     if choice != live.refused:
         live.refused = None  # chosen once more, it is tried and told once more
     is_due, is_anew = _is_due(live, choice), live.anew.is_set()
@@ -331,10 +318,7 @@ def restart(live: Live) -> None:
 def next_iterations(iterations: int, took: float, timestep: float) -> int:
     """Return how many iterations the next frame gets at most, to keep up with real time.
 
-    Args:
-        iterations: Of the frames before, at most.
-        took: Time that they took [s].
-        timestep: Time that there is [s].
+    The frames before had `iterations` at most, and took [s] of the timestep [s].
     """
     share = (timestep - _PAGE) / took
     wanted = 0.9 * share * iterations if share < 1.0 else 1.1 * iterations + 1.0

@@ -77,13 +77,25 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
     server.initial_camera.look_at = (middle, 0.9, 0.0)
     server.initial_camera.up = (0.0, 1.0, 0.0)
     gui = server.gui
+    uplot = require("viser.uplot", extra="view")
+    series = [uplot.Series(label="s")]
+    for number, run in enumerate(runs):
+        color = _CURVE_COLORS[number % len(_CURVE_COLORS)]
+        series.append(uplot.Series(label=run.name, stroke=color, width=2))
+    time = np.arange(num_frames) * runs[0].trajectory.timestep
     controls = {
         "frame": gui.add_slider("frame", 0, max(num_frames - 1, 1), 1, 0),
         "playing": gui.add_checkbox("play", False),
         "speed": gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0),
         "color": gui.add_dropdown("colour by", (PLAIN, *FIELDS), initial_value=PLAIN),
         "legend": gui.add_markdown(""),
-        "plot": _add_plot(gui, runs, num_frames),
+        "plot": gui.add_uplot(
+            (time, *np.zeros((len(runs), num_frames))),
+            tuple(series),
+            scales={"x": uplot.Scale(time=False)},
+            height=_PLOT_HEIGHT,
+            visible=False,
+        ),
         "worst": gui.add_button("go to the worst frame", visible=False),
         "wireframe": gui.add_checkbox("wireframe", False),
         "body": gui.add_checkbox("body", True),
@@ -104,23 +116,6 @@ def open_view(runs: Sequence[Run], *, host: str = "127.0.0.1", port: int = 8080)
     controls["save"].on_click(lambda event: _save_picture(event.client))
     show(view)
     return view
-
-
-def _add_plot(gui: Any, runs: Sequence[Run], num_frames: int) -> Any:
-    """Add an empty plot over time [s] with a curve a run; return its handle."""
-    uplot = require("viser.uplot", extra="view")
-    series = [uplot.Series(label="s")]
-    for number, run in enumerate(runs):
-        color = _CURVE_COLORS[number % len(_CURVE_COLORS)]
-        series.append(uplot.Series(label=run.name, stroke=color, width=2))
-    time = np.arange(num_frames) * runs[0].trajectory.timestep
-    return gui.add_uplot(
-        (time, *np.zeros((len(runs), num_frames))),
-        tuple(series),
-        scales={"x": uplot.Scale(time=False)},
-        height=_PLOT_HEIGHT,
-        visible=False,
-    )
 
 
 def show(view: View) -> None:

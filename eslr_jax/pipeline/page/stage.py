@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -75,31 +74,23 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
 
     It is stepped by BDF2 in air. Changes of fabric, wind, hand and tolerance do not compile anew.
 
-    Args:
-        garment: A prepared garment.
-        poses: The body in motion, two frames or more.
-        material: Fabric.
-
     Raises:
         MotionError: The motion has fewer than two frames.
     """
     # Nobody enlarges its buffers here.
     layers = Repulsion(num_rows=default_rows(garment.vertex_mask.shape[0]))
     terms = scene_terms(Collision(has_skin=True), layers, Air((0.0, 0.0, 0.0)), no_hand())
-    begin = partial(_begin_compiling, material)
-    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
-    return _staged(scene, material)
-
-
-def _begin_compiling(material: Material, scene: Scene) -> None:
-    """Begin to compile the step of a scene, of which the shapes are known."""
 
     def first_step(scene: Scene) -> tuple:
         stage = _staged(scene, material)
         frame = jax.tree.map(lambda leaf: leaf[0], stage.inputs)
         return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
 
-    begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+    def begin(scene: Scene) -> None:
+        begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+
+    scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
+    return _staged(scene, material)
 
 
 def _staged(scene: Scene, material: Material) -> Stage:
@@ -129,14 +120,9 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
 def advance(
     stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int, tolerance: float
 ) -> Step:
-    """Step the cloth while the body moves from one frame to a neighbour.
+    """Step the cloth while the body moves from the first of two neighbouring frames to the other.
 
-    Args:
-        stage: Of `set_stage`.
-        state: Cloth at the first of the two frames.
-        frames: Two neighbouring frames.
-        iterations: Of the solver, at most.
-        tolerance: Share of the initial gap at which the frame may end.
+    The frame may end at a tolerance: a share of its initial gap.
     """
     now, then = frames
     inputs = stage.inputs if then > now else stage.back
@@ -160,15 +146,10 @@ def _step(
 
 
 def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:
-    """Return the vertex that a ray points at.
+    """Return the vertex [m] that a ray from an origin [m] along a direction of unit length points at.
 
     It is the first vertex along the ray, among those that are at most a centimetre farther from the ray than the
     nearest one.
-
-    Args:
-        positions: Vertices [m].
-        origin: Where the ray begins [m].
-        direction: Where it goes; unit length.
     """
     offset = positions - np.asarray(origin)
     along = offset @ np.asarray(direction)

@@ -40,13 +40,9 @@ def write_label(picture: np.ndarray, text: str) -> np.ndarray:
 
 
 def add_color_bar(picture: np.ndarray, low: float, high: float, title: str) -> np.ndarray:
-    """Return a picture with a colour bar under it.
+    """Return a picture, uint8 [height, width, 3], with a colour bar under it, which makes it higher.
 
-    Args:
-        picture: sRGB picture, uint8, shape [height, width, 3]; the bar makes it higher.
-        low: Value of the bar's left end.
-        high: Value of its right end.
-        title: What is shown, with its unit.
+    `low` and `high` are the values of the bar's ends, the title says what is shown, with its unit.
     """
     width = picture.shape[1]
     height = int(np.clip(width // 24, 10, 16))  # of the text and of the bar [pixels]
@@ -65,13 +61,7 @@ def add_color_bar(picture: np.ndarray, low: float, high: float, title: str) -> n
 def side_by_side(
     pictures: Sequence[np.ndarray], labels: Sequence[str], *, columns: int | None = None
 ) -> np.ndarray:
-    """Return pictures of one size in rows, each with a label in its corner.
-
-    Args:
-        pictures: sRGB pictures, uint8, each of shape [height, width, 3].
-        labels: A short text each.
-        columns: Pictures per row; all in one row by default.
-    """
+    """Return pictures, uint8 of one size, in rows (by default one), each with its label in its corner."""
     labelled = [write_label(picture, text) for picture, text in zip(pictures, labels, strict=True)]
     columns = min(columns or len(labelled), len(labelled))
     rows = -(-len(labelled) // columns)

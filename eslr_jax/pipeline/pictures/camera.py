@@ -67,12 +67,8 @@ def follow(
 ) -> tuple[list[Camera], float]:
     """Place a camera per frame that keeps the subject in the middle, and sees all of it, at one distance.
 
-    Args:
-        subject: Vertices of what is to be seen [m], shape [frames, vertices, 3].
-        angles: Direction of the camera around +Y, from +Z towards +X [rad], shape [frames].
-        aspect: Picture width over height.
-        zoom: How many times larger than with the whole subject in the picture.
-        focus: Points whose centre is looked at [m], shape [frames, points, 3]; by default the subject's.
+    `angles` are directions of the camera around +Y, from +Z towards +X [rad], `aspect` is picture width over
+    height. `focus` are points whose centre is looked at [m], by default the subject's.
 
     Returns:
         A camera per frame, and the height of the floor: the lowest point over all frames [m].

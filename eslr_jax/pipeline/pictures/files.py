@@ -14,11 +14,7 @@ from eslr_jax.pipeline.extras import require
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write a picture as PNG, atomically.
-
-    Args:
-        path: The file.
-        image: sRGB values, uint8, shape [height, width, 3].
+    """Write a picture, sRGB in uint8 [height, width, 3], as PNG, atomically.
 
     Raises:
         AssetError: If the file can't be written.
@@ -32,10 +28,7 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Write pictures as a film (H.264 in mp4 by default), atomically and one frame at a time.
 
-    Args:
-        path: The file; its suffix chooses the container.
-        frames: Pictures of one size, uint8, each of shape [height, width, 3]; an odd row or column is cut.
-        fps: Frames per second.
+    Pictures are uint8, [height, width, 3], of one size, of which an odd row or column is cut.
 
     Raises:
         AssetError: If there is no frame, sizes differ, or the file can't be written.

@@ -149,19 +149,9 @@ def contact_sheet(
 ) -> np.ndarray:
     """Render frames spread evenly over a motion, first and last included, into one picture.
 
-    The meshes are given as for `render_frames`.
-
-    Args:
-        body_positions: Of the body, or None.
-        body_faces: Of the body, or None.
-        garment_positions: Of the garment.
-        garment_faces: Of the garment.
-        num_frames: How many pictures, or fewer when the motion is shorter.
-        columns: Pictures per row.
-        size: Width and height of one picture [pixels].
-        timestep: Time between frames [s]; if given, labels tell the time too.
-        on_picture: Called with (pictures done, pictures in all) after each one.
-        options: Passed on to `render_frames`.
+    Arguments are those of `render_frames`; the size is that of one picture, of which there are `columns` a row.
+    Where the motion is shorter there are fewer. With a timestep [s] labels tell the time too; `on_picture` is
+    called with (pictures done, pictures in all) after each one.
 
     Returns:
         sRGB picture, uint8, shape [rows * height, columns * width, 3] plus gaps, with frame numbers.

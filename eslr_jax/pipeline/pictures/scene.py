@@ -79,11 +79,11 @@ def trace_picture(
     size: tuple[int, int],
     samples: int,
 ) -> np.ndarray:
-    """Trace one picture.
+    """Trace one picture; the lights turn with the camera.
 
     Args:
         surfaces: What stands in the studio.
-        camera: Where to look from; the lights turn with it.
+        camera: Where to look from.
         ground_height: Height of the floor [m].
         size: Width and height [pixels].
         samples: Camera rays per pixel, rounded up to a square number.
@@ -238,13 +238,9 @@ def _rgb(values: np.ndarray) -> dict[str, Any]:
 def _smooth(color: np.ndarray, guide: np.ndarray, step: int, color_scale: float) -> np.ndarray:
     """Average every pixel with the neighbours that show the same surface under the same light.
 
-    A neighbour weighs a Gaussian of its distance, its difference in guide and its difference in colour.
-
-    Args:
-        color: Noisy linear radiance, shape [height, width, 3].
-        guide: Noise-free features, shape [height, width, features]; a difference of one parts two surfaces.
-        step: Distance of the neighbours [pixels].
-        color_scale: Difference of radiance that is an edge.
+    A neighbour weighs a Gaussian of its distance, its difference in guide and its difference in colour. A
+    difference of one in the noise-free guide parts two surfaces, one of `color_scale` in the radiance [height,
+    width, 3] is an edge. Neighbours are `step` pixels apart.
 
     Source: edge-avoiding a-trous filter, Dammertz et al. 2010, doi:10.2312/EGGH.HPG10.067-075.
     """

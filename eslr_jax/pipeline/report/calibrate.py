@@ -24,12 +24,7 @@ _TURNS = 9  # timings of each, in turns; medians count
 
 
 def calibrate(models: tuple[str, ...], sizes: tuple[str, ...] = ("1k", "4k")) -> Calibration:
-    """Time the solver, and the solver behind each network, on this device.
-
-    Args:
-        models: Names of bundled networks.
-        sizes: Resolutions of the garment.
-    """
+    """Time the solver, and the solver behind each bundled network, at some sizes of a garment."""
     has_coarse_edges = read_coarse_edges(models)
     garment, clip = _TIMED
     costs: list[Cost] = []
@@ -55,11 +50,9 @@ def read_coarse_edges(names: tuple[str, ...]) -> bool:
 
 
 def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
-    """Time methods in turns, since a machine's speed changes within minutes.
+    """Time the first frames of a scene by the solver (SOLVER) or networks, in turns.
 
-    Args:
-        names: Of networks; SOLVER is the solver alone.
-        scene: Its first frames are simulated.
+    A machine's speed changes within minutes.
     """
     runs = {(name, count): (*simulator_of(name), count) for name in names for count in _TIMED_ITERATIONS}
     fixed_ms, iteration_ms = fit_costs(time_frames(runs, scene))
@@ -70,12 +63,10 @@ def measure_costs(names: tuple[str, ...], scene: Scene) -> list[Cost]:
 def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, float], float]:
     """Return every method's fixed cost per frame, and the cost of an iteration [ms].
 
-    An iteration is the same for every method, so all share one cost. The fixed cost of a method is that of the
-    first one plus their difference, which is taken within turns: a machine that changes its speed during the
-    measurement then favours none.
-
-    Args:
-        times: Milliseconds per frame, turn by turn, by method and number of iterations.
+    `times` are milliseconds per frame, turn by turn, by method and number of iterations. An iteration is the
+    same for every method, so all share one cost. The fixed cost of a method is that of the first one plus their
+    difference, which is taken within turns: a machine that changes its speed during the measurement then favours
+    none.
     """
     names = list(dict.fromkeys(name for name, _ in times))
     low, high = _TIMED_ITERATIONS
@@ -92,13 +83,7 @@ def fit_costs(times: Mapping[tuple[str, int], list[float]]) -> tuple[dict[str, f
 
 
 def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tuple[Network | None, SimConfig]:
-    """Return network and configuration of a method: the solver, or a network with the solver behind it.
-
-    Args:
-        name: SOLVER, which has no network, or the name of a bundled network.
-        iterations: Of the solver, per frame.
-        tolerance: See `SimConfig`.
-    """
+    """Return network and configuration of a method: the solver (SOLVER), or a network with it behind."""
     network = None if name == SOLVER else load_model(name)
     return network, SimConfig(iterations=iterations, tolerance=tolerance)
 
@@ -106,12 +91,9 @@ def simulator_of(name: str, iterations: int = 0, tolerance: float = 0.0) -> tupl
 def time_frames(
     runs: Mapping[Name, tuple[Network | None, SimConfig, int | None]], scene: Scene, turns: int = _TURNS
 ) -> dict[Name, list[float]]:
-    """Return milliseconds per frame of rollouts, one number per turn.
+    """Return milliseconds per frame of rollouts of a scene's first frames, one number per turn.
 
-    Args:
-        runs: Network, configuration and iterations by name, see `rollout_scene`; all are rolled out in turns.
-        scene: Its first frames are simulated.
-        turns: Rollouts of each.
+    `runs` are network, configuration and iterations by name, see `rollout_scene`; all are rolled out in turns.
     """
     short = first_frames(scene, _TIMED_FRAMES)
     parts = {

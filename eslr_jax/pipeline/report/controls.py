@@ -16,12 +16,10 @@ EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 
 
 def control_network(control: Control, network: Network) -> Network:
-    """Return a network without what a control takes away.
+    """Return a trained network, one of this package's, without what a control takes away.
 
-    Args:
-        control: "untrained" has weights of a new network, on the trained one's statistics of features.
-            "no_decoder" has a last layer of zeros: what is left are gradient steps, and the guess.
-        network: The trained network, one of this package's.
+    "untrained" has weights of a new network, on the trained one's statistics of features. "no_decoder" has a last
+    layer of zeros: what is left are gradient steps, and the guess.
 
     Raises:
         ConfigError: The network has no such part.
@@ -41,10 +39,8 @@ def control_network(control: Control, network: Network) -> Network:
 def control_garment(control: Control, garment: Garment) -> Garment:
     """Return a garment without what a control takes away.
 
-    Args:
-        control: "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same
-            spread, equal for equal garments however they are padded.
-        garment: The garment.
+    "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same spread, equal
+    for equal garments however they are padded.
     """
     embedding = garment.geodesic_embedding
     if control == "no_embedding":

@@ -40,11 +40,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a network.
 
-    Args:
-        network: The network.
-        options: Split, garments, clips and lengths.
-        iterations: Solver iterations behind the network.
-        on_scene: Called after each garment and clip with the count, the total and a label.
+    `iterations` are those of the solver behind the network. `on_scene` is called after each garment and clip
+    with the count, the total and a label.
 
     Returns:
         Plain values: teacher-forced and on-policy gap [J] beside that of L-BFGS from the same states, and
@@ -78,9 +75,13 @@ def evaluate(
                 return prepare_scene(cloth, poses, surface=surface)
 
             if options.gap_frames:
-                on_truth, on_policy = _gaps(network, scene_of(options.gap_frames), config, options.every)
-                forced.append(on_truth)
-                policy.append(on_policy)
+                scene = scene_of(options.gap_frames)
+                compared = GapOptions(every=options.every, refined=(config.iterations,))
+                truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
+                # From the optimum's states, and from those of the network's own rollout.
+                for stepper, steps, gaps in ((None, truth, forced), (network, config, policy)):
+                    trajectory = _roll(stepper, scene, steps)
+                    gaps.append(jax.device_get(measure_gap(network, trajectory, scene, compared)))
             scene = scene_of(options.rollout_frames)
             free = _roll(network, scene, config)
             optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
@@ -104,25 +105,8 @@ def evaluate(
     }
 
 
-def _gaps(
-    network: Network, scene: Scene, config: SimConfig, every: int
-) -> tuple[OptimalityGap, OptimalityGap]:
-    """Return the gaps from the optimum's states and from those of the network's own rollout."""
-    options = GapOptions(every=every, refined=(config.iterations,))
-    measured = []
-    truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
-    for stepper, steps in ((None, truth), (network, config)):
-        trajectory = _roll(stepper, scene, steps)
-        measured.append(jax.device_get(measure_gap(network, trajectory, scene, options)))
-    return measured[0], measured[1]
-
-
 def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:
-    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on.
-
-    Raises:
-        EslrError: The solver's rollout goes wrong.
-    """
+    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on."""
     simulation = simulate(network, scene, config=config, raises=network is None)
     return hold_last(simulation.trajectory, scene.num_frames)
 

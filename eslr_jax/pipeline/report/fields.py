@@ -51,10 +51,6 @@ def run_field(run: Run, name: str) -> Field:
     are those of the frame's minimisation problem, per area, see `energy_shares` and `gap_shares`; `distance`
     is to the tangent plane of the nearest body vertex.
 
-    Args:
-        run: Of `read_run`.
-        name: One of `FIELDS`.
-
     Raises:
         AssetError: The field is unknown, or the run lacks what it needs.
     """
@@ -65,12 +61,24 @@ def run_field(run: Run, name: str) -> Field:
     if name == "repulsion-energy" and run.scene.term(Repulsion) is None:
         raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
-        return _distances(run)
+        trajectory = run.trajectory
+        assert trajectory.body is not None
+        values = np.empty(trajectory.positions.shape[:2], np.float32)
+        faces = trajectory.body.faces
+        tracks = zip(trajectory.positions, trajectory.body.positions, strict=True)
+        for frame, (cloth, body) in enumerate(tracks):
+            normals = vertex_normals(body, faces)
+            _, nearest = cKDTree(body).query(cloth)
+            values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
+        return Field(values, 0.0, 0.06, "m")
     garment = run.scene.garment
     if name == "stretch":
         values = np.asarray(_stretches(jnp.asarray(run.trajectory.positions), garment))
         return Field(values, 1.0, max(float(np.quantile(values, 0.999)), 1.05), "")
-    values = _problem_values(run, name)
+    trajectory = run_trajectory(run)
+    states, _ = trajectory_states(trajectory, run.scene)
+    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
+    values = np.concatenate([np.zeros_like(values[:1]), values])
     values = values / np.maximum(np.asarray(garment.vertex_areas), 1e-12)
     # A few vertices in hard contact hold a hundred times what others do, and shares of gap may be negative.
     low, high = (
@@ -94,14 +102,6 @@ def _stretches(
     return jax.lax.map(frame, positions)
 
 
-def _problem_values(run: Run, name: str) -> Float[np.ndarray, "frames vertices"]:
-    """Return a value [J] of the frames' minimisation problems; the first frame has none."""
-    trajectory = run_trajectory(run)
-    states, _ = trajectory_states(trajectory, run.scene)
-    values = np.asarray(_every_frame(name, trajectory.positions[1:], states, run.scene))
-    return np.concatenate([np.zeros_like(values[:1]), values])
-
-
 @partial(jax.jit, static_argnames="name")
 def _every_frame(
     name: str, reached: Float[Array, "frames vertices 3"], states: ClothState, scene: Scene
@@ -121,10 +121,7 @@ def energy_shares(
 ) -> Float[Array, " vertices"]:
     """Share the energy of the terms of one name out over the vertices [J]; the shares add up to it.
 
-    Args:
-        name: Of one of the problem's terms.
-        position: Positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
+    The frame's problem has these terms, and the cloth is at the position at t + 1 [m].
     """
     x = components(pin(problem, position))
     parts = [
@@ -142,11 +139,7 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
     The share of a vertex is the work of the remaining force at it along its straight way x* + s (x - x*) to the
     optimum, which is the integral of grad P . (x - x*) over s. The differences of `energy_shares` at x and x*
     also add up to the gap. But they show the energy that the terms exchange, which is of first order in x - x*,
-    while the gap is of second order.
-
-    Args:
-        position: Any stepper's positions at t + 1 [m], shape [vertices, 3].
-        problem: The frame's problem.
+    while the gap is of second order. The position is any stepper's at t + 1 [m].
     """
     start = Start(position, potential(pushed_out_guess(problem), problem))
     minimum = solve(problem, start, iterations=_ITERATIONS, tolerance=_TOLERANCE)
@@ -159,17 +152,3 @@ def gap_shares(position: Float[Array, "vertices 3"], problem: FrameProblem) -> F
 
     works = jax.lax.map(work, jnp.asarray(0.5 * (places + 1.0), position.dtype))
     return product(jnp.asarray(0.5 * weights, position.dtype), works)
-
-
-def _distances(run: Run) -> Field:
-    """Return the height of every vertex over the tangent plane of the nearest body vertex [m]."""
-    trajectory = run.trajectory
-    if trajectory.body is None:
-        raise AssetError(f"{run.name} has no body, and so no distance to it")
-    values = np.empty(trajectory.positions.shape[:2], np.float32)
-    faces = trajectory.body.faces
-    for frame, (cloth, body) in enumerate(zip(trajectory.positions, trajectory.body.positions, strict=True)):
-        normals = vertex_normals(body, faces)
-        _, nearest = cKDTree(body).query(cloth)
-        values[frame] = np.einsum("vx,vx->v", cloth - body[nearest], normals[nearest])
-    return Field(values, 0.0, 0.06, "m")

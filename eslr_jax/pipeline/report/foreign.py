@@ -35,7 +35,14 @@ def foreign_trajectory(
         iterations: Iterations that it spent on every frame.
     """
     x = jnp.asarray(positions, jnp.float32)
-    v = _velocities(x, scene) if velocities is None else jnp.asarray(velocities, jnp.float32)
+    if velocities is None:
+        # Implicit Euler: (x_t - x_{t-1}) / dt. BDF2, from frame 2 on: (3 x_t - 4 x_{t-1} + x_{t-2}) / (2 dt).
+        moved = jnp.diff(x, axis=0) / scene.timestep
+        if scene.initial_state.past is not None:
+            moved = jnp.concatenate([moved[:1], 1.5 * moved[1:] - 0.5 * moved[:-1]])
+        v = jnp.concatenate([scene.initial_state.velocity[None], moved])
+    else:
+        v = jnp.asarray(velocities, jnp.float32)
     loads = find_friction_loads(x, v, scene) if friction_loads is None else jnp.asarray(friction_loads)
     unknown = jnp.full(len(x), jnp.nan)
     return Trajectory(
@@ -51,28 +58,11 @@ def foreign_trajectory(
     )
 
 
-def _velocities(x: Float[Array, "frames vertices 3"], scene: Scene) -> Float[Array, "frames vertices 3"]:
-    """Return the velocities [m/s] with which a scene's integrator arrives at positions [m].
-
-    Implicit Euler: (x_t - x_{t-1}) / dt. BDF2: (3 x_t - 4 x_{t-1} + x_{t-2}) / (2 dt), from the second frame on.
-    """
-    moved = jnp.diff(x, axis=0) / scene.timestep
-    if scene.initial_state.past is not None:
-        moved = jnp.concatenate([moved[:1], 1.5 * moved[1:] - 0.5 * moved[:-1]])
-    return jnp.concatenate([scene.initial_state.velocity[None], moved])
-
-
 @jax.jit
 def find_friction_loads(
     positions: Float[Array, "frames vertices 3"], velocities: Float[Array, "frames vertices 3"], scene: Scene
 ) -> Float[Array, "frames vertices"]:
-    """Return the friction loads [N] of a trajectory that does not tell them.
-
-    Args:
-        positions: Vertex positions [m], shape [frames, vertices, 3].
-        velocities: Vertex velocities [m/s], shape [frames, vertices, 3].
-        scene: Its scene.
-    """
+    """Return the friction loads [N] of a trajectory that does not tell them; it is in m and m/s."""
 
     def advance(load, frame):
         position, velocity, past, reached, inputs = frame
@@ -93,9 +83,7 @@ def find_friction_loads(
 def with_energies(trajectory: Trajectory, scene: Scene) -> Trajectory:
     """Return a trajectory with energies, residuals and pairs of cloth at its positions; frame 0 has none.
 
-    Args:
-        trajectory: Of any simulator; its own energies, residuals and demand of pairs are replaced by ours.
-        scene: Its scene.
+    Those of the simulator that it is of are replaced by ours.
     """
 
     def measure(

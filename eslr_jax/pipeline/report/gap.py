@@ -70,12 +70,8 @@ def past_states(
 ) -> PastState | None:
     """Return what BDF2 remembers before every simulated frame, stacked; None for implicit Euler.
 
-    Args:
-        positions: Vertex positions [m].
-        velocities: Vertex velocities [m/s].
-        scene: Its scene.
-        residuals: Force norm over weight at the end of every frame. NaN, or None for all frames, stands for
-            unknown: such a frame counts as one that ended in its minimum.
+    Residuals are force norms over weight at the end of every frame. NaN, or None for all frames, stands for
+    unknown: such a frame counts as one that ended in its minimum.
     """
     first = scene.initial_state.past
     if first is None:
@@ -169,12 +165,7 @@ def stepped_potentials(
 ) -> Float[Array, " frames"]:
     """Return the potential [J] that a simulator's single frames end with, from the states of a trajectory.
 
-    Args:
-        network: Its network, or None.
-        trajectory: Supplies the states.
-        scene: Its scene.
-        config: Iterations and tolerance; static.
-        every: Take every so many frames, as `GapOptions` does; static.
+    Frames are taken as `GapOptions.every` says; `every` and the configuration are static.
     """
     frames = jax.tree.map(lambda leaf: leaf[1::every], trajectory_states(trajectory, scene))
     stepper = make_stepper(network, config)
@@ -204,12 +195,7 @@ def map_frames(
 ) -> Any:
     """Apply `measure` to the positions that the cloth reached in every frame, and to the frame's problem.
 
-    Args:
-        measure: From positions and their frame's problem to a value, or to several.
-        reached: Anybody's positions at t + 1 [m], shape [frames, vertices, 3].
-        states: Cloth at t, of `trajectory_states`.
-        inputs: The frames' inputs.
-        scene: The scene.
+    `reached` are anybody's positions at t + 1 [m]; states and inputs, at t, are those of `trajectory_states`.
     """
 
     def frame(arguments):

@@ -25,12 +25,7 @@ class FrameMeasures(NamedTuple):
 
 @jax.jit
 def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -> FrameMeasures:
-    """Measure every simulated frame of a trajectory.
-
-    Args:
-        positions: Where its vertices are [m]; frame 0 is the start.
-        scene: Its scene.
-    """
+    """Measure every simulated frame of a trajectory of a scene, given positions [m]; frame 0 is the start."""
     garment = scene.garment
     is_real = garment.rest_areas > 0
     count = jnp.sum(is_real, dtype=jnp.int32)

@@ -41,13 +41,7 @@ def intersecting_pairs(
 
     Two triangles intersect where an edge of one pierces the other. Faces that share a vertex touch by
     construction and are left out. So are pairs of body faces: real bodies intersect themselves. Positions that
-    are not finite have no pairs.
-
-    Args:
-        cloth: Cloth vertex positions [m], shape [vertices, 3]; padded vertices, which no face uses, do no harm.
-        cloth_faces: Cloth triangles, shape [faces, 3].
-        body: Body vertex positions [m], shape [body_vertices, 3]; None without a body.
-        body_faces: Body triangles, shape [body_faces, 3]; None without a body.
+    are not finite have no pairs. Padded vertices, which no face uses, do no harm.
 
     Raises:
         MissingExtraError: The IPC Toolkit is not installed.
@@ -70,26 +64,21 @@ def intersecting_pairs(
     broad.build(positions, edges, faces, 0.0)
     candidates = broad.detect_edge_face_candidates()
     ids = np.array([(found.edge_id, found.face_id) for found in candidates], np.int64).reshape(-1, 2)
-    pairs = [
-        (min(face, other), max(face, other))
-        for edge, face in ids[_pierces(ipctk, positions[edges[ids[:, 0]]], positions[faces[ids[:, 1]]])]
-        for other in beside[edge]
-        if not set(faces[face]) & set(faces[other])
-    ]
-    return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
-
-
-def _pierces(
-    ipctk: ModuleType, ends: Float[np.ndarray, "pairs 2 3"], corners: Float[np.ndarray, "pairs 3 3"]
-) -> np.ndarray:
-    """Return which edges pierce which triangles; float64 sorts out the clear cases, the toolkit the rest."""
+    # Which edges pierce which triangles: float64 sorts out the clear cases, the toolkit the rest.
+    ends, corners = positions[edges[ids[:, 0]]], positions[faces[ids[:, 1]]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     heights = np.einsum("pex,px->pe", ends - corners[:, :1], normal)
     margin = 1e-12 * np.abs(ends).max(initial=1e-300) * np.linalg.norm(normal, axis=1)
     hits = (heights.min(axis=1) <= margin) & (heights.max(axis=1) >= -margin)
     for row in np.flatnonzero(hits):
         hits[row] = _meets(ipctk, *ends[row], corners[row])
-    return hits
+    pairs = [
+        (min(face, other), max(face, other))
+        for edge, face in ids[hits]
+        for other in beside[edge]
+        if not set(faces[face]) & set(faces[other])
+    ]
+    return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
 
 
 def _meets(ipctk: ModuleType, start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> bool:

@@ -93,13 +93,22 @@ def write_run(
     """
     rig, poses, stored = actor
     folder = ensure_output_dir(folder)
+    skin = Skin(
+        skin_weights=np.asarray(rig.skin_weights),
+        skin_indices=np.asarray(rig.skin_indices),
+        joint_transforms=np.asarray(poses.joint_transforms),
+        joint_rest_positions=np.asarray(rig.joint_rest_positions),
+        parents=rig.parents,
+        joint_names=rig.joint_names,
+    )
+    body = BodyTrack(*map(np.asarray, (poses.positions, poses.faces, poses.rest_positions)), skin)
     file = TrajectoryFile(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),
         faces=stored.faces,
         metadata={name: report[name] for name in _LABELS if name in report},
         timestep=float(poses.timestep),
-        body=_body_track(rig, poses),
+        body=body,
         friction_loads=np.asarray(track.friction_loads),
         residuals=None if track.residuals is None else np.asarray(track.residuals),
     )
@@ -115,20 +124,6 @@ def write_run(
         else:  # of an earlier run
             (folder / "scene.npz").unlink(missing_ok=True)
         move_files(new, folder)
-
-
-def _body_track(rig: Body, poses: BodyMotion) -> BodyTrack:
-    """Return a body in motion with its joints."""
-    skin = Skin(
-        skin_weights=np.asarray(rig.skin_weights),
-        skin_indices=np.asarray(rig.skin_indices),
-        joint_transforms=np.asarray(poses.joint_transforms),
-        joint_rest_positions=np.asarray(rig.joint_rest_positions),
-        parents=rig.parents,
-        joint_names=rig.joint_names,
-    )
-    positions, faces, rest = map(np.asarray, (poses.positions, poses.faces, poses.rest_positions))
-    return BodyTrack(positions, faces, rest, skin)
 
 
 def is_run(path: str | Path) -> bool:
@@ -158,13 +153,7 @@ def load_trajectory(path: str | Path) -> TrajectoryFile:
 
 
 def read_run(path: str | Path) -> Run:
-    """Read the folder of a run, or a trajectory and what lies beside it.
-
-    Args:
-        path: Path of the folder, or of a trajectory file.
-
-    Returns:
-        The run.
+    """Read the folder of a run, or a trajectory file and what lies beside it.
 
     Raises:
         AssetError: There is no trajectory, a file is damaged, or the garment is not the trajectory's.

@@ -37,13 +37,7 @@ class Modelled:
 
 
 def describe_scene(scene: Scene, poses: BodyMotion, network: Network | None) -> Modelled:
-    """Return what a scene models.
-
-    Args:
-        scene: Of `prepare_scene`.
-        poses: The motion it was made from.
-        network: Of the simulation, or None.
-    """
+    """Return what a scene of `prepare_scene` models, given the motion that it was made from, and a network."""
     modelled = describe_terms(scene)
     known = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.0))
     left_out = {term.name: term.unless_needed for term in known if term.name not in modelled}
@@ -70,13 +64,7 @@ def describe_scene(scene: Scene, poses: BodyMotion, network: Network | None) -> 
 
 
 def time_parts(network: Network | None, scene: Scene, config: SimConfig) -> dict[str, float]:
-    """Return milliseconds of each part of one frame on this device; the parts are timed alternately.
-
-    Args:
-        network: A network, or None.
-        scene: Of `prepare_scene`.
-        config: Iterations and tolerance.
-    """
+    """Return milliseconds of each part of one frame on this device; the parts are timed alternately."""
     state = scene.initial_state
     inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
     problem = jax.jit(frame_problem)(scene, state, inputs)
@@ -102,12 +90,7 @@ def time_parts(network: Network | None, scene: Scene, config: SimConfig) -> dict
 
 
 def take_turns(parts: dict[str, tuple[Callable, tuple]], turns: int = _TURNS) -> dict[str, float]:
-    """Return the median milliseconds of functions, which are jitted and called alternately.
-
-    Args:
-        parts: Functions with their arguments.
-        turns: Calls of each.
-    """
+    """Return the median milliseconds of functions with arguments, which are jitted and called alternately."""
     jitted = {name: (jax.jit(function), arguments) for name, (function, arguments) in parts.items()}
     return {name: float(np.median(values)) for name, values in time_in_turns(jitted, turns).items()}
 

@@ -70,7 +70,19 @@ def score_trajectory(
         NonFiniteError: A position is NaN or infinite.
     """
     positions = np.asarray(trajectory.positions if isinstance(trajectory, Trajectory) else trajectory)
-    _check(positions, scene, every)
+    if every < 1:
+        raise ConfigError(f"every = {every}: give a number of frames, 1 or more")
+    expected = (scene.num_frames, *scene.initial_state.position.shape)
+    if positions.shape != expected:
+        raise MotionError(
+            f"positions {positions.shape} are not those of the scene, which has {list(expected)}: frames, "
+            "vertices and 3; give a trajectory of this garment and of all frames"
+        )
+    if len(positions) < _LEAST_FRAMES:
+        raise MotionError(f"{len(positions)} frames are too few to score; give {_LEAST_FRAMES} or more")
+    is_finite = np.isfinite(positions).all(axis=(1, 2))
+    if not is_finite.all():
+        raise NonFiniteError(f"frame {np.argmin(is_finite)} is not finite; cut the trajectory before it")
     if not isinstance(trajectory, Trajectory):
         trajectory = foreign_trajectory(positions, scene)
     before = trajectory
@@ -96,23 +108,6 @@ def score_trajectory(
         "gap_relative_max": float(np.max(ends.share(ends.reached))),
         **_count_intersections(positions, scene, every, report["garments"]),
     }
-
-
-def _check(positions: np.ndarray, scene: Scene, every: int) -> None:
-    """Raise unless positions are a trajectory of the scene."""
-    if every < 1:
-        raise ConfigError(f"every = {every}: give a number of frames, 1 or more")
-    expected = (scene.num_frames, *scene.initial_state.position.shape)
-    if positions.shape != expected:
-        raise MotionError(
-            f"positions {positions.shape} are not those of the scene, which has {list(expected)}: frames, "
-            "vertices and 3; give a trajectory of this garment and of all frames"
-        )
-    if len(positions) < _LEAST_FRAMES:
-        raise MotionError(f"{len(positions)} frames are too few to score; give {_LEAST_FRAMES} or more")
-    is_finite = np.isfinite(positions).all(axis=(1, 2))
-    if not is_finite.all():
-        raise NonFiniteError(f"frame {np.argmin(is_finite)} is not finite; cut the trajectory before it")
 
 
 def _count_intersections(

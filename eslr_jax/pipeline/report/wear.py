@@ -36,13 +36,7 @@ def wear_report(
     through if it is later in front of the nearest face. Three kinds of faces don't count: faces at a hem, since
     skin passes under them; faces that are turned away by more than 60 degrees, which are folds or cover another
     limb; and faces that are far from the skin in the rest pose. Every tenth frame and the last one are measured.
-
-    Args:
-        positions: Simulated vertex positions [m], shape [frames, vertices, 3].
-        garment: The garment in the body's rest pose.
-        skinned: The garment carried by the joints [m], shape [frames, vertices, 3].
-        poses: The body in the same frames.
-        parts: Parts of the garment; where skin shows most, the cloth's part is named.
+    `skinned` is the garment carried by the joints [m]. Where skin shows most, the cloth's part is named.
 
     Returns:
         Plain values: `coverage`, the least share of covered skin that cloth is still within 10 cm of;

@@ -78,11 +78,9 @@ PROCEDURAL: dict[str, Callable[[NDArray, float], tuple[_Rotations, NDArray]]] = 
 
 
 def make_procedural(name: str, body: Body) -> Motion:
-    """Return a computed motion for a body: a second in the rest pose, then the movement.
+    """Return a computed motion of `PROCEDURAL` for a body: a second in the rest pose, then the movement.
 
-    Args:
-        name: One of `PROCEDURAL`.
-        body: A rigged body; parts that it lacks don't move.
+    Parts that the body lacks don't move.
 
     Raises:
         MotionError: The rig has none of the joints that move.

@@ -39,12 +39,8 @@ def metres_per_unit(name: str, extent: float, units: str | None = None) -> float
     """Return the metres per unit of a body's file; warn with one line if that is a guess.
 
     A body of a person's size in metres is in metres. Otherwise the unit that comes closest to an adult's height
-    is taken, and a body that fits no unit is scaled to that height.
-
-    Args:
-        name: What messages call the body.
-        extent: Largest side of its bounding box, in its unit.
-        units: One of `UNITS`, or a number of metres per unit; None guesses.
+    is taken, and a body that fits no unit is scaled to that height. `extent` is the largest side of its bounding
+    box, `units` one of `UNITS`, or a number of metres per unit.
 
     Raises:
         AssetError: The unit is unknown, or the body's extent is none.
@@ -85,13 +81,9 @@ def body_skeleton(body: Body) -> Skeleton:
 
 
 def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
-    """Return a rigged mesh as a body in metres.
+    """Return a rigged mesh as a body in metres; by default its unit is recognised, see `metres_per_unit`.
 
     Vertices at one place are joined, the hips become joint 0, and hands are no obstacle.
-
-    Args:
-        mesh: A body as its file has it.
-        units: Unit of its lengths, or metres per unit; by default recognised, see `metres_per_unit`.
 
     Raises:
         AssetError: The mesh is empty or not finite, its weights and faces don't fit, or its unit is unknown.
@@ -115,6 +107,12 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     shapes, joint_shapes = mesh.shape_directions, mesh.joint_shape_directions
     if shapes is None or joint_shapes is None:
         shapes, joint_shapes = np.zeros((len(mesh.positions), 3, 0)), np.zeros((len(order), 3, 0))
+    is_hand = np.zeros(len(skeleton), bool)
+    for (_, chain), joints in find_parts(skeleton).items():
+        is_hand[joints] |= chain in HAND
+    for joint, parent in enumerate(skeleton.parents):
+        is_hand[joint] |= parent >= 0 and is_hand[parent]
+    leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
     return Body(
         rest_positions=lengths(mesh.positions[vertices]),
         shape_directions=lengths(shapes[vertices]),
@@ -123,7 +121,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
         skin_weights=jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
-        is_obstacle=jnp.asarray(_is_obstacle(faces, weights, indices, skeleton)),
+        is_obstacle=jnp.asarray(~is_hand[leading][faces].all(axis=1)),
         parents=skeleton.parents,
         joint_names=skeleton.joint_names,
         pose_directions=None if mesh.pose_directions is None else lengths(mesh.pose_directions[vertices]),
@@ -163,23 +161,8 @@ def _check_mesh(mesh: RiggedMesh) -> None:
         )
 
 
-def _is_obstacle(faces: NDArray, weights: NDArray, indices: NDArray, skeleton: Skeleton) -> NDArray:
-    """Return which faces cloth may touch: all but those of the hands, which intersect themselves."""
-    is_hand = np.zeros(len(skeleton), bool)
-    for (_, chain), joints in find_parts(skeleton).items():
-        is_hand[joints] |= chain in HAND
-    for joint, parent in enumerate(skeleton.parents):
-        is_hand[joint] |= parent >= 0 and is_hand[parent]
-    leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
-    return ~is_hand[leading][faces].all(axis=1)
-
-
 def hips_first(skeleton: Skeleton) -> tuple[Skeleton, NDArray]:
-    """Make the hips of a skeleton joint 0, since a motion's translation is that of joint 0.
-
-    Returns:
-        The skeleton, and the old index of each of its joints.
-    """
+    """Make the hips joint 0, as motions have it; return the skeleton, and the old index of each of its joints."""
     hips = find_parts(skeleton)["", "hips"][0]
     neighbors: dict[int, list[int]] = {}
     for joint, parent in enumerate(skeleton.parents):
@@ -209,13 +192,8 @@ def make_motion(
     if bones also move or stretch, so that a joint with skin is more than 1 cm away from its place in the file.
     On another rig, limbs point where the source's limbs point, and the rest of the body turns as the source has
     turned since its rest pose. Steps are scaled by the length of the legs, the floor is put at y = 0, and the
-    motion starts above the origin.
-
-    Args:
-        source: The motion of a file.
-        body: The body to move.
-        joint_map: Changes to the joint map, from joints of the body to joints of the source; "" keeps one still.
-        up: Axis that points up in the source: "y", "z", or "auto" to judge by how the source stands.
+    motion starts above the origin. The joint map is changed from joints of the body to joints of the source; ""
+    keeps one still. The source's axis "y" or "z" points up, or "auto" judges by how it stands.
 
     Raises:
         MotionError: No joint is known to both, or the source does not stand at rest.

@@ -33,13 +33,9 @@ def pose_sequence(
     """Return a moving mesh as a body, and as that body in motion.
 
     The vertices move as in the sequence, resampled in time by straight lines. Patches of the surface stand for
-    joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame.
-
-    Args:
-        sequence: The mesh in motion; its first frame is the rest pose.
-        fps: Frames per second of the simulation.
-        num_frames: Number of frames to keep; None keeps all.
-        units: Unit of the mesh, or metres per unit; by default recognised, see `metres_per_unit`.
+    joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame,
+    which is the rest pose. `fps` are the simulation's; the first `num_frames` of its frames are kept, by default
+    all. The unit is by default recognised, see `metres_per_unit`.
 
     Raises:
         AssetError: The unit is unknown.
@@ -49,7 +45,12 @@ def pose_sequence(
     faces = np.asarray(sequence.faces, np.int64)
     extent = float(np.ptp(sequence.positions[0], axis=0).max())
     scaled = metres_per_unit(sequence.name, extent, units) * sequence.positions
-    rest, positions = scaled[0], _resample(scaled, sequence.fps, fps)
+    # By straight lines between frames.
+    at = np.arange(count_resampled(len(scaled), sequence.fps, fps)) * (sequence.fps / fps)
+    before = np.clip(at.astype(int), 0, max(len(scaled) - 2, 0))
+    share = np.clip(at - before, 0.0, 1.0)[:, None, None]
+    after = np.minimum(before + 1, len(scaled) - 1)
+    rest, positions = scaled[0], (1 - share) * scaled[before] + share * scaled[after]
     check_outward(rest, faces, name=sequence.name)
     sides = np.ptp(rest, axis=0)
     if sides[2] == sides.max() and sides[1] < UPRIGHT * sides[2]:
@@ -66,7 +67,17 @@ def pose_sequence(
             )
         positions = positions[:num_frames]
     weights, indices, dense = _patch_weights(rest, faces)
-    transforms, centers = _fit_patches(positions, rest, dense)
+    # The best rigid motion of every patch: Kabsch 1976 (doi:10.1107/S0567739476001873).
+    share = dense / np.maximum(dense.sum(axis=0), 1e-12)
+    centers = share.T @ rest
+    transforms = np.empty((len(positions), dense.shape[1], 3, 4))
+    moments = np.einsum("vp,va->vpa", share, rest) - share[:, :, None] * centers
+    for frame, points in enumerate(positions):
+        middle = share.T @ points
+        covariance = np.einsum("va,vpb->pab", points, moments)
+        turned = nearest_rotations(covariance)
+        transforms[frame, :, :, :3] = turned
+        transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
     patches = dense.shape[1]
     body = Body(
         rest_positions=jnp.asarray(rest, jnp.float32),
@@ -84,22 +95,10 @@ def pose_sequence(
     return body, body_motion(body, *moved, fps=fps)
 
 
-def _resample(positions: NDArray, fps_in: float, fps_out: float) -> NDArray:
-    """Return positions at another frame rate, by straight lines between frames."""
-    count = count_resampled(len(positions), fps_in, fps_out)
-    at = np.arange(count) * (fps_in / fps_out)
-    before = np.clip(at.astype(int), 0, max(len(positions) - 2, 0))
-    share = np.clip(at - before, 0.0, 1.0)[:, None, None]
-    after = np.minimum(before + 1, len(positions) - 1)
-    return (1 - share) * positions[before] + share * positions[after]
-
-
 def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Divide a surface into patches with soft borders.
+    """Return the largest weights of soft-bordered patches at every vertex, and their patches; and all weights.
 
-    Returns:
-        The largest weights of every vertex, which sum to one, and their patches, shape [vertices, influences];
-        and all weights, shape [vertices, patches].
+    Shapes are [vertices, influences], where rows sum to one, twice, and [vertices, patches].
     """
     edges = unique_edges(faces)
     lengths = np.maximum(np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1), 1e-9)
@@ -120,21 +119,3 @@ def _patch_weights(rest: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDA
     indices = np.argsort(-dense, axis=1, kind="stable")[:, :used]
     weights = np.take_along_axis(dense, indices, axis=1)
     return weights / weights.sum(1, keepdims=True), indices, dense
-
-
-def _fit_patches(positions: NDArray, rest: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
-    """Return each patch's best rigid motion, shape [frames, patches, 3, 4], and rest centre, [patches, 3].
-
-    Source: Kabsch 1976 (doi:10.1107/S0567739476001873).
-    """
-    share = weights / np.maximum(weights.sum(axis=0), 1e-12)
-    centers = share.T @ rest
-    transforms = np.empty((len(positions), weights.shape[1], 3, 4))
-    moments = np.einsum("vp,va->vpa", share, rest) - share[:, :, None] * centers
-    for frame, points in enumerate(positions):
-        middle = share.T @ points
-        covariance = np.einsum("va,vpb->pab", points, moments)
-        turned = nearest_rotations(covariance)
-        transforms[frame, :, :, :3] = turned
-        transforms[frame, :, :, 3] = middle - np.einsum("pab,pb->pa", turned, centers)
-    return transforms, centers
