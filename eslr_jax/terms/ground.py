@@ -109,4 +109,4 @@ class Ground(Term):
 
     def describe(self, garment: Garment) -> str:
         """Return where it is."""
-        return f"ground at {float(self.height or 0.0):.2f} m"
+        return f"at {float(self.height or 0.0):.2f} m"

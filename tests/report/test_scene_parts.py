@@ -9,8 +9,8 @@ from eslr_jax.terms import CLOTH, Air, Damping, Repulsion
 from eslr_jax.types import Threads
 
 
-def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene, small_config):
-    parts = describe_scene(small_scene, small_poses, small_config)
+def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene):
+    parts = describe_scene(small_scene, small_poses, None)
     assert set(parts.modelled) == {
         "stretch", "bending", "inertia", "gravity", "collision", "friction", "body",
     }  # fmt: skip
@@ -19,14 +19,14 @@ def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene,
     }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
     options = {"terms": (*CLOTH, Repulsion(where="all"), Air((3.0, 0.0, 4.0)), Damping(0.01))}
-    bare = describe_scene(prepare_scene(small_garment, small_poses, **options), small_poses, small_config)
-    assert bare.left_out["collision"] == "no body and no ground in reach"
+    bare = describe_scene(prepare_scene(small_garment, small_poses, **options), small_poses, None)
+    assert bare.left_out["collision"] == "no body in reach"
     assert bare.modelled["repulsion"] == "layers of cloth"
     assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
     scene = prepare_scene(small_garment, small_poses, integrator="bdf2", substeps=2)
     threads = Threads(warp=jnp.ones((100, 2)), stiffness=jnp.ones((4, 100)))
     woven = scene.replace(material=scene.material.replace(threads=threads))
-    parts = describe_scene(woven, small_poses, small_config)
+    parts = describe_scene(woven, small_poses, None)
     assert parts.modelled["fabric by part"] == "threads"
     assert parts.modelled["substeps"] == "2 a frame"
     assert "BDF2" in parts.modelled
@@ -45,7 +45,7 @@ def test_the_slower_of_two_functions_takes_longer_in_turns():
 
 
 @pytest.mark.slow
-def test_parts_of_a_frame_are_timed(small_scene, small_config):
+def test_parts_of_a_frame_are_timed(small_scene):
     times = time_parts(None, small_scene, small_config)
     assert times["whole frame"] > times["searches for contacts"]
     assert times["whole frame"] > times["preconditioner"]

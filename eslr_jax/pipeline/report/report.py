@@ -101,11 +101,8 @@ def trajectory_report(
 
 
 def describe_terms(scene: Scene) -> dict[str, str]:
-    """Return a few words on the terms that a scene models, by name."""
-    words: dict[str, str] = {}
-    for term in scene.terms:
-        words[term.name] = ", ".join(filter(None, (words.get(term.name), term.describe(scene.garment))))
-    return words
+    """Return a few words on the terms that a scene models, by the names of their types."""
+    return {type(term).__name__.lower(): term.describe(scene.garment) for term in scene.terms}
 
 
 def describe_model(scene: Scene) -> dict[str, Any]:

@@ -40,7 +40,8 @@ def describe_scene(scene: Scene, poses: BodyMotion, network: Network | None) -> 
     """Return what a scene of `prepare_scene` models, given the motion that it was made from, and a network."""
     modelled = describe_terms(scene)
     known = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.0))
-    left_out = {term.name: term.unless_needed for term in known if term.name not in modelled}
+    names = {type(term).__name__.lower(): term for term in known}
+    left_out = {name: term.unless_needed for name, term in names.items() if name not in modelled}
 
     def sort(name: str, is_modelled: bool, size: str, why: str) -> None:
         (modelled if is_modelled else left_out)[name] = size if is_modelled else why
