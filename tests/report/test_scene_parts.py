@@ -45,7 +45,7 @@ def test_the_slower_of_two_functions_takes_longer_in_turns():
 
 
 @pytest.mark.slow
-def test_parts_of_a_frame_are_timed(small_scene):
+def test_parts_of_a_frame_are_timed(small_scene, small_config):
     times = time_parts(None, small_scene, small_config)
     assert times["whole frame"] > times["searches for contacts"]
     assert times["whole frame"] > times["preconditioner"]
