@@ -41,7 +41,7 @@ def main() -> None:
 
     def bare(trained, moments, problem):
         def loss_of(trained):
-            return physics_loss({**state.params, "params": trained}, problem, cloth, config)[0]
+            return physics_loss(state.network.replace(params=trained), problem, cloth, config)[0]
 
         gradient = jax.grad(loss_of)(trained)
         updates, moments = optimizer.update(gradient, moments, trained)
@@ -52,13 +52,13 @@ def main() -> None:
     times = take_turns(
         {
             "whole step": (lambda state: step.__wrapped__(state, data), (state,)),
-            "forward, backward, update": (bare, (state.params["params"], state.optimizer, problem)),
+            "forward, backward, update": (bare, (state.network.params, state.optimizer, problem)),
         },
         1 if chosen.smoke else 40,
     )
     whole, alone = times.values()
     result = {
-        "model_parameters": sum(leaf.size for leaf in jax.tree.leaves(state.params["params"])),
+        "model_parameters": sum(leaf.size for leaf in jax.tree.leaves(state.network.params)),
         "vertices": config.vertices[0],
         "ms": times,
         "overhead": whole / alone - 1,
