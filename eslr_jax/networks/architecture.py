@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 from typing import Any, ClassVar, Literal, cast
@@ -28,7 +29,7 @@ _MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
-class Architecture(System):
+class Architecture(System, abc.ABC):
     """Options of every network on a garment's graph.
 
     Without `correction_scale` it reads HOOD's features and predicts an acceleration, as in the paper. With it, it
@@ -71,9 +72,9 @@ class Architecture(System):
         return GraphKind(self.reads_gradient, world_edge_radius=self.world_edge_radius)
 
     @property
+    @abc.abstractmethod
     def module(self) -> nn.Module:
         """The Flax module, with the methods of `eslr.EncodeProcessDecode`."""
-        raise NotImplementedError
 
     def draw_constants(self) -> dict[str, Any]:
         """Return arrays that are not trained."""

@@ -166,6 +166,11 @@ def body_motion(body: Body, positions: jax.Array, joint_transforms: jax.Array, *
     )
 
 
+def lowest_point(poses: BodyMotion) -> float:
+    """Return the height of the lowest point of a moving body [m]."""
+    return float(np.min(np.asarray(poses.positions)[..., 1]))
+
+
 def check_length(poses: BodyMotion) -> None:
     """Check that a body in motion has frames to simulate.
 

@@ -137,12 +137,13 @@ def prepare_scenes(
             "fabrics by part, threads or bending in N m one by one"
         )
     padded = pad_alike(garments, common_bucket([choose_bucket(garment) for garment in garments]))
-    surface = shared_surface(padded, poses[0])
+    asked_for = scene_terms() if terms is None else terms
+    surface = shared_surface(padded, poses[0]) if any(term.reads_body for term in asked_for) else None
     worn = [Worn(garment, motion, surface) for garment, motion in zip(padded, poses, strict=True)]
     plans: list[list[Term]] = [[] for _ in worn]
     for one in worn:
         _check(one.garment, one.poses)
-    for term in scene_terms() if terms is None else terms:
+    for term in asked_for:
         term.check()
         asked = [term.plan(one, plan) for one, plan in zip(worn, plans, strict=True)]
         if needed := [one for one in asked if one is not None]:

@@ -76,16 +76,14 @@ def stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> St
     )
 
 
-def stretched_stiffness(
-    problem: FrameProblem, position: Float[Array, "vertices 3"], at_rest: Stiffness | None = None
-) -> Stiffness:
+def stretched_stiffness(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Stiffness:
     """Return the stiffness that the solver starts from: springs as they are stretched at `position`.
 
     A spring of the St. Venant-Kirchhoff membrane stiffens with the square of its stretch. The diagonal changes by
     the sum of the changes of a vertex's springs, and no more: with a larger diagonal long waves converge slowly
-    (experiments/tried.md). Networks take `stiffness`, which they were trained with. It may be given as `at_rest`.
+    (experiments/tried.md). Networks take `stiffness`, which they were trained with.
     """
-    matrix = stiffness(problem, position) if at_rest is None else at_rest
+    matrix = stiffness(problem, position)
     squared, rest = (
         _squared_lengths(points, matrix.neighbors) for points in (position, problem.garment.sewn_positions)
     )

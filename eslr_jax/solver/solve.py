@@ -25,7 +25,7 @@ from eslr_jax.solver import tangent
 from eslr_jax.solver.lbfgs import Minimum, Stop, minimize
 from eslr_jax.solver.minres import LinearSolution, solve_symmetric
 from eslr_jax.solver.potential import Point, potential
-from eslr_jax.solver.preconditioner import Stiffness, stiffness, stretched_stiffness
+from eslr_jax.solver.preconditioner import hessian_diagonal, stretched_stiffness
 from eslr_jax.terms.problem import FrameProblem, weight_norm
 
 SOLUTION = "solution"  # what checkpointing keeps of a frame, so that it is not solved twice
@@ -91,14 +91,14 @@ def _solve(
     problem: FrameProblem, start: Start, limits: tuple[Int[Array, ""], Float[Array, ""]], memory: int
 ) -> Minimum:
     stop = Stop(*limits, start.inertial_energy)
-    return _minimum(problem, start, stop, memory, stiffness(problem, start.position))
+    return _minimum(problem, start, stop, memory)
 
 
-def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int, at_rest: Stiffness) -> Minimum:
+def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int) -> Minimum:
     return minimize(
         lambda position: potential(position, problem),
         start.position,
-        stretched_stiffness(problem, start.position, at_rest),
+        stretched_stiffness(problem, start.position),
         stop,
         memory=memory,
         previous=start.previous,
@@ -116,10 +116,9 @@ def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, A
     """
     problem, start, (iterations, _) = primals
     spacing = jnp.finfo(start.position.dtype).eps * jnp.max(jnp.abs(start.position))
-    at_rest = stiffness(problem, start.position)
-    rounding = spacing * safe_norm(at_rest.diagonal)
+    rounding = spacing * safe_norm(hessian_diagonal(problem, start.position))
     stop = Stop(jnp.maximum(iterations, _MOST_ITERATIONS), 0.0, start.inertial_energy, rounding)
-    minimum = _minimum(problem, start, stop, memory, at_rest)
+    minimum = _minimum(problem, start, stop, memory)
     is_refused = safe_norm(minimum.gradient.reshape(-1)) > _REFUSED * weight_norm(problem)
     position, is_refused = checkpoint_name((minimum.position, is_refused), SOLUTION)
     status = jnp.where(is_refused, jnp.int32(Status.DERIVATIVE_REFUSED), jnp.int32(Status.OK))

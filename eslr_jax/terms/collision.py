@@ -15,7 +15,14 @@ from eslr_jax.contact.self_contact import TipPairs, find_tip_contacts
 from eslr_jax.contact.skin import SkinContacts, find_skin_contacts, lift_off_skin, skin_heights
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import Vector3, components, dot3, in_memory, segment_sum, sub3
-from eslr_jax.terms.problem import STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem, contact_thickness
+from eslr_jax.terms.problem import (
+    CONTACT_STIFFNESS,
+    CONTACT_THICKNESS,
+    STIFFNESS_RANGE,
+    THICKNESS_RANGE,
+    FrameProblem,
+    contact_thickness,
+)
 from eslr_jax.terms.repulsion import push_apart, repulsion_diagonal, repulsion_energies
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term, sum_elements
@@ -49,10 +56,8 @@ class Collision(Term):
     unless_needed = "no body in reach"
     ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
 
-    # [J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt. A stiffer
-    # fabric than HOOD's has stiffer contacts, see `contact_excess`.
-    stiffness: Float[Array, ""] | float = 3.5e7
-    thickness: Float[Array, ""] | float = 2e-3  # [m] (HOOD), see `problem.contact_thickness`
+    stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
+    thickness: Float[Array, ""] | float = CONTACT_THICKNESS  # [m], see `problem.contact_thickness`
     has_skin: bool = struct.field(pytree_node=False, default=False)
     has_tips: bool = struct.field(pytree_node=False, default=False)
 

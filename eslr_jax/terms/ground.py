@@ -16,7 +16,13 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.numerics import Vector3
 from eslr_jax.ranges import Range, check_number
 from eslr_jax.terms.collision import collision_energies, contact_forces, lifted, penetration
-from eslr_jax.terms.problem import STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem
+from eslr_jax.terms.problem import (
+    CONTACT_STIFFNESS,
+    CONTACT_THICKNESS,
+    STIFFNESS_RANGE,
+    THICKNESS_RANGE,
+    FrameProblem,
+)
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Term
 from eslr_jax.terms.worn import Worn
@@ -48,8 +54,8 @@ class Ground(Term):
     is_always: bool = struct.field(
         pytree_node=False, default=False
     )  # modelled also where no cloth reaches it
-    stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], as of the body
-    thickness: Float[Array, ""] | float = 2e-3  # distance that vertices keep [m]
+    stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
+    thickness: Float[Array, ""] | float = CONTACT_THICKNESS  # distance that vertices keep [m]
 
     def check(self) -> None:
         """Check its constants and its height (host)."""

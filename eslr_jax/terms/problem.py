@@ -14,6 +14,10 @@ from eslr_jax.terms.term import Term
 from eslr_jax.types import BodySurface, Garment, Material
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
+# [J/m^5] per cloth area: HOOD's weight of 5e3 J/m^3 a vertex on its 4424-vertex, 0.628 m^2 T-shirt. A stiffer
+# fabric than HOOD's has stiffer contacts, see `stretch.contact_excess`.
+CONTACT_STIFFNESS = 3.5e7
+CONTACT_THICKNESS = 2e-3  # [m] (HOOD)
 STIFFNESS_RANGE = Range(0.0, 1e12, "J/m^5")  # of contact
 THICKNESS_RANGE = Range(0.0, 5e-2, "m")
 _GRAVITY = 9.81  # [m/s^2], of the unit of residuals where a scene has no gravity

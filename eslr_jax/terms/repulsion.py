@@ -34,7 +34,13 @@ from eslr_jax.numerics import (
     sub3,
     take3,
 )
-from eslr_jax.terms.problem import STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem, contact_thickness
+from eslr_jax.terms.problem import (
+    CONTACT_STIFFNESS,
+    STIFFNESS_RANGE,
+    THICKNESS_RANGE,
+    FrameProblem,
+    contact_thickness,
+)
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Elements, Term
 from eslr_jax.terms.worn import Worn
@@ -68,7 +74,7 @@ class Repulsion(Term):
     unless_needed = "no layers that can meet"
     ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "thickness": THICKNESS_RANGE})
 
-    stiffness: Float[Array, ""] | float = 3.5e7  # [J/m^5], as of the body
+    stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
     thickness: Float[Array, ""] | float = 3e-3  # [m] (ContourCraft)
     where: Literal["pieces", "folds", "all"] = struct.field(pytree_node=False, default="pieces")
     # Rows for pairs of a vertex and a face; None: to be planned. `simulate` enlarges them where they are too few.
@@ -90,10 +96,10 @@ class Repulsion(Term):
         it `num_rows`, or check the status of the trajectory.
         """
         is_one_piece, pieces = worn.num_pieces == 1, None
+        if is_one_piece and self.where == "pieces":
+            return None
         if self.where != "all":
             if not (worn.meets_itself() if is_one_piece else worn.pieces_meet()):
-                return None
-            if is_one_piece and self.where == "pieces":
                 return None
             pieces = None if is_one_piece else jnp.asarray(worn.pieces)
         rows = starting_rows(len(worn.pieces), worn.num_pieces) if self.num_rows is None else self.num_rows

@@ -14,7 +14,7 @@ from eslr_jax.contact.self_contact import SEARCH_RADIUS
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.mesh.topology import vertex_components
 from eslr_jax.pose.lbs import skin_garment
-from eslr_jax.pose.motion import SHOULDERS
+from eslr_jax.pose.motion import SHOULDERS, lowest_point
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment
 
 # [m] that cloth may be away from its skinned place, besides its distance from the body at rest. Body faces that
@@ -78,7 +78,7 @@ class Worn:
     @property
     def lowest_point(self) -> float:
         """Height of the lowest point of the moving body [m]."""
-        return float(np.min(np.asarray(self.poses.positions)[..., 1]))
+        return lowest_point(self.poses)
 
     def could_fall(self) -> bool:
         """Tell whether a part has no pin, and no cloth above the shoulders that it could hang from."""

@@ -205,18 +205,16 @@ class Info:
         from eslr_jax.pipeline.report.scene_parts import describe_scene, time_parts
         from eslr_jax.pose.motion import pose_body
         from eslr_jax.simulation.plan import prepare_scene
-        from eslr_jax.terms import Collision, Repulsion, scene_terms
 
         use_compile_cache()
         check_resolution([garment], self.vertices)
-        method = choose_method(Options(simulator=self.simulator))
-        layers = Repulsion(where="all" if self.self_contact else "folds")
-        terms = scene_terms(Collision(has_skin=True), layers)  # those of `eslr simulate`
+        options = Options(simulator=self.simulator, self_contact=self.self_contact)
+        method = choose_method(options)
         with waiting("measuring"):
             rig = load_body()
             poses = pose_body(rig, load_motion(self.motion or DEFAULT_MOTION))
             cloth = load_garment(garment, vertices=self.vertices, body=rig)
-            scene = prepare_scene(cloth, poses, terms=terms, integrator="bdf2")
+            scene = prepare_scene(cloth, poses, terms=options.terms(has_solver=True), integrator="bdf2")
             parts = describe_scene(scene, poses, method.params)
             costs = time_parts(method.params, scene, method.config)
         if self.json:

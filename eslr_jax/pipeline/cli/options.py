@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from eslr_jax.errors import ConfigError
+
+if TYPE_CHECKING:
+    from eslr_jax.terms import Term
 
 DEFAULT_GARMENT = "tshirt"
 
@@ -112,6 +115,20 @@ class Options:
                 raise ConfigError(f"--{name} {value}: give a number, 0 or more")
         if self.self_contact and self.no_self_contact:
             raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
+
+    def terms(self, *, has_solver: bool) -> tuple[Term, ...]:
+        """Return what is modelled where it is needed; networks alone know no skin and no folds."""
+        from eslr_jax.terms import Collision, Damping, Ground, Repulsion, scene_terms
+        from eslr_jax.terms.air import blowing
+
+        layers = Repulsion(where="all" if self.self_contact else "folds" if has_solver else "pieces")
+        changed = [Collision(has_skin=has_solver), Ground(is_always=self.ground == "on"), layers]
+        if (air := blowing(self.wind, self.gust)) is not None:
+            changed.append(air)
+        if self.damping is not None:
+            changed.append(Damping(self.damping))
+        left_out = (Ground,) * (self.ground == "off") + (Repulsion,) * self.no_self_contact
+        return scene_terms(*changed, without=left_out)
 
     def record(self) -> dict[str, Any]:
         """Return the options as plain values, by name."""

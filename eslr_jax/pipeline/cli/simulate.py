@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from eslr_jax.pipeline.formats.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.terms import Term
     from eslr_jax.types import Material, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
@@ -205,7 +204,7 @@ def _prepare(options: Options) -> _Setting:
         cloth,
         settling,
         material=material,
-        terms=_modelled(options, has_solver=has_solver),
+        terms=options.terms(has_solver=has_solver),
         integrator=options.integrator or ("bdf2" if has_solver else "euler"),
         substeps=options.substeps,
         on_shapes=begin,
@@ -214,21 +213,6 @@ def _prepare(options: Options) -> _Setting:
         vertices = np.asarray(scene.body.surface.vertex_ids)
         check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
     return _Setting(names, garments, stored, actor, material, method, settle, scene)
-
-
-def _modelled(options: Options, *, has_solver: bool) -> tuple[Term, ...]:
-    """Return the terms that the options ask for, where they are needed; networks alone know no skin, no folds."""
-    from eslr_jax.terms import Collision, Damping, Ground, Repulsion, scene_terms
-    from eslr_jax.terms.air import blowing
-
-    layers = Repulsion(where="all" if options.self_contact else "folds" if has_solver else "pieces")
-    changed = [Collision(has_skin=has_solver), Ground(is_always=options.ground == "on"), layers]
-    if (air := blowing(options.wind, options.gust)) is not None:
-        changed.append(air)
-    if options.damping is not None:
-        changed.append(Damping(options.damping))
-    left_out = (Ground,) * (options.ground == "off") + (Repulsion,) * options.no_self_contact
-    return scene_terms(*changed, without=left_out)
 
 
 def _announce(options: Options, setting: _Setting) -> None:

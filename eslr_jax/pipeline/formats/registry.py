@@ -114,7 +114,12 @@ def names_of(*kinds: str) -> str:
 
 def _all(*kinds: str) -> list[_Format]:
     """Return the formats of some kinds, in the order of the kinds."""
-    # All files of this folder register their formats when they are first imported.
+    _import_formats()
+    return [form for kind in kinds for form in _formats if form.kind == kind]
+
+
+@functools.cache
+def _import_formats() -> None:
+    """Import all files of this folder, which registers their formats."""
     for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         importlib.import_module(f"{__package__}.{module.name}")
-    return [form for kind in kinds for form in _formats if form.kind == kind]

@@ -43,7 +43,7 @@ from eslr_jax.pipeline.page.stage import (
 from eslr_jax.pipeline.report.report import describe_model
 from eslr_jax.pipeline.report.run import ClothTrack, write_run
 from eslr_jax.pipeline.rigs.clothing import Piece, body_pieces, garment_pieces
-from eslr_jax.pose.motion import pose_body, there_and_back
+from eslr_jax.pose.motion import lowest_point, pose_body, there_and_back
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.scene import slice_tracks
 from eslr_jax.simulation.stepper import FrameReport, keeps_tolerance
@@ -271,7 +271,7 @@ def _load(live: Live, choice: Choice) -> None:
         rig = load_body(choice.body, betas=choice.betas)
         poses = with_settling(pose_body(rig, load_motion(choice.motion, body=rig)), SETTLE_FRAMES, rig)
         spots, drawn_body = np.array(poses.positions).mean(axis=1), []
-        spots[:, 1] = float(np.min(np.asarray(poses.positions)[..., 1]))
+        spots[:, 1] = lowest_point(poses)
         body = body_pieces(np.asarray(poses.rest_positions), np.asarray(poses.faces), rig)
         standing = np.asarray(poses.positions[0]) - spots[0]
         if live.cast is None:  # there is something to see while the rest loads

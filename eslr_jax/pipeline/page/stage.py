@@ -110,10 +110,9 @@ def _staged(scene: Scene, material: Material) -> Stage:
 
 def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
     """Return a stage with another fabric, wind [m/s] and hand."""
-    asked = jax.tree.map(jnp.asarray, (Air(jnp.asarray(wind, jnp.float32)), hand))
+    air, hand = jax.tree.map(jnp.asarray, (Air(jnp.asarray(wind, jnp.float32)), hand))
     material = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), material, stage.constant.material)
-    terms = (*stage.constant.terms[: -len(asked)], *asked)  # they stand last
-    constant = stage.constant.replace(material=material, terms=terms)
+    constant = stage.constant.replace(material=material).with_term(air).with_term(hand)
     return stage._replace(constant=constant)
 
 

@@ -125,10 +125,7 @@ def energy_shares(
     """
     x = components(pin(problem, position))
     parts = [
-        part
-        for term, data in zip(problem.terms, problem.data, strict=True)
-        if term.name == name
-        for part in term.elements(x, problem, data)
+        part for term, data in problem.parts if term.name == name for part in term.elements(x, problem, data)
     ]
     return vertex_shares(tuple(parts), x[0].shape[0])
 
