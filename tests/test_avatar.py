@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from formats import write_smpl, write_walker
+from foreign_files import write_smpl, write_walker
 from other_bodies import smpl_female
 
 from eslr_jax import load_garment, load_motion, pose_body

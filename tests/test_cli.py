@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import eslr, eslr_here, refused
-from formats import smpl_model, write_amass, write_bvh
+from foreign_files import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 
 from eslr_jax.config import from_dict

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from formats import write_walker
+from foreign_files import write_walker
 from garment_files import scanned_tshirt
 
 ROOT = Path(__file__).parents[1]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from broken import refuses
-from formats import write_bvh
+from foreign_files import write_bvh
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.pipeline.assets import load_motion

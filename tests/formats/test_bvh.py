@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from formats import write_bvh
+from foreign_files import write_bvh
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.pipeline.formats.bvh import read_bvh

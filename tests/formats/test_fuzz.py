@@ -15,7 +15,7 @@ import time
 import numpy as np
 import pytest
 from broken import pack, tables_of
-from formats import write_bvh
+from foreign_files import write_bvh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from whole_files import ACCLAIM, ARRAYS, BYTES, character, small_motion

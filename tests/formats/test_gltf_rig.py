@@ -7,7 +7,7 @@ import numpy as np
 import pygltflib as gltf
 import pytest
 from broken import pack, refuses
-from formats import GlbWriter, write_character
+from foreign_files import GlbWriter, write_character
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.pipeline.formats.gltf_document import GltfDocument, sample_keys

@@ -9,7 +9,15 @@ import jax
 import numpy as np
 import pytest
 import scipy.sparse
-from formats import SMPL_NAMES, SMPL_PARENTS, joint_regressor, smpl_model, write_amass, write_hood, write_vto
+from foreign_files import (
+    SMPL_NAMES,
+    SMPL_PARENTS,
+    joint_regressor,
+    smpl_model,
+    write_amass,
+    write_hood,
+    write_vto,
+)
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from formats import SMPL_PARENTS, write_amass, write_bvh, write_character, write_hood, write_vto
+from foreign_files import SMPL_PARENTS, write_amass, write_bvh, write_character, write_hood, write_vto
 
 from eslr_jax.files.npz import write_arrays
 from eslr_jax.pipeline.assets.motions import read_joint_map

@@ -14,7 +14,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from formats import write_walker
+from foreign_files import write_walker
 from scipy.spatial import cKDTree
 
 from eslr_jax.mesh.closest import closest_points

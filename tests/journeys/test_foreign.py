@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from formats import smpl_parameters, write_amass, write_hood
+from foreign_files import smpl_parameters, write_amass, write_hood
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
 from PIL import Image
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from formats import (
+from foreign_files import (
     Z_UP_FROM_Y_UP,
     smpl_parameters,
     write_amass,

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from formats import write_bvh
+from foreign_files import write_bvh
 
 from eslr_jax.errors import MotionError
 from eslr_jax.pipeline.assets import load_motion
