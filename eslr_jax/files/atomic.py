@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from eslr_jax.errors import AssetError
@@ -64,20 +66,41 @@ def ensure_output_dir(path: str | Path) -> Path:
     return folder
 
 
-def move_files(source: Path, target: Path) -> None:
-    """Move the files of a folder that are written and flushed into another on the same disk.
+def move_files(source: Path, target: Path, *, without: Iterable[str] = ()) -> None:
+    """Move the files of a folder that are written and flushed into another on the same disk: all of them or none.
+
+    Files that they replace are set aside until the last one is in its place, and come back if one can't be moved.
+
+    Args:
+        source: Folder of the new files.
+        target: Folder that they go to.
+        without: Names of files that `target` shall not have any more.
 
     Raises:
         AssetError: A name is taken by a folder.
     """
-    for file in sorted(source.iterdir()):
-        try:
-            os.replace(file, target / file.name)
-        except OSError as error:
-            raise AssetError(
-                f"can't write {target / file.name}: {_reason(error)}; free the name or choose another folder"
-            ) from error
+    new = sorted(file.name for file in source.iterdir())
+    aside = Path(tempfile.mkdtemp(prefix=".old-", dir=target))
+    moved: list[tuple[Path, Path]] = []
+    try:
+        for name in (*new, *without):
+            moves = [(target / name, aside / name)] if (target / name).is_file() else []
+            moves += [(source / name, target / name)] if name in new else []
+            for here, there in moves:
+                try:
+                    os.replace(here, there)
+                except OSError as error:
+                    raise AssetError(
+                        f"can't write {target / name}: {_reason(error)}; free the name or choose another folder"
+                    ) from error
+                moved.append((here, there))
+    except BaseException:
+        for here, there in reversed(moved):
+            os.replace(there, here)
+        aside.rmdir()
+        raise
     _flush(target)
+    shutil.rmtree(aside)
 
 
 def _flush(path: Path) -> None:

@@ -128,8 +128,19 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path, body, monkeypatch):
             report={"total": 2.0},
         )
     assert sorted(path.name for path in tmp_path.iterdir()) == names
+    monkeypatch.undo()
+    (tmp_path / "trajectory.npz").rename(tmp_path / "kept")
+    (tmp_path / "trajectory.npz").mkdir()  # the last of the files: those before it are in place
+    with pytest.raises(AssetError, match=r"can't write .*trajectory\.npz"):
+        write_run(tmp_path, track, None, (rig, poses, garment), report={"total": 2.0})
+    (tmp_path / "trajectory.npz").rmdir()
+    (tmp_path / "kept").rename(tmp_path / "trajectory.npz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
     kept = read_run(tmp_path)
+    assert kept.scene.num_frames == 3
     assert kept.report == {"total": 1.0}
     np.testing.assert_allclose(kept.trajectory.positions, moved, atol=1e-5)
     again = run_trajectory(kept)
     np.testing.assert_array_equal(again.residuals, residuals)
+    write_run(tmp_path, track, None, (rig, poses, garment), report={"total": 3.0})
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name for name in names if name != "scene.npz"]

@@ -44,7 +44,7 @@ class Run:
 
         Raises:
             AssetError: There is no `scene.npz`, it is damaged, or it is not the trajectory's; or it has a term
-                whose module is not imported.
+                whose module can't be imported.
         """
         file = self.folder / "scene.npz"
         if not file.is_file():
@@ -77,7 +77,7 @@ def write_run(
     *,
     report: dict[str, Any],
 ) -> None:
-    """Write the folder of a run; files are moved there when all are written, so that those of two runs don't mix.
+    """Write the folder of a run: all of its files or, if one can't be written, none, and those before stay.
 
     Args:
         folder: It is made if it is not there.
@@ -121,9 +121,7 @@ def write_run(
         export_trajectory(file, new / "animation.glb", garment=stored)
         if scene is not None:
             save_scene(new / "scene.npz", scene)
-        else:  # of an earlier run
-            (folder / "scene.npz").unlink(missing_ok=True)
-        move_files(new, folder)
+        move_files(new, folder, without=() if scene is not None else ("scene.npz",))  # of an earlier run
 
 
 def is_run(path: str | Path) -> bool:
