@@ -13,13 +13,16 @@ import pytest
 from commands import eslr, eslr_here, refused
 from foreign_files import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
+from own_term import Push
 
 from eslr_jax.config import from_dict
+from eslr_jax.errors import ConfigError
 from eslr_jax.pipeline.assets import load_body, load_garment_file, load_motion
 from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.garment import read_garment_npz
 from eslr_jax.pipeline.rigs.rig import skeleton_motion
+from eslr_jax.terms import Repulsion
 
 
 @pytest.mark.slow
@@ -38,8 +41,35 @@ def test_simulate_writes_everything(tmp_path):
     assert report["num_frames"] == 4
     assert json.loads((tmp_path / "report.json").read_text()) == report
     assert {path.name for path in tmp_path.iterdir()} == {
-        "trajectory.npz", "garment.npz", "animation.glb", "sheet.png", "report.json",
+        "trajectory.npz", "scene.npz", "garment.npz", "animation.glb", "sheet.png", "report.json",
     }  # fmt: skip
+
+
+def test_a_term_of_ones_own_takes_its_constants_and_choices_from_the_command_line():
+    terms = Options(term=("own_term:Push,pressure=2", "eslr_jax.terms:Repulsion,where='all'")).terms(
+        has_solver=True
+    )
+    assert terms[-1] == Push(np.float32(2.0))
+    assert [term.where for term in terms if isinstance(term, Repulsion)] == ["all"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("own_terms:Push", "No module named 'own_terms'"),
+        ("own_term", "no class of this name"),
+        ("own_term:struct", "no class of this name"),
+        ("own_term:Push", "pressure"),
+        ("own_term:Push,pressure=", "write all its constants"),
+        ("own_term:Push,pressure='strong'", "could not convert"),
+        ("own_term:Push,pressure=2,speed=3", "speed"),
+    ],
+)
+def test_a_term_that_can_not_be_made_is_refused_in_one_line(text, reason):
+    with pytest.raises(ConfigError, match=reason) as caught:
+        Options(term=(text,)).terms(has_solver=True)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow

@@ -32,12 +32,14 @@ def test_a_scene_survives_its_file_with_all_that_it_models(tmp_path):
     assert types[0] == types[1]
 
 
-def test_a_term_is_found_where_its_module_is_imported(tmp_path):
+def test_a_term_whose_module_is_not_there_is_named(tmp_path):
     save_scene(tmp_path / "scene.npz", all_of_a_scene(Push(0.5)))
     code = "import sys, eslr_jax\ntry: eslr_jax.load_scene(sys.argv[1])\nexcept eslr_jax.EslrError as e: print(e)"
     command = [sys.executable, "-c", code, str(tmp_path / "scene.npz")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert result.stdout.strip().endswith("which is not known; import own_term first")
+    assert result.stdout.strip().endswith(
+        "run the command where own_term.py is, or put its folder on PYTHONPATH"
+    )
 
 
 def test_a_function_of_ones_own_is_refused_when_it_is_written(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
-import sys
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +14,7 @@ from jax.tree_util import Partial
 
 from eslr_jax.errors import AssetError, ConfigError
 from eslr_jax.files.npz import read_arrays, write_arrays
-from eslr_jax.terms import Term
+from eslr_jax.terms.term import find_term
 from eslr_jax.types import Scene
 
 _OWN = "eslr_jax."  # package whose types and functions a file may name
@@ -40,10 +39,10 @@ def save_scene(path: str | Path, scene: Scene) -> None:
 def load_scene(path: str | Path) -> Scene:
     """Read a scene that `save_scene` wrote.
 
-    A term of one's own is found where its module has been imported before.
+    The module of a term of one's own is imported.
 
     Raises:
-        AssetError: The file is missing, damaged, or of another version, or a term's module is not imported.
+        AssetError: The file is missing, damaged, or of another version, or a term's module can't be imported.
     """
     return read_tree(path, Scene, content="scene", remedy="write it again with save_scene")
 
@@ -126,7 +125,7 @@ def _find(name: str) -> Any:
         found = getattr(importlib.import_module(module), qualified)
         if getattr(found, "__module__", "") == module:
             return found
-    found = getattr(sys.modules.get(module), qualified, None)
-    if not (isinstance(found, type) and issubclass(found, Term)):
-        raise AssetError(f"the scene has a term {name}, which is not known; import {module} first")
-    return found
+    try:
+        return find_term(name)
+    except ConfigError as error:
+        raise AssetError(f"the scene has a {error}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.errors import Status
+from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import Vector3, gather_corners, segment_sum
 from eslr_jax.ranges import Range, check_number
 
@@ -159,6 +160,26 @@ class Term:
             "vertices": garment.vertex_mask,
         }
         return "" if self.on is None else f"{int(np.sum(np.asarray(sizes[self.on]) > 0))} {self.on}"
+
+
+def find_term(name: str) -> type[Term]:
+    """Return the term of MODULE:CLASS; the module is imported (host).
+
+    Raises:
+        ConfigError: There is no such module, or it has no such term.
+    """
+    module, _, kind = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), kind, None) if module and kind else None
+    except ImportError as error:
+        raise ConfigError(
+            f"term {name}: {error}; run the command where {module}.py is, or put its folder on PYTHONPATH"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Term)):
+        raise ConfigError(
+            f"term {name}: no class of this name derives from eslr_jax.terms.Term; write it as MODULE:CLASS"
+        )
+    return found
 
 
 def mesh_corners(

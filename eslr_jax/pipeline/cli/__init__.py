@@ -22,6 +22,7 @@ _BROKEN_PIPE = 128 + 13  # as a shell reports the signal SIGPIPE
 _REPEATABLE = {  # and the commands that collect its values
     "--set": ("train",),
     "--garment": ("simulate", "play", "score"),
+    "--term": ("simulate",),
 }
 
 __all__ = ["app", "main"]
@@ -34,7 +35,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("always", category=UserWarning, module="eslr_jax")
     warnings.showwarning = lambda message, category, *_: say(str(message))  # one line on stderr
-    sys.path.append(os.getcwd())  # last: where networks of one's own are found, as MODULE:NAME
+    sys.path.append(os.getcwd())  # last: where one's own networks and terms are found
     try:
         arguments = sys.argv[1:]  # of an option that is given twice, the second value would silently win
         options = [text.partition("=")[0] for text in arguments if text.startswith("--")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -95,6 +96,9 @@ class Options:
     gust: float = 0.0
     # Internal damping of the fabric in seconds, such as 0.005; it calms fast ripples first.
     damping: float | None = None
+    # An energy of your own, or one in the place of its kind: MODULE:CLASS, then its constants, as in
+    # mywind:Push,pressure=2. Repeat the option for more.
+    term: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
 
     @property
     def garments(self) -> tuple[str, ...]:
@@ -127,6 +131,7 @@ class Options:
             changed.append(air)
         if self.damping is not None:
             changed.append(Damping(self.damping))
+        changed += map(read_term, self.term)
         left_out = (Ground,) * (self.ground == "off") + (Repulsion,) * self.no_self_contact
         return scene_terms(*changed, without=left_out)
 
@@ -134,6 +139,30 @@ class Options:
         """Return the options as plain values, by name."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
         return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+
+
+def read_term(text: str) -> Term:
+    """Return the term of MODULE:CLASS,constant=value; values are read as TOML.
+
+    Raises:
+        ConfigError: There is no such term, or it does not take these constants.
+    """
+    import numpy as np
+
+    from eslr_jax.terms.term import find_term
+
+    name, _, constants = text.partition(",")
+    kind = find_term(name)
+    try:
+        values = tomllib.loads(f"constants = {{{constants}}}")["constants"]
+        for field in dataclasses.fields(kind):  # type: ignore[arg-type]: as a term is a dataclass
+            if field.name in values and field.metadata.get("pytree_node", True):  # else a choice
+                values[field.name] = np.asarray(values[field.name], np.float32)
+        return kind(**values)
+    except (tomllib.TOMLDecodeError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"--term {text}: {error}; write all its constants, as in {name},first=2,second=[0, 1, 0]"
+        ) from error
 
 
 def refuse_given(reason: str, options: dict[str, bool]) -> None:
