@@ -79,7 +79,8 @@ def with_edges(
         corners=jnp.where(is_used, rows, position.shape[0] - 1).T,
         weights=jnp.where(is_used, weights, 0.0).T,
         side=jnp.where(is_used, sign, 0.0),
-        areas=jnp.where(is_used, garment.vertex_areas[rows[0]], 0.0),
+        # Of all four ends: a pair is found from several of them, and rounding says from which first.
+        areas=jnp.where(is_used, jnp.mean(garment.vertex_areas[rows], axis=0), 0.0),
         is_edge=jnp.ones(count, bool),
         count=faces.count,
         status=faces.status,

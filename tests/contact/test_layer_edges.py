@@ -59,6 +59,15 @@ def test_two_folds_cross_between_their_vertices_and_are_found_once(height):
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-5)
 
 
+def test_a_pair_stands_for_the_area_of_all_its_ends_whoever_found_it():
+    """Two ends may find it at heights that differ by rounding alone, and the lower one is kept."""
+    garment, position = layers(0.0005)
+    areas = np.linspace(1e-4, 8e-4, 8, dtype=np.float32)
+    edges = edges_of(position, garment.replace(vertex_areas=jnp.asarray(areas)))
+    (row,) = crossing(edges)
+    assert float(edges.areas[row]) == pytest.approx(areas[[0, 1, 4, 5]].mean(), rel=1e-6)
+
+
 def test_folds_that_have_passed_through_each_other_are_asked_back():
     """The vertices around know the side, as they are over faces that they have not passed."""
     garment, position = layers(-0.001)
