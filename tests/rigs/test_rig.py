@@ -167,8 +167,52 @@ def test_a_rest_pose_that_does_not_stand_is_refused(walking, body):
     names = list(body.joint_names)
     rest[names.index("LeftFoot")] = rest[names.index("LeftLeg")] + [0, 0.4, 0]
     lying = dataclasses.replace(walking.skeleton, rest_positions=rest)
-    with pytest.raises(MotionError, match="does not stand"):
+    with pytest.raises(MotionError, match="stands neither at rest nor in a frame"):
         make_motion(dataclasses.replace(walking, skeleton=lying), body)
+
+
+def test_bones_that_lie_along_one_axis_at_rest_move_the_body_alike(walking, body):
+    """As in LAFAN1: each joint's own axes, of any twist, are the world's at rest, and its bone is along x."""
+    ends = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot", "Foot": "ToeBase"}
+    names, rest, rng = list(body.joint_names), walking.skeleton.rest_positions, np.random.default_rng(0)
+    bones = [
+        (names.index(side + a), names.index(side + b)) for side in ("Left", "Right") for a, b in ends.items()
+    ]
+    own = np.tile(
+        Rotation.from_euler("z", 90, degrees=True).as_matrix(), (len(names), 1, 1)
+    )  # trunk: x is up
+    for start, end in bones:
+        twist = Rotation.from_rotvec([rng.uniform(-np.pi, np.pi), 0, 0])
+        along = Rotation.align_vectors((rest[end] - rest[start])[None], [[1.0, 0, 0]])[0]
+        own[start:] = np.where(
+            below(body, start)[start:, None, None], (along * twist).as_matrix(), own[start:]
+        )
+    lying = np.zeros_like(rest)
+    for joint, parent in enumerate(body.parents[1:], 1):
+        lying[joint] = lying[parent] + own[parent].T @ (rest[joint] - rest[parent])
+    skeleton = dataclasses.replace(walking.skeleton, rest_positions=lying)
+    motion = make_motion(
+        dataclasses.replace(walking, skeleton=skeleton, rotations=walking.rotations @ own), body
+    )
+    found = posed_joints(motion, body)
+    for start, end in bones:
+        ours, theirs = (positions[:, end] - positions[:, start] for positions in (found, walking.positions))
+        cosine = (ours * theirs).sum(-1) / np.linalg.norm(ours, axis=-1) / np.linalg.norm(theirs, axis=-1)
+        most = 10.0 if "Foot" in names[start] else 1.0  # [degrees]; nothing tells how a rig's soles lie
+        assert np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))) < most, names[start]
+    turned = global_rotations(motion.rotations, body.parents)
+    twisted = Rotation.from_matrix(
+        (np.swapaxes(turned, 2, 3) @ walking.rotations).reshape(-1, 3, 3)
+    ).magnitude()
+    assert np.degrees(twisted.max()) < 30.0
+
+
+def below(body, joint):
+    """Whether each joint is this one or hangs on it."""
+    found = np.arange(len(body.parents)) == joint
+    for other, parent in enumerate(body.parents):
+        found[other] |= parent >= 0 and found[parent]
+    return found
 
 
 @pytest.mark.parametrize("name", PROCEDURAL)

@@ -196,7 +196,7 @@ def make_motion(
     keeps one still. The source's axis "y" or "z" points up, or "auto" judges by how it stands.
 
     Raises:
-        MotionError: No joint is known to both, or the source does not stand at rest.
+        MotionError: No joint is known to both, or the source stands neither at rest nor in a frame.
     """
     is_judged = up == "auto" and _stands_along_z(source.skeleton, source.positions)
     if is_judged and not _stands_along_z(source.skeleton, source.skeleton.rest_positions[None]):
@@ -224,7 +224,7 @@ def make_motion(
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if scale is None:
-        alignments = align_rests(target, source.skeleton, ours, theirs, source.name)
+        alignments = align_rests(target, source.skeleton, ours, theirs, source.name, source)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:
