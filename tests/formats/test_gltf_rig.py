@@ -88,6 +88,17 @@ def test_the_bind_pose_is_the_rest_pose_though_the_nodes_are_posed(tmp_path):
     np.testing.assert_allclose(body.skeleton.rest_positions, SKELETON.rest_positions, atol=1e-6)
 
 
+def test_a_skinned_garment_is_where_its_joints_hold_it(tmp_path):
+    """Its own node may be anywhere, as glTF says: exporters leave a scale of 0.01 there."""
+    path = tmp_path / "shirt.glb"
+    mesh, _ = write(path, np.random.default_rng(1))
+    document = gltf.GLTF2().load(str(path))
+    document.nodes[document.nodes[-1].children[-1]].scale = [0.01] * 3
+    document.save(str(path))
+    found = read_mesh_file(path)
+    np.testing.assert_allclose(found.positions, mesh[0], atol=1e-6)
+
+
 def test_split_vertices_become_one_and_hips_come_first(tmp_path):
     positions = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0.0]])
     skeleton = Skeleton(

@@ -54,7 +54,7 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     that make up the body, as in "Skin,Hat"; "" is all that are skinned.
     """
     document = GltfDocument(path)
-    joints = _read_joints(document)
+    joints = read_joints(document)
     found = {}  # skinned nodes, and the names they go by
     for index, node in enumerate(document.items("nodes")):
         if "mesh" in node and "skin" in node:
@@ -96,7 +96,7 @@ def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
         raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
     if clip and clip not in names:
         raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
-    joints = _read_joints(document)
+    joints = read_joints(document)
     index = names.index(clip) if clip else 0
     keys = document.key_frames(document.items("animations")[index])
     if not keys:
@@ -120,7 +120,7 @@ def _clip_names(document: GltfDocument) -> tuple[str, ...]:
     return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
 
 
-def _read_joints(document: GltfDocument) -> _Joints:
+def read_joints(document: GltfDocument) -> _Joints:
     """Collect the joints of all skins at rest."""
     skins = document.items("skins")
     if not skins:
