@@ -275,6 +275,20 @@ def test_a_character_that_is_inside_out_is_refused(body):
         make_body(dataclasses.replace(mesh, faces=mesh.faces[:, ::-1]))
 
 
+def test_a_character_of_hands_alone_is_refused(body):
+    hand = body.joint_names.index("LeftHand")
+    mesh = RiggedMesh(
+        name="glove",
+        positions=np.asarray(body.rest_positions, np.float64),
+        faces=np.asarray(body.faces),
+        skin_weights=np.ones((len(body.rest_positions), 1)),
+        skin_indices=np.full((len(body.rest_positions), 1), hand),
+        skeleton=body_skeleton(body),
+    )
+    with pytest.raises(AssetError, match="body glove is hands alone; bind its other meshes"):
+        make_body(mesh)
+
+
 def test_only_a_bvh_is_told_which_axis_points_up(body):
     for name in ("turn", "cmu_016_32"):
         with pytest.raises(MotionError, match=f"{name} has its own up axis.*--motion-up"):

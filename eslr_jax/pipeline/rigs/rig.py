@@ -86,7 +86,8 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     Vertices at one place are joined, the hips become joint 0, and hands are no obstacle.
 
     Raises:
-        AssetError: The mesh is empty or not finite, its weights and faces don't fit, or its unit is unknown.
+        AssetError: The mesh is empty, not finite or hands alone, its weights and faces don't fit, or its unit is
+            unknown.
         MeshError: Its faces point inside.
     """
     _check_mesh(mesh)
@@ -113,6 +114,9 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     for joint, parent in enumerate(skeleton.parents):
         is_hand[joint] |= parent >= 0 and is_hand[parent]
     leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
+    is_obstacle = ~is_hand[leading][faces].all(axis=1)
+    if not is_obstacle.any():
+        raise AssetError(f"body {mesh.name} is hands alone; bind its other meshes to its skeleton")
     return Body(
         rest_positions=lengths(mesh.positions[vertices]),
         shape_directions=lengths(shapes[vertices]),
@@ -121,7 +125,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
         skin_weights=jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
-        is_obstacle=jnp.asarray(~is_hand[leading][faces].all(axis=1)),
+        is_obstacle=jnp.asarray(is_obstacle),
         parents=skeleton.parents,
         joint_names=skeleton.joint_names,
         pose_directions=None if mesh.pose_directions is None else lengths(mesh.pose_directions[vertices]),
