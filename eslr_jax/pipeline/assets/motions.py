@@ -112,7 +112,7 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
         AssetError: The file is missing or holds something else.
     """
     with parsing(path, "joint map", max_bytes=1 << 22) as file:
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = json.loads(file.read_text(encoding="utf-8-sig"))
     if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
         raise AssetError(
             f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'

@@ -14,9 +14,9 @@ from eslr_jax.pipeline.formats.mesh_sequence import MAX_POINTS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader
 
 
-@reader("mesh", [".glb"])
+@reader("mesh", [".glb", ".gltf"])
 def read_glb(path: Path, _like: MeshFile | None = None) -> MeshFile:
-    """Read all triangles of a glTF binary into one mesh, in the scene's frame, and share split vertices.
+    """Read all triangles of a glTF file into one mesh, in the scene's frame, and share split vertices.
 
     Morph targets count as much as their weights at rest say. A mesh with a skin is in its bind pose: glTF has
     the joints carry it, and its own node count for nothing.
