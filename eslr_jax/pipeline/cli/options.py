@@ -56,7 +56,7 @@ class Options:
     tolerance: str | None = None
     # JSON file of changes to the map of joints that `eslr joints` shows.
     joint_map: Path | None = None
-    # Axis that points up in a BVH motion.
+    # Axis that points up in a motion of BVH or SMPL.
     motion_up: Literal["auto", "y", "z"] = "auto"
     # Degrees by which both arms are lifted; by default 12 for the motion of another body, and 0 for the
     # body's own motion.

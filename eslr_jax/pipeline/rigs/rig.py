@@ -202,17 +202,15 @@ def make_motion(
     Raises:
         MotionError: No joint is known to both, or the source stands neither at rest nor in a frame.
     """
-    is_judged = up == "auto" and _stands_along_z(source.skeleton, source.positions)
-    if is_judged and not _stands_along_z(source.skeleton, source.skeleton.rest_positions[None]):
-        warnings.warn(
-            f"{source.name}: taken as Z up, as the figure is longest along z, though not at rest; if it crawls "
-            "or lies, say that Y is up (--motion-up y)",
-            stacklevel=2,
-        )
-    if up == "z" or is_judged:
-        rest = dataclasses.replace(source.skeleton, rest_positions=source.skeleton.rest_positions @ _Y_UP.T)
-        turned, moved = _Y_UP @ source.rotations @ _Y_UP.T, source.positions @ _Y_UP.T
-        source = dataclasses.replace(source, skeleton=rest, rotations=turned, positions=moved)
+    axes = _Y_UP if (_judge_up(source) if up == "auto" else up) == "z" else np.eye(3)
+    rest_axes = axes if source.usual_up is None else np.eye(3)
+    rest = source.skeleton.rest_positions @ rest_axes.T
+    source = dataclasses.replace(
+        source,
+        skeleton=dataclasses.replace(source.skeleton, rest_positions=rest),
+        rotations=axes @ source.rotations @ rest_axes.T,
+        positions=source.positions @ axes.T,
+    )
     target = body_skeleton(body)
     is_model = is_body_model(target, source)
     mapping = map_joints(target, source.skeleton, joint_map, same_names=is_model)
@@ -242,8 +240,8 @@ def make_motion(
         if leg and other:
             translations = leg / other * translations
         translations = _put_on_floor(turned, translations, target, body)
-    elif source.root_axes is not None:
-        translations = translations + source.root_axes @ target.rest_positions[0]
+    elif source.usual_up is not None:
+        translations = translations + axes @ target.rest_positions[0]
     else:
         translations = scale * translations
         places = chain_positions(turned, translations, target)
@@ -292,8 +290,24 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
     return SkeletonMotion(motion.name, skeleton, turned, positions, motion.fps)
 
 
-def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
-    """Tell whether the head is mostly above the feet along z rather than y; positions: [frames, joints, 3]."""
+def _judge_up(source: SkeletonMotion) -> str:
+    """Return the axis "y" or "z" that points up in a motion; warn with one line if that is a guess."""
+    rest, is_model = source.skeleton.rest_positions[None], source.usual_up is not None
+    usual = source.usual_up or _standing_axis(source.skeleton, rest)
+    found = _standing_axis(source.skeleton, source.positions) or usual or "y"
+    if found != usual and (is_model or found == "z"):
+        other = "z" if found == "y" else "y"
+        warnings.warn(
+            f"{source.name}: taken as {found.upper()} up, as the figure is longest along {found}, though not "
+            f"{'as usual' if is_model else 'at rest'}; if it crawls or lies, say that {other.upper()} is up "
+            f"(--motion-up {other})",
+            stacklevel=3,
+        )
+    return found
+
+
+def _standing_axis(skeleton: Skeleton, positions: np.ndarray) -> str | None:
+    """Return "y" or "z", along which the head is above the feet; positions: [frames, joints, 3]."""
     parts = find_parts(skeleton)
     upper = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
     lower = [
@@ -303,9 +317,9 @@ def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
         if (side, chain) in parts
     ]
     if upper is None or not lower:
-        return False
-    rise = (positions[:, upper] - positions[:, lower].mean(axis=1)).mean(axis=0)
-    return bool(rise[2] > abs(rise[1]))
+        return None
+    _, along_y, along_z = (positions[:, upper] - positions[:, lower].mean(axis=1)).mean(axis=0)
+    return "z" if along_z > abs(along_y) else "y" if along_y > abs(along_z) else None
 
 
 def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
@@ -314,7 +328,7 @@ def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
     Joints then follow by name, and rest where the parameters have none.
     """
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
-    return source.root_axes is not None and len(shared) >= MODEL_JOINTS
+    return source.usual_up is not None and len(shared) >= MODEL_JOINTS
 
 
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:
