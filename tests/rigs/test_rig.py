@@ -62,6 +62,69 @@ def test_joints_are_known_by_the_names_of_every_family(family):
         assert parts[part] == [joint], names[joint]
 
 
+WHOLE = """
+    Hips Spine Spine1 Spine2 Neck Head
+    LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder RightArm RightForeArm RightHand
+    LeftUpLeg LeftLeg LeftFoot LeftToeBase RightUpLeg RightLeg RightFoot RightToeBase
+"""
+FAMILIES = {
+    "OptiTrack": """
+        Hip Ab Ab2 Chest Neck Head LShoulder LUArm LFArm LHand RShoulder RUArm RFArm RHand
+        LThigh LShin LFoot LToe RThigh RShin RFoot RToe
+    """,
+    "Xsens": """
+        Pelvis L5 L3 T8 Neck Head LeftShoulder LeftUpperArm LeftForeArm LeftHand
+        RightShoulder RightUpperArm RightForeArm RightHand
+        LeftUpperLeg LeftLowerLeg LeftFoot LeftToe RightUpperLeg RightLowerLeg RightFoot RightToe
+    """,
+    "AdvancedSkeleton": """
+        Root_M Spine1_M Spine2_M Chest_M Neck_M Head_M Scapula_L Shoulder_L Elbow_L Wrist_L
+        Scapula_R Shoulder_R Elbow_R Wrist_R Hip_L Knee_L Ankle_L Toes_L Hip_R Knee_R Ankle_R Toes_R
+    """,
+    "Kinect": """
+        SpineBase SpineMid Torso SpineShoulder Neck Head ClavicleLeft ShoulderLeft ElbowLeft WristLeft
+        ClavicleRight ShoulderRight ElbowRight WristRight
+        HipLeft KneeLeft AnkleLeft FootLeft HipRight KneeRight AnkleRight FootRight
+    """,
+    "arms of unknown names": """
+        Hips Spine Spine1 Spine2 Neck Head LeftShoulder LeftUpper LeftLower LeftHand RightShoulder
+        RightUpper RightLower RightHand LeftHipBone LeftShank LeftFoot LeftToe RightHipBone RightShank
+        RightFoot RightToe
+    """,
+    "three.js": " ".join(f"mixamorig{name}" for name in WHOLE.split()),
+    "a prefix": " ".join(f"Robot_{name}" for name in WHOLE.split()),
+    "a suffix": " ".join(f"{name}_JNT" for name in WHOLE.split()),
+}
+WHOLE_PARENTS = (-1, 0, 1, 2, 3, 4, 3, 6, 7, 8, 3, 10, 11, 12, 0, 14, 15, 16, 0, 18, 19, 20)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_joints_of_unknown_names_are_known_by_what_they_hang_between(family):
+    expected, found = (
+        find_parts(Skeleton(tuple(names.split()), WHOLE_PARENTS, np.zeros((22, 3))))
+        for names in (WHOLE, FAMILIES[family])
+    )
+    assert found == expected
+
+
+def test_limbs_that_follow_nothing_are_named(walking, body):
+    names = list(walking.skeleton.joint_names)
+    joint = names.index("LeftForeArm")
+    names[joint : joint + 5] = ["box"] * 5
+    partial = dataclasses.replace(
+        walking.skeleton,
+        joint_names=tuple(f"{name}.{k}" if name == "box" else name for k, name in enumerate(names)),
+    )
+    source = dataclasses.replace(walking, skeleton=partial)
+    with pytest.warns(
+        UserWarning, match="no joint of it is known as left forearm, which move with.*joint-map"
+    ):
+        make_motion(source, body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_motion(source, body, joint_map={"LeftForeArm": f"box.{joint}"})
+
+
 def test_helpers_are_no_part_of_the_body():
     names = ("upperarm_twist_01_l", "LeftToe_End", "ik_hand_l", "prop", "__UpLeg_L", "")
     assert find_named_parts(names) == {}

@@ -122,7 +122,8 @@ def write_same(kind, folder, clip, own):
 
 KINDS = (
     "AMASS npz", "AMASS of SMPL-X npz", "keys of SMPL-X npz", "HOOD pkl", "VTO pkl", "archive npz",
-    "centimetres, Z up bvh", "collar names bvh", "Unreal names bvh", "Mixamo prefix bvh", "character glb", "turned bones glb",
+    "centimetres, Z up bvh", "collar names bvh", "Unreal names bvh", "Mixamo prefix bvh",
+    "character glb", "turned bones glb",
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ ORDINARY_TILT = np.deg2rad(35.0)  # rest poses that lean less than this are take
 MAX_LEG_TURN = np.deg2rad(75.0)  # between the legs of two rest poses that both stand
 MAX_NEAREST_TURN = np.deg2rad(120.0)  # of a leg in the frame nearest to the rest pose: one that sits has 90
 _LEG = ("upper_leg", "lower_leg")
-_LIMBS = {"upper_leg": "lower_leg", "lower_leg": "foot", "upper_arm": "forearm", "forearm": "hand"}
+LIMBS = {"upper_leg": "lower_leg", "lower_leg": "foot", "upper_arm": "forearm", "forearm": "hand"}
 _BEFORE = {
     "upper_leg": "hips", "lower_leg": "upper_leg", "foot": "hips",
     "clavicle": "chest", "upper_arm": "chest", "forearm": "upper_arm",
@@ -115,8 +115,8 @@ def _find_limbs(
 ) -> dict[Part, tuple[NDArray, NDArray]]:
     """Return the resting bones of limbs that both rigs have: the body's, and the source's."""
     found = {}
-    for side, chain in ((side, chain) for side in ("left", "right") for chain in _LIMBS):
-        pair = (side, _LIMBS[chain]), (side, chain)
+    for side, chain in ((side, chain) for side in ("left", "right") for chain in LIMBS):
+        pair = (side, LIMBS[chain]), (side, chain)
         if all(part in ours and part in theirs for part in pair):
             bone, other = (
                 np.subtract(*(rig.rest_positions[joints[part][0]] for part in pair))

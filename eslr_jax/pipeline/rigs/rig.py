@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.mesh.validate import UNITS, check_outward
 from eslr_jax.pipeline.formats.mesh import shared_vertices
-from eslr_jax.pipeline.rigs.alignment import align_rests, match_parts, rig_scale
+from eslr_jax.pipeline.rigs.alignment import LIMBS, align_rests, match_parts, rig_scale
 from eslr_jax.pose.joints import HAND, find_named_parts, find_parts, map_joints
 from eslr_jax.pose.motion import Motion
 from eslr_jax.pose.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
@@ -222,6 +222,17 @@ def make_motion(
         )
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
+    lost = [
+        " ".join(part).strip()
+        for part, joints in find_parts(target).items()
+        if part[1] in (*LIMBS, "spine") and not mapping.keys() & {target.joint_names[k] for k in joints}
+    ]
+    if lost and joint_map is None:
+        warnings.warn(
+            f"{source.name}: no joint of it is known as {', '.join(lost)}, which move with what they hang on; "
+            "write a map with eslr joints --out map.json, and give it as --joint-map map.json",
+            stacklevel=2,
+        )
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
