@@ -51,6 +51,11 @@ def parsing(
         ) from error
 
 
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file without the mark that Windows puts first; what is no UTF-8 is replaced."""
+    return path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+
+
 def split_name(text: str | Path) -> tuple[str, str]:
     """Split `FILE#NAME` into the file and the name, "" if there is none.
 

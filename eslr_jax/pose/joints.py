@@ -1,8 +1,9 @@
 """Which joint is which: parts of a body by the joint names of common rigs, and joint maps between two rigs.
 
 A part is a side and a chain, such as left `upper_leg`; spine, neck and fingers are chains of several joints.
-Known are the names of CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, and the
-LeftCollar/LeftShoulder/LeftElbow family.
+Known are the names of CMU (BVH and ASF), Mixamo, SMPL, Biped, Unreal, VRM, Rigify, Daz, MakeHuman, OptiTrack,
+Xsens, Kinect, AdvancedSkeleton, and the LeftCollar/LeftShoulder/LeftElbow family. What most names of a rig
+begin or end with is left out, and the hierarchy tells what is between the joints that are known.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from eslr_jax.pose.skeleton import Skeleton
 Part = tuple[str, str]  # side ("left", "right", "") and chain
 
 _SIDES = {"left": "left", "l": "left", "lft": "left", "right": "right", "r": "right", "rgt": "right"}
+_SIDES |= dict.fromkeys(("m", "c", "center"), "")  # of the middle
 _PREFIXES = re.compile(
     r"^(mixamorig\d*|bip\d*|bip01|cc_base|def|org|character\d*|rig|j_bip(_c)?|j|valvebiped)[\s_.:-]+",
     re.IGNORECASE,
@@ -42,10 +44,12 @@ _SIDED_WORDS = {
     "foot": "foot", "ankle": "foot",
     "toe": "toe", "toes": "toe", "toebase": "toe", "ball": "toe",
     "clavicle": "clavicle", "collar": "clavicle", "shoulder": "shoulder",
+    "scapula": "clavicle",
     "uparm": "upper_arm", "upperarm": "upper_arm", "humerus": "upper_arm", "arm": "upper_arm",
-    "shldr": "upper_arm", "shldrbend": "upper_arm",
+    "shldr": "upper_arm", "shldrbend": "upper_arm", "uarm": "upper_arm",
     "loarm": "forearm", "lowerarm": "forearm", "lowarm": "forearm", "forearm": "forearm",
     "radius": "forearm", "elbow": "forearm", "forearmbend": "forearm",
+    "farm": "forearm",
     "hand": "hand", "wrist": "wrist",
     "fingers": "fingers", "fingerbase": "fingers", "handfinger": "fingers",
 }  # fmt: skip
@@ -54,9 +58,16 @@ for _finger in _FINGERS:
         _SIDED_WORDS[_word] = _finger
 _SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
 HAND = ("hand", "fingers", *_FINGERS)  # parts that continue the forearm's bone
+_SHARED = 0.75  # of a rig's names that begin alike: the rest are roots and props
+_CHAINS = {"foot": ("upper_leg", "lower_leg", "foot"), "hand": ("upper_arm", "forearm", "hand")}
 _FALLBACKS = {"fingers": ("middle", "index"), "hip_joint": (), "toe": ()} | {
     finger: ("fingers",) for finger in _FINGERS[1:]
 }
+
+
+def _words(name: str) -> list[str]:
+    """Return the words and numbers of a name in capitals, snake case or camel case."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", name)]
 
 
 def name_part(name: str) -> Part | None:
@@ -64,8 +75,7 @@ def name_part(name: str) -> Part | None:
     name = re.split(r"[:|]", name)[-1]
     if name.startswith("__"):  # a helper of MakeHuman, in the place of the joint that follows
         return None
-    name = _PREFIXES.sub("", name)
-    words = [word.lower() for word in re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", name)]
+    words = _words(_PREFIXES.sub("", name))
     if not words or _IGNORED & set(words):
         return None
     side = ""
@@ -89,14 +99,25 @@ def name_part(name: str) -> Part | None:
     return None
 
 
+def _shared_start(names: Sequence[str]) -> str:
+    """Return the longest text that most names begin with, as "mixamorig" or "Robot_"."""
+    middle = sorted(names)[len(names) // 2] if names else ""
+    lengths = range(len(middle), 0, -1)
+    most = _SHARED * len(names)
+    return next(
+        (middle[:n] for n in lengths if sum(name.startswith(middle[:n]) for name in names) >= most), ""
+    )
+
+
 def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
     """Return the joints of every part that is known by name, in the order of the names.
 
     Shoulder, foot and hand mean different joints in different families; the other names of the rig decide.
     """
     found: dict[Part, list[int]] = {}
+    start, end = _shared_start(joint_names), _shared_start([name[::-1] for name in joint_names])[::-1]
     for joint, name in enumerate(joint_names):
-        part = name_part(name)
+        part = name_part(name) or name_part(name.removeprefix(start).removesuffix(end))
         if part is not None:
             found.setdefault(part, []).append(joint)
     for side in ("left", "right"):
@@ -120,11 +141,59 @@ def find_named_parts(joint_names: Sequence[str]) -> dict[Part, list[int]]:
 def find_parts(skeleton: Skeleton) -> dict[Part, list[int]]:
     """Return the joints of every part of a rig, from the hips outwards; the hips are always among them."""
     found = find_named_parts(skeleton.joint_names)
+    chest = _complete_limbs(skeleton, found)
     hips = _find_hips(skeleton, found)
+    _complete_spine(skeleton, found, hips, chest)
     found.pop(("", "root"), None)
     found = {part: kept for part, joints in found.items() if (kept := [j for j in joints if j != hips])}
     found["", "hips"] = [hips]
     return found
+
+
+def _path(skeleton: Skeleton, joint: int) -> list[int]:
+    """Return a joint and those that it hangs on, without helpers, up to the root."""
+    path = []
+    while joint >= 0:
+        if not _IGNORED.intersection(_words(skeleton.joint_names[joint])):
+            path.append(joint)
+        joint = skeleton.parents[joint]
+    return path
+
+
+def _complete_limbs(skeleton: Skeleton, found: dict[Part, list[int]]) -> int | None:
+    """Add the joints between hands or feet and the trunk that their names don't tell; return where arms begin."""
+    branch = None
+    for end, chain in _CHAINS.items():
+        paths = {
+            side: _path(skeleton, found[side, end][0]) for side in ("left", "right") if (side, end) in found
+        }
+        if len(paths) < 2:
+            continue
+        shared = [joint for joint in paths["left"] if joint in paths["right"]]
+        branch = shared[0] if shared and end == "hand" else None
+        for side, path in paths.items():
+            own = [joint for joint in path if joint not in shared]
+            if all((side, part) in found for part in chain) or len(own) < len(chain):
+                continue
+            for part, joints in list(found.items()):
+                found[part] = [joint for joint in joints if joint not in own]
+                if not found[part]:
+                    del found[part]
+            found |= {(side, part): [joint] for part, joint in zip(reversed(chain), own, strict=False)}
+            if end == "hand" and len(own) > len(chain):
+                found[side, "clavicle"] = own[: len(chain) - 1 : -1]
+    return branch
+
+
+def _complete_spine(skeleton: Skeleton, found: dict[Part, list[int]], hips: int, chest: int | None) -> None:
+    """Add the joints between the hips and what arms or head hang on that their names don't tell."""
+    ends = found.get(("", "neck")) or found.get(("", "head")) or [hips]
+    path = _path(skeleton, ends[0] if chest is None else chest)
+    taken = {joint for part, joints in found.items() if part != ("", "spine") for joint in joints}
+    between = path[: path.index(hips)] if hips in path else []
+    spine = {*found.get(("", "spine"), []), *(joint for joint in between if joint not in taken)}
+    if spine:
+        found["", "spine"] = sorted(spine, key=lambda joint: (len(_path(skeleton, joint)), joint))
 
 
 def _find_hips(skeleton: Skeleton, parts: Mapping[Part, list[int]]) -> int:

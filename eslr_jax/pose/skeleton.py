@@ -47,9 +47,9 @@ class SkeletonMotion:
     rotations: np.ndarray  # in world axes since the rest pose [frames, joints, 3, 3]
     positions: np.ndarray  # [frames, joints, 3]
     fps: float  # [1/s]
-    # Only for formats without a skeleton, whose positions are relative to the root of the body's own rest pose:
-    # the matrix that turns that root from the file's axes to ours before it is added.
-    root_axes: np.ndarray | None = None
+    # Only for formats without a skeleton, whose positions are relative to the root of the body's own rest pose,
+    # which is Y up whatever the file: the axis "y" or "z" that points up in most of their files.
+    usual_up: str | None = None
 
     def __post_init__(self) -> None:
         """Raise a MotionError unless there are frames of finite values at a possible rate."""

@@ -156,6 +156,27 @@ def two_parts(shirt):
     return positions, faces
 
 
+@pytest.mark.parametrize(("gap", "components", "is_sewn"), [
+    (1e-3, "auto", True), (5e-3, "auto", False), (1e-3, "keep", False),
+])  # fmt: skip
+def test_pieces_whose_seams_were_left_open_are_sewn(body, shirt, gap, components, is_sewn):
+    """As programs export a pattern that was not welded: front and back, with a gap between them."""
+    is_back = shirt.rest_positions[shirt.faces].mean(axis=1)[:, 2] < 0
+    positions, faces, start = [], [], 0
+    for is_own, shift in ((is_back, -gap), (~is_back, 0.0)):
+        used, local = np.unique(shirt.faces[is_own], return_inverse=True)
+        positions.append(shirt.rest_positions[used] + [0.0, 0.0, shift])
+        faces.append(local.reshape(-1, 3) + start)
+        start += len(used)
+    pieces = source(np.concatenate(positions), np.concatenate(faces))
+    fitted = fit_garment(pieces, body, FitOptions(components=components))
+    told = " ".join(fitted.metadata["fit"]["warnings"])
+    assert ("pieces whose edges lie within 1 cm" in told) == (components == "auto" and not is_sewn)
+    if is_sewn:
+        assert len(fitted.rest_positions) == len(shirt.rest_positions)
+        assert len(fitted.faces) == len(shirt.faces)
+
+
 @pytest.mark.parametrize(("components", "parts"), [("keep", 2), ("join", 1), ("largest", 1)])
 def test_separate_parts(body, shirt, components, parts):
     positions, faces = two_parts(shirt)

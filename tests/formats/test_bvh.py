@@ -47,6 +47,11 @@ def test_a_small_file_by_hand(tmp_path):
     np.testing.assert_allclose(motion.rotations[1, 1], turn.as_matrix(), atol=1e-12)
 
 
+def test_the_mark_that_windows_puts_first_is_no_word(tmp_path):
+    (tmp_path / "marked.bvh").write_text(SMALL, encoding="utf-8-sig")
+    assert read_bvh(tmp_path / "marked.bvh").skeleton.joint_names == ("Hips", "Spine")
+
+
 @pytest.mark.parametrize(("time", "fps"), [("0.0333333", 30), ("0.008333", 120), ("0.033367", 1 / 0.033367)])
 def test_a_rounded_frame_time_loses_no_frame(tmp_path, time, fps):
     head, _ = SMALL.split("MOTION")

@@ -88,6 +88,34 @@ def test_the_bind_pose_is_the_rest_pose_though_the_nodes_are_posed(tmp_path):
     np.testing.assert_allclose(body.skeleton.rest_positions, SKELETON.rest_positions, atol=1e-6)
 
 
+def test_a_skinned_garment_is_where_its_joints_hold_it(tmp_path):
+    """Its own node may be anywhere, as glTF says: exporters leave a scale of 0.01 there."""
+    path = tmp_path / "shirt.glb"
+    mesh, _ = write(path, np.random.default_rng(1))
+    document = gltf.GLTF2().load(str(path))
+    document.nodes[document.nodes[-1].children[-1]].scale = [0.01] * 3
+    document.save(str(path))
+    found = read_mesh_file(path)
+    np.testing.assert_allclose(found.positions, mesh[0], atol=1e-6)
+
+
+def test_a_mesh_that_hangs_on_a_joint_is_a_part_of_the_body(tmp_path):
+    """As a robot's parts: bound to that joint alone, and where it is in the bind pose."""
+    path = tmp_path / "robot.glb"
+    mesh, _ = write(path, np.random.default_rng(1))
+    document = gltf.GLTF2().load(str(path))
+    document.nodes.append(gltf.Node(name="Knee", mesh=0, translation=[0.0, 0.0, 30.0]))  # [cm]
+    document.nodes[3].children.append(len(document.nodes) - 1)
+    document.nodes[3].rotation = Rotation.from_rotvec([0.3, 0.1, -0.2]).as_quat().tolist()  # a pose
+    document.save(str(path))
+    found = read_gltf_body(path)
+    knee = mesh[0][:, [0, 2, 1]] * [1, -1, 1] + SKELETON.rest_positions[3] + [0.0, 0.0, 0.3]
+    np.testing.assert_allclose(found.positions, np.concatenate([mesh[0], knee]), atol=1e-6)
+    np.testing.assert_array_equal(found.skin_weights[40:], np.tile([1.0, 0, 0, 0], (40, 1)))
+    np.testing.assert_array_equal(found.skin_indices[40:, 0], 3)
+    assert len(read_gltf_body(path, "Knee").positions) == 40
+
+
 def test_split_vertices_become_one_and_hips_come_first(tmp_path):
     positions = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0.0]])
     skeleton = Skeleton(

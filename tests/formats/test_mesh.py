@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eslr_jax.errors import MeshError
+from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.pipeline.formats.mesh import read_mesh, read_mesh_file
 
@@ -181,3 +181,25 @@ def test_obj_may_be_written_with_tabs(tmp_path):
     positions, faces = read_mesh(tmp_path / "a.obj")
     assert positions.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert faces.tolist() == [[0, 1, 2]]
+
+
+def test_an_obj_line_may_go_on_in_the_next_and_a_mark_may_stand_first(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("\ufeffv 0 0 0\nv 1 0 0 # C:\\\nv 0 \\\n1 0\nf 1 \\\n2 \\\n3\n# C:\\\nf 1 3 2\n")
+    positions, faces = read_mesh(path)
+    assert positions.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert faces.tolist() == [[0, 1, 2], [0, 2, 1]]
+
+
+@pytest.mark.parametrize("suffix", [".usd", ".abc", ".fbx"])
+def test_scenes_of_other_programs_are_told_what_to_become(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").touch()
+    with pytest.raises(AssetError, match=f"suffix '{suffix}'; export it as glTF .*give one of .*.obj"):
+        read_mesh(tmp_path / f"a{suffix}")
+
+
+def test_a_gltf_beside_its_buffers_is_read_as_its_glb(tmp_path):
+    scene = trimesh.Scene(trimesh.Trimesh(POSITIONS, FACES, process=False))
+    for name, content in trimesh.exchange.gltf.export_gltf(scene).items():
+        (tmp_path / name).write_bytes(content)
+    assert_same(read_mesh(tmp_path / "model.gltf"))

@@ -22,7 +22,7 @@ from eslr_jax.pipeline.formats.mesh_sequence import (
 )
 from eslr_jax.pipeline.formats.obj import obj_text
 from eslr_jax.pipeline.rigs.rig import UnitsWarning
-from eslr_jax.pipeline.rigs.sequence import pose_sequence
+from eslr_jax.pipeline.rigs.sequence import STILL_FRAMES, pose_sequence
 
 CAPSULE = trimesh.creation.capsule(height=1.2, radius=0.25, count=(12, 12))
 CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))  # it stands
@@ -72,6 +72,17 @@ def test_patches_follow_a_rigid_motion_exactly():
         moved = np.einsum("pab,vb->vpa", transforms[..., :3], rest) + transforms[..., 3]
         np.testing.assert_allclose(moved, np.repeat(MOVING[frame][:, None], len(transforms), 1), atol=1e-5)
     np.testing.assert_allclose(np.asarray(body.skin_weights).sum(axis=1), 1.0, atol=1e-6)
+
+
+def test_a_single_mesh_is_held(tmp_path):
+    """A mannequin: a folder of one file, or the file itself."""
+    write_folder(tmp_path / "mannequin", MOVING[:1])
+    for path in (tmp_path / "mannequin", tmp_path / "mannequin" / "body0.obj"):
+        assert is_mesh_sequence(path)
+        _, poses = pose_sequence(read_mesh_sequence(path), num_frames=7)
+        np.testing.assert_allclose(poses.positions, np.repeat(MOVING[:1], 7, axis=0), atol=1e-6)
+        _, poses = pose_sequence(read_mesh_sequence(path))
+        assert len(poses.positions) == STILL_FRAMES
 
 
 def test_frames_between_frames_lie_on_straight_lines():

@@ -139,7 +139,7 @@ def test_parameters_move_a_smpl_body_to_the_same_place_in_every_format(tmp_path,
         assert motion.arm_abduction == 0.0
     # AMASS: vertices are those of the parameters, then turned from Z up to Y up.
     write_amass(tmp_path / "amass.npz", rotations, shift, 30.0)
-    motion = make_motion(read_amass(tmp_path / "amass.npz"), body)
+    motion = make_motion(read_amass(tmp_path / "amass.npz"), body, up="auto")
     to_y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     with np.load(tmp_path / "amass.npz") as file:
         poses, trans = file["poses"][:, :72].reshape(-1, 24, 3).copy(), file["trans"]

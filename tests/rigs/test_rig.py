@@ -62,6 +62,69 @@ def test_joints_are_known_by_the_names_of_every_family(family):
         assert parts[part] == [joint], names[joint]
 
 
+WHOLE = """
+    Hips Spine Spine1 Spine2 Neck Head
+    LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder RightArm RightForeArm RightHand
+    LeftUpLeg LeftLeg LeftFoot LeftToeBase RightUpLeg RightLeg RightFoot RightToeBase
+"""
+FAMILIES = {
+    "OptiTrack": """
+        Hip Ab Ab2 Chest Neck Head LShoulder LUArm LFArm LHand RShoulder RUArm RFArm RHand
+        LThigh LShin LFoot LToe RThigh RShin RFoot RToe
+    """,
+    "Xsens": """
+        Pelvis L5 L3 T8 Neck Head LeftShoulder LeftUpperArm LeftForeArm LeftHand
+        RightShoulder RightUpperArm RightForeArm RightHand
+        LeftUpperLeg LeftLowerLeg LeftFoot LeftToe RightUpperLeg RightLowerLeg RightFoot RightToe
+    """,
+    "AdvancedSkeleton": """
+        Root_M Spine1_M Spine2_M Chest_M Neck_M Head_M Scapula_L Shoulder_L Elbow_L Wrist_L
+        Scapula_R Shoulder_R Elbow_R Wrist_R Hip_L Knee_L Ankle_L Toes_L Hip_R Knee_R Ankle_R Toes_R
+    """,
+    "Kinect": """
+        SpineBase SpineMid Torso SpineShoulder Neck Head ClavicleLeft ShoulderLeft ElbowLeft WristLeft
+        ClavicleRight ShoulderRight ElbowRight WristRight
+        HipLeft KneeLeft AnkleLeft FootLeft HipRight KneeRight AnkleRight FootRight
+    """,
+    "arms of unknown names": """
+        Hips Spine Spine1 Spine2 Neck Head LeftShoulder LeftUpper LeftLower LeftHand RightShoulder
+        RightUpper RightLower RightHand LeftHipBone LeftShank LeftFoot LeftToe RightHipBone RightShank
+        RightFoot RightToe
+    """,
+    "three.js": " ".join(f"mixamorig{name}" for name in WHOLE.split()),
+    "a prefix": " ".join(f"Robot_{name}" for name in WHOLE.split()),
+    "a suffix": " ".join(f"{name}_JNT" for name in WHOLE.split()),
+}
+WHOLE_PARENTS = (-1, 0, 1, 2, 3, 4, 3, 6, 7, 8, 3, 10, 11, 12, 0, 14, 15, 16, 0, 18, 19, 20)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_joints_of_unknown_names_are_known_by_what_they_hang_between(family):
+    expected, found = (
+        find_parts(Skeleton(tuple(names.split()), WHOLE_PARENTS, np.zeros((22, 3))))
+        for names in (WHOLE, FAMILIES[family])
+    )
+    assert found == expected
+
+
+def test_limbs_that_follow_nothing_are_named(walking, body):
+    names = list(walking.skeleton.joint_names)
+    joint = names.index("LeftForeArm")
+    names[joint : joint + 5] = ["box"] * 5
+    partial = dataclasses.replace(
+        walking.skeleton,
+        joint_names=tuple(f"{name}.{k}" if name == "box" else name for k, name in enumerate(names)),
+    )
+    source = dataclasses.replace(walking, skeleton=partial)
+    with pytest.warns(
+        UserWarning, match="no joint of it is known as left forearm, which move with.*joint-map"
+    ):
+        make_motion(source, body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_motion(source, body, joint_map={"LeftForeArm": f"box.{joint}"})
+
+
 def test_helpers_are_no_part_of_the_body():
     names = ("upperarm_twist_01_l", "LeftToe_End", "ik_hand_l", "prop", "__UpLeg_L", "")
     assert find_named_parts(names) == {}
@@ -167,8 +230,52 @@ def test_a_rest_pose_that_does_not_stand_is_refused(walking, body):
     names = list(body.joint_names)
     rest[names.index("LeftFoot")] = rest[names.index("LeftLeg")] + [0, 0.4, 0]
     lying = dataclasses.replace(walking.skeleton, rest_positions=rest)
-    with pytest.raises(MotionError, match="does not stand"):
+    with pytest.raises(MotionError, match="stands neither at rest nor in a frame"):
         make_motion(dataclasses.replace(walking, skeleton=lying), body)
+
+
+def test_bones_that_lie_along_one_axis_at_rest_move_the_body_alike(walking, body):
+    """As in LAFAN1: each joint's own axes, of any twist, are the world's at rest, and its bone is along x."""
+    ends = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot", "Foot": "ToeBase"}
+    names, rest, rng = list(body.joint_names), walking.skeleton.rest_positions, np.random.default_rng(0)
+    bones = [
+        (names.index(side + a), names.index(side + b)) for side in ("Left", "Right") for a, b in ends.items()
+    ]
+    own = np.tile(
+        Rotation.from_euler("z", 90, degrees=True).as_matrix(), (len(names), 1, 1)
+    )  # trunk: x is up
+    for start, end in bones:
+        twist = Rotation.from_rotvec([rng.uniform(-np.pi, np.pi), 0, 0])
+        along = Rotation.align_vectors((rest[end] - rest[start])[None], [[1.0, 0, 0]])[0]
+        own[start:] = np.where(
+            below(body, start)[start:, None, None], (along * twist).as_matrix(), own[start:]
+        )
+    lying = np.zeros_like(rest)
+    for joint, parent in enumerate(body.parents[1:], 1):
+        lying[joint] = lying[parent] + own[parent].T @ (rest[joint] - rest[parent])
+    skeleton = dataclasses.replace(walking.skeleton, rest_positions=lying)
+    motion = make_motion(
+        dataclasses.replace(walking, skeleton=skeleton, rotations=walking.rotations @ own), body
+    )
+    found = posed_joints(motion, body)
+    for start, end in bones:
+        ours, theirs = (positions[:, end] - positions[:, start] for positions in (found, walking.positions))
+        cosine = (ours * theirs).sum(-1) / np.linalg.norm(ours, axis=-1) / np.linalg.norm(theirs, axis=-1)
+        most = 10.0 if "Foot" in names[start] else 1.0  # [degrees]; nothing tells how a rig's soles lie
+        assert np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))) < most, names[start]
+    turned = global_rotations(motion.rotations, body.parents)
+    twisted = Rotation.from_matrix(
+        (np.swapaxes(turned, 2, 3) @ walking.rotations).reshape(-1, 3, 3)
+    ).magnitude()
+    assert np.degrees(twisted.max()) < 30.0
+
+
+def below(body, joint):
+    """Whether each joint is this one or hangs on it."""
+    found = np.arange(len(body.parents)) == joint
+    for other, parent in enumerate(body.parents):
+        found[other] |= parent >= 0 and found[parent]
+    return found
 
 
 @pytest.mark.parametrize("name", PROCEDURAL)
@@ -229,6 +336,20 @@ def test_a_character_that_is_inside_out_is_refused(body):
     make_body(mesh)
     with pytest.raises(MeshError, match="body hero: its faces point inside; flip the normals"):
         make_body(dataclasses.replace(mesh, faces=mesh.faces[:, ::-1]))
+
+
+def test_a_character_of_hands_alone_is_refused(body):
+    hand = body.joint_names.index("LeftHand")
+    mesh = RiggedMesh(
+        name="glove",
+        positions=np.asarray(body.rest_positions, np.float64),
+        faces=np.asarray(body.faces),
+        skin_weights=np.ones((len(body.rest_positions), 1)),
+        skin_indices=np.full((len(body.rest_positions), 1), hand),
+        skeleton=body_skeleton(body),
+    )
+    with pytest.raises(AssetError, match="body glove is hands alone; bind its other meshes"):
+        make_body(mesh)
 
 
 def test_only_a_bvh_is_told_which_axis_points_up(body):

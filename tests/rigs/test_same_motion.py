@@ -73,6 +73,12 @@ def write_same(kind, folder, clip, own):
         write_amass(path, rotations, pelvis, clip.fps)
     elif kind == "AMASS of SMPL-X npz":
         write_amass(path, rotations, pelvis, clip.fps, num_joints=55)
+    elif kind == "keys of SMPL-X npz":
+        write_amass(folder / "amass.npz", rotations, pelvis, clip.fps)
+        with np.load(folder / "amass.npz") as file:
+            poses, moves = file["poses"], file["trans"]
+        parts = {"root_orient": poses[:, :3], "pose_body": poses[:, 3:66], "pose_hand": poses[:, 66:]}
+        np.savez(path, **parts, pose_jaw=np.zeros((len(poses), 3)), transl=moves, fps=np.array(clip.fps))
     elif kind == "HOOD pkl":
         write_hood(path, rotations, pelvis)
     elif kind == "VTO pkl":
@@ -115,8 +121,9 @@ def write_same(kind, folder, clip, own):
 
 
 KINDS = (
-    "AMASS npz", "AMASS of SMPL-X npz", "HOOD pkl", "VTO pkl", "archive npz", "centimetres, Z up bvh",
-    "collar names bvh", "Unreal names bvh", "Mixamo prefix bvh", "character glb", "turned bones glb",
+    "AMASS npz", "AMASS of SMPL-X npz", "keys of SMPL-X npz", "HOOD pkl", "VTO pkl", "archive npz",
+    "centimetres, Z up bvh", "collar names bvh", "Unreal names bvh", "Mixamo prefix bvh",
+    "character glb", "turned bones glb",
 )  # fmt: skip
 
 
@@ -130,9 +137,21 @@ def test_the_same_clip_puts_joints_at_the_same_places(kind, tmp_path, clip, body
     compared = [
         joint
         for joint, name in enumerate(body.joint_names)
-        if not (kind.startswith(("AMASS", "HOOD", "VTO")) and name in NOT_IN_SMPL)
+        if not (kind.startswith(("AMASS", "keys", "HOOD", "VTO")) and name in NOT_IN_SMPL)
     ]
     assert distance[compared].max() < TOLERANCE
+
+
+def test_a_motion_of_smpl_that_is_y_up_stands(tmp_path, clip, body, expected):
+    rotations, pelvis = smpl_parameters(clip)
+    path = tmp_path / "yup.npz"
+    np.savez(path, poses=rotations[:, :22].reshape(-1, 66), trans=pelvis, mocap_framerate=np.array(clip.fps))
+    with pytest.warns(UserWarning, match=r"yup: taken as Y up.*though not as usual.*--motion-up z"):
+        guessed = load_motion(path, body=body)
+    compared = [joint for joint, name in enumerate(body.joint_names) if name not in NOT_IN_SMPL]
+    for motion in (guessed, load_motion(path, body=body, up="y")):
+        found = skeleton_motion(motion, body).positions
+        assert np.linalg.norm(found - expected, axis=-1)[:, compared].max() < TOLERANCE
 
 
 def test_the_clip_stands_on_the_floor_and_starts_above_the_origin(body, expected):

@@ -47,7 +47,7 @@ def load_motion(
             the bundled format. `FILE#CLIP` picks one of several clips.
         body: The body that is to move; the bundled one by default.
         joint_map: Changes to the map from the body's joints to the motion's; "" keeps a joint still.
-        up: Axis that points up in a BVH file; by default the one along which the figure stands.
+        up: Axis that points up in a BVH file or one of SMPL; by default the one along which the figure stands.
 
     Raises:
         AssetError: There is no such motion, or the file is damaged.
@@ -57,10 +57,10 @@ def load_motion(
     """
     text = str(name)
     file, clip = split_name(text)
-    is_bvh = Path(file).suffix.lower() == ".bvh"
-    if up != "auto" and not is_bvh:
+    has_up = Path(file).suffix.lower() not in (".bvh", ".npz", ".pkl") or _is_archived(text)
+    if up != "auto" and has_up:
         raise MotionError(
-            f"motion {text} has its own up axis, which only a BVH file lacks; leave out --motion-up"
+            f"motion {text} has its own up axis, which only BVH and SMPL's motions lack; leave out --motion-up"
         )
     if text in PROCEDURAL:
         if joint_map:
@@ -77,7 +77,7 @@ def load_motion(
     if skipped:
         warnings.warn(skipped, stacklevel=2)
     motion = make_motion(
-        source, load_body() if body is None else body, joint_map=joint_map, up=up if is_bvh else "y"
+        source, load_body() if body is None else body, joint_map=joint_map, up="y" if has_up else up
     )
     return dataclasses.replace(motion, start=(len(whole.positions) - len(source.positions)) / source.fps)
 
@@ -112,7 +112,7 @@ def read_joint_map(path: str | Path) -> dict[str, str]:
         AssetError: The file is missing or holds something else.
     """
     with parsing(path, "joint map", max_bytes=1 << 22) as file:
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = json.loads(file.read_text(encoding="utf-8-sig"))
     if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
         raise AssetError(
             f'joint map {path} is no JSON object of names; write it like {{"LeftArm": "left_shoulder"}}'
@@ -127,7 +127,7 @@ def _is_archived(text: str) -> bool:
     file, _ = split_name(text)
     if Path(file).suffix.lower() != ".npz":
         return False
-    return "poses" not in read_arrays(file, content="motion", names=("poses",))  # those of AMASS
+    return "joint_names" in read_arrays(file, content="motion", names=("joint_names",))  # not of AMASS
 
 
 def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:

@@ -30,8 +30,8 @@ class Options:
     # glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else cmu_016_32.
     motion: str | None = None
     # Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned character
-    # (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files). FILE#MESH,MESH picks the meshes of a
-    # character that are its body, without its clothes.
+    # (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files; a single one stands still).
+    # FILE#MESH,MESH picks the meshes of a character that are its body, without its clothes.
     body: str = "anny"
     # physics is the solver alone; network is a trained network, from whose prediction the solver starts.
     simulator: Literal["network", "physics"] | None = None
@@ -57,7 +57,7 @@ class Options:
     tolerance: str | None = None
     # JSON file of changes to the map of joints that `eslr joints` shows.
     joint_map: Path | None = None
-    # Axis that points up in a BVH motion.
+    # Axis that points up in a motion of BVH or SMPL.
     motion_up: Literal["auto", "y", "z"] = "auto"
     # Degrees by which both arms are lifted; by default 12 for the motion of another body, and 0 for the
     # body's own motion.

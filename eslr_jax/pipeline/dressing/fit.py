@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.mesh.topology import face_areas, face_cross_products, vertex_components
+from eslr_jax.mesh.topology import face_areas, face_cross_products, undirected_edges, vertex_components
 from eslr_jax.mesh.validate import check_arrays, validate_mesh
 from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
@@ -21,6 +21,7 @@ from eslr_jax.pipeline.dressing.repair import (
     consistent_orientation,
     join_components,
     largest_component,
+    share_along_seams,
     weld,
 )
 from eslr_jax.pipeline.dressing.report import wearer_entry
@@ -30,6 +31,8 @@ from eslr_jax.pose.motion import chest_direction
 from eslr_jax.types import Body
 
 _MAX_COORDINATE = 1e6  # beyond it no unit makes a garment
+_SEAM = 2e-3  # [m] between the edges of pieces that programs export with their seams open: .1 to 1 mm
+_ALONG = 0.2  # of all edges' vertices that are as near to another piece: seams, and no single touch
 
 
 def fit_garment(
@@ -78,7 +81,9 @@ def fit_garment(
         clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
-    clean, joined = _join(dataclasses.replace(clean, positions=placement.apply(clean.positions)), options)
+    clean, joined, unsewn = _join(
+        dataclasses.replace(clean, positions=placement.apply(clean.positions)), options
+    )
     # Faces are turned that disagree with neighbours, and parts that face the body.
     turn = consistent_orientation(clean.positions, clean.faces)
     crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
@@ -159,7 +164,7 @@ def fit_garment(
                 "penetration": penetration,
                 "pinned": int(is_pinned.sum()),
                 "pinned_by": pinned_by,
-                "warnings": [*placement.warnings, *lost, *falling],
+                "warnings": [*placement.warnings, *unsewn, *lost, *falling],
                 **transfer,
             },
         },
@@ -185,18 +190,31 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
     }
 
 
-def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any]]:
-    """Join or drop separate parts as the options say; positions are in metres."""
-    if options.components not in ("join", "largest"):
-        return clean, {}
-    if options.components == "join":
+def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any], list[str]]:
+    """Join or drop separate parts as the options say; positions are in metres. Return report and warnings."""
+    chosen, warnings = options.components, []
+    if chosen == "auto":
+        gaps = (min(_SEAM, options.join_gap), options.join_gap)
+        is_open, is_near = (share_along_seams(clean.positions, clean.faces, gap) > _ALONG for gap in gaps)
+        chosen = "join" if is_open else "keep"
+        if is_near:
+            pieces = vertex_components(clean.faces, len(clean.positions))[0]
+            warnings = [
+                f"{pieces} pieces whose edges lie within {100 * options.join_gap:g} cm of each other are not "
+                "sewn; give eslr fit --components join, or --components keep if they are apart"
+            ]
+    if chosen not in ("join", "largest"):
+        return clean, {}, warnings
+    if chosen == "join":
         step = join_components(clean.positions, clean.faces, options.join_gap)
     else:
         step = largest_component(clean.positions, clean.faces)
+    if options.components == "auto" and undirected_edges(step.faces)[2].max() > 2:
+        return clean, {}, warnings  # an edge of three pieces, such as a pocket's on a seam
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1
     left = vertex_components(step.faces, len(step.positions))[0]
     joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])
-    return joined, {"components_left": left}
+    return joined, {"components_left": left}, []
 
 
 def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:

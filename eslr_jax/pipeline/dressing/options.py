@@ -25,8 +25,9 @@ class FitOptions:
             these are within 2 cm of each other, it is not moved at all. With units, up and front given, nothing
             is refused.
         arms: Recognise the pose of the arms that the garment was modelled in, or take the body's rest pose.
-        components: Keep separate parts, join their open edges, keep the largest, or refuse them.
-        join_gap: Distance across which `join` sews parts together [m].
+        components: Keep separate parts, join their open edges, keep the largest, or refuse them. By default parts
+            are joined if their edges lie along each other, as pieces of a pattern whose seams were left open.
+        join_gap: Distance across which parts are sewn together [m].
         weld: Distance within which vertices of open edges become one, relative to the garment's size.
         edge_length: Remesh to this mean edge length [m] (extra `remesh`).
         pin: Vertices that follow the body: none, waist, vertices:0,5,9, part:NAME, region:y>0.2,x<0.1,
@@ -42,7 +43,7 @@ class FitOptions:
     front: Axis = "auto"
     keep_place: bool = False
     arms: Literal["auto", "rest"] = "auto"
-    components: Literal["keep", "join", "largest", "refuse"] = "keep"
+    components: Literal["auto", "keep", "join", "largest", "refuse"] = "auto"
     join_gap: float = _JOIN_GAP
     weld: float = WELD_TOLERANCE
     edge_length: float | None = None

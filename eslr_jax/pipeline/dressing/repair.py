@@ -63,18 +63,32 @@ def join_components(
     vertices than the other, several are joined to one. The slivers between them vanish if `gap` is at least
     half the longer edges.
     """
+    pairs, distances = _seam_pairs(positions, faces)
+    return merge_vertices(positions, faces, pairs[distances <= gap])
+
+
+def share_along_seams(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gap: float
+) -> float:
+    """Return the share of all boundary vertices that have a boundary of another part within `gap`."""
+    return float(np.mean(_seam_pairs(positions, faces)[1] <= gap)) if len(_boundary_vertices(faces)) else 0.0
+
+
+def _seam_pairs(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return every boundary vertex with the nearest one of another part [n, 2], and their distance [n]."""
     _, component = vertex_components(faces, len(positions))
     candidates = _boundary_vertices(faces)
-    pairs = [np.empty((0, 2), np.int64)]
+    pairs = np.stack([candidates, candidates], axis=1)
+    distances = np.full(len(candidates), np.inf)
     for part in np.unique(component[candidates]):
         is_own = component[candidates] == part
-        own, others = candidates[is_own], candidates[~is_own]
-        if not len(others):
+        if is_own.all():
             break
-        distance, nearest = KDTree(positions[others]).query(positions[own], distance_upper_bound=gap)
-        is_near = np.isfinite(distance)
-        pairs.append(np.stack([own[is_near], others[nearest[is_near]]], axis=1))
-    return merge_vertices(positions, faces, np.concatenate(pairs))
+        distances[is_own], nearest = KDTree(positions[candidates[~is_own]]).query(
+            positions[candidates[is_own]]
+        )
+        pairs[is_own, 1] = candidates[~is_own][nearest]
+    return pairs, distances
 
 
 def largest_component(

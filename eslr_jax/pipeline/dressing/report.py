@@ -31,6 +31,8 @@ def describe_fit(report: dict[str, Any]) -> str:
         f"{mesh['loose_vertices']} loose, {mesh['dropped_faces']} faces dropped, {mesh['turned_faces']} turned, "
         f"{mesh['components']} pieces; now {mesh['vertices']} vertices, {mesh['faces']} faces",
     ]
+    if "components_left" in mesh:
+        lines.append(f"pieces: {mesh['components']}, of which {mesh['components_left']} are left")
     if inside:
         before, after = inside["before"], inside["after"]
         lines.append(

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError
-from eslr_jax.files.parsing import parsing
+from eslr_jax.files.parsing import parsing, read_lines
 from eslr_jax.pipeline.formats.registry import reader
 from eslr_jax.pose.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets
 
@@ -73,7 +73,7 @@ def _skeleton_of(file: Path) -> Path:
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """Return the number and the words of every line that is not empty or a comment."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_lines(path)
     words = [(number, line.partition("#")[0].split()) for number, line in enumerate(lines, 1)]
     return [(number, line) for number, line in words if line]
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.files.parsing import read_lines
 from eslr_jax.pipeline.formats.registry import reader
 from eslr_jax.pose.skeleton import MAX_FRAMES, MAX_JOINTS, SkeletonMotion, pose_offsets, whole_rate
 
@@ -67,7 +68,7 @@ class _Words:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        self.lines = read_lines(path)
         self.number = 0  # of the lines consumed
         self.rest: list[str] = []
 

@@ -8,19 +8,23 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.pipeline.formats.gltf_document import MOVES, TRIANGLES, GltfDocument, sample_keys
+from eslr_jax.pipeline.formats.gltf_rig import read_joints
 from eslr_jax.pipeline.formats.mesh import MeshFile, name_parts, shared_vertices
 from eslr_jax.pipeline.formats.mesh_sequence import MAX_POINTS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader
 
 
-@reader("mesh", [".glb"])
+@reader("mesh", [".glb", ".gltf"])
 def read_glb(path: Path, _like: MeshFile | None = None) -> MeshFile:
-    """Read all triangles of a glTF binary into one mesh, in the scene's frame, and share split vertices.
+    """Read all triangles of a glTF file into one mesh, in the scene's frame, and share split vertices.
 
-    Morph targets count as much as their weights at rest say.
+    Morph targets count as much as their weights at rest say. A mesh with a skin is in its bind pose: glTF has
+    the joints carry it, and its own node count for nothing.
     """
     document = GltfDocument(path)
     world = document.world_matrices({}, 1)[0]
+    has_skin = any("skin" in node and "mesh" in node for node in document.items("nodes"))
+    spaces = read_joints(document).spaces if has_skin else {}
     positions, corners, uvs, names, materials, count = [], [], [], [], [], 0
     for index, node in enumerate(document.items("nodes")):
         mesh = document.item("meshes", node["mesh"]) if "mesh" in node else {}
@@ -28,7 +32,8 @@ def read_glb(path: Path, _like: MeshFile | None = None) -> MeshFile:
             if primitive.get("mode", TRIANGLES) < TRIANGLES:
                 continue  # points and lines
             points, faces = document.shaped_triangles(node, primitive)
-            positions.append(points @ world[index, :3, :3].T + world[index, :3, 3])
+            space = spaces[node["skin"]] if "skin" in node else world[index]
+            positions.append(points @ space[:3, :3].T + space[:3, 3])
             corners.append(faces + count)
             count += len(points)
             uv = primitive["attributes"].get("TEXCOORD_0")

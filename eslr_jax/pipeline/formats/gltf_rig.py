@@ -38,6 +38,7 @@ class _Joints:
     rest_frames: np.ndarray  # [joints, 4, 4]
     skeleton: Skeleton
     spaces: dict[int, np.ndarray]  # skin -> matrix from its mesh space to the world
+    world: np.ndarray  # from every node to the world, as the file has them posed [nodes, 4, 4]
 
 
 def gltf_clip_names(path: str | Path) -> tuple[str, ...]:
@@ -51,21 +52,22 @@ def read_gltf_body(path: Path, meshes: str = "") -> RiggedMesh:
     """Read a skinned character in its bind pose, in world axes, with the vertices of the file.
 
     It has the shape that the file's weights of morph targets give it. `meshes` names the meshes, or their nodes,
-    that make up the body, as in "Skin,Hat"; "" is all that are skinned.
+    that make up the body, as in "Skin,Hat"; "" is all that are skinned, or hang on a joint.
     """
     document = GltfDocument(path)
-    joints = _read_joints(document)
-    found = {}  # skinned nodes, and the names they go by
+    joints = read_joints(document)
+    carriers = {node: _carrier(document, joints, node) for node in range(len(document.parents))}
+    found = {}  # nodes of the body, and the names they go by
     for index, node in enumerate(document.items("nodes")):
-        if "mesh" in node and "skin" in node:
+        if "mesh" in node and ("skin" in node or carriers[index] is not None):
             entries = (node, document.item("meshes", node["mesh"]))
             found[index] = [str(entry["name"]) for entry in entries if entry.get("name")] or [f"mesh{index}"]
     wanted = set(filter(None, meshes.split(",")))
     if unknown := sorted(wanted.difference(*found.values())):
         known = ", ".join(names[0] for names in found.values())
-        raise AssetError(f"{path} has no skinned mesh {unknown[0]!r}; it has {known}")
+        raise AssetError(f"{path} has no mesh {unknown[0]!r} on its skeleton; it has {known}")
     nodes = [node for node, names in found.items() if not wanted or wanted & set(names)]
-    parts = [part for node in nodes for part in _read_node(document, joints, node)]
+    parts = [part for node in nodes for part in _read_node(document, joints, node, carriers[node])]
     if not parts:
         raise AssetError(f"{path} has a skin, but no triangles bound to it; export the mesh with its skin")
     offsets = np.cumsum([0, *(len(part[0]) for part in parts)])
@@ -96,7 +98,7 @@ def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
         raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
     if clip and clip not in names:
         raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
-    joints = _read_joints(document)
+    joints = read_joints(document)
     index = names.index(clip) if clip else 0
     keys = document.key_frames(document.items("animations")[index])
     if not keys:
@@ -120,7 +122,7 @@ def _clip_names(document: GltfDocument) -> tuple[str, ...]:
     return tuple(unique_names([str(entry.get("name") or f"clip{i}") for i, entry in enumerate(entries)]))
 
 
-def _read_joints(document: GltfDocument) -> _Joints:
+def read_joints(document: GltfDocument) -> _Joints:
     """Collect the joints of all skins at rest."""
     skins = document.items("skins")
     if not skins:
@@ -167,7 +169,7 @@ def _read_joints(document: GltfDocument) -> _Joints:
     nodes = [nodes[joint] for joint in order]
     rest_frames = np.stack([frames[node] for node in nodes])
     skeleton = Skeleton(tuple(names[joint] for joint in order), tuple(new_parents), rest_frames[:, :3, 3])
-    return _Joints(nodes, rest_frames, skeleton, spaces)
+    return _Joints(nodes, rest_frames, skeleton, spaces, world)
 
 
 def _bind_space(
@@ -196,23 +198,36 @@ def _bind_space(
     return best
 
 
+def _carrier(document: GltfDocument, joints: _Joints, node: int) -> int | None:
+    """Return the joint that a node hangs on; None if there is none."""
+    while node >= 0 and node not in joints.nodes:
+        node = document.parents[node]
+    return joints.nodes.index(node) if node >= 0 else None
+
+
 def _read_node(
-    document: GltfDocument, joints: _Joints, index: int
+    document: GltfDocument, joints: _Joints, index: int, carrier: int | None
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Return positions [m], faces, weights and joints of each primitive of a skinned node."""
+    """Return positions [m], faces, weights and joints of each primitive of a node with a skin, or on a joint."""
     node = document.item("nodes", index)
-    skin = document.item("skins", node["skin"])
-    space = joints.spaces[node["skin"]]
-    place = {joint: number for number, joint in enumerate(joints.nodes)}
-    order = np.array([place[joint] for joint in skin["joints"]])
+    if "skin" in node:
+        skin, space = document.item("skins", node["skin"]), joints.spaces[node["skin"]]
+        order = np.array([joints.nodes.index(joint) for joint in skin["joints"]])
+    else:
+        posed = joints.world[joints.nodes[carrier]]
+        space = joints.rest_frames[carrier] @ np.linalg.inv(posed) @ joints.world[index]
     result = []
     for primitive in document.item("meshes", node["mesh"]).get("primitives", []):
         attributes = primitive.get("attributes", {})
-        if "JOINTS_0" not in attributes:
+        if "skin" in node and "JOINTS_0" not in attributes:
             continue
         points, faces = document.shaped_triangles(node, primitive)
         if np.linalg.det(space[:3, :3]) < 0:
             faces = faces[:, ::-1]
+        world = points @ space[:3, :3].T + space[:3, 3]
+        if "skin" not in node:
+            result.append((world, faces, np.ones((len(points), 1)), np.full((len(points), 1), carrier)))
+            continue
         weights, followed = [], []
         number = 0
         while f"JOINTS_{number}" in attributes:
@@ -228,6 +243,5 @@ def _read_node(
         weights, local = weight / total, np.where(weight > 0, chosen, 0.0)
         if local.max() >= len(order):
             raise document.fail(f"has a skin weight for joint {int(local.max())} of {len(order)}")
-        world = points @ space[:3, :3].T + space[:3, 3]
         result.append((world, faces, weights, order[local.astype(np.int64)]))
     return result

@@ -1,4 +1,4 @@
-"""Read a mesh that moves and keeps its faces: an npz archive, a folder of meshes, or shapes of a glTF file."""
+"""Read a mesh that moves and keeps its faces, or stands still: from npz, a folder of meshes, or glTF."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.files.npz import check_layout, read_arrays
 from eslr_jax.files.parsing import split_name
 from eslr_jax.pipeline.formats.mesh import read_mesh_file
-from eslr_jax.pipeline.formats.registry import find_reader, suffixes_of
+from eslr_jax.pipeline.formats.registry import find_reader, reader, suffixes_of
 from eslr_jax.pose.skeleton import MAX_FRAMES
 
 MAX_POINTS = 1 << 28  # frames times vertices: six gigabytes of float64
@@ -52,7 +52,7 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
             of an .npz with `faces` and positions [frames, vertices, 3], named rest_positions, positions, vertices
             or verts, and optionally `fps` or `timestep`; or of a .glb or .gltf with a mesh that shapes (morph
-            targets) move, `FILE#MESH` where there are several.
+            targets) move, `FILE#MESH` where there are several; or of a single OBJ, PLY or STL file.
         fps: Frame rate [1/s]; by default the file's own, or 30.
 
     Raises:
@@ -79,6 +79,13 @@ def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[M
         return [_read_folder(Path(path), DEFAULT_FPS if fps is None else fps)]
     file, mesh = split_name(path)
     return find_reader("mesh sequence", file)(file, mesh, fps)
+
+
+@reader("mesh sequence", [".obj", ".ply", ".stl"])
+def read_still_mesh(path: Path, _mesh: str = "", fps: float | None = None) -> list[MeshSequence]:
+    """Read a mesh of a single frame."""
+    mesh = read_mesh_file(path)
+    return [MeshSequence(path.name, mesh.positions[None], mesh.faces, DEFAULT_FPS if fps is None else fps)]
 
 
 def is_mesh_sequence(path: str | Path) -> bool:

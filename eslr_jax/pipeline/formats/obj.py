@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import MeshError
+from eslr_jax.files.parsing import read_lines
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, write_frames
 from eslr_jax.pipeline.formats.mesh import MeshFile, name_parts
 from eslr_jax.pipeline.formats.registry import reader, writer
@@ -27,7 +28,12 @@ def read_obj(path: Path, like: MeshFile | None = None) -> MeshFile:
     lines: list[int] = []  # of the polygons
     names: dict[str, list[str]] = {"usemtl": [], "g": [], "o": []}
     current = dict.fromkeys(names, "")
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    begun = ""  # of a line that goes on in the next one
+    for number, line in enumerate(read_lines(path), 1):
+        line, begun = begun + line, ""
+        if line.endswith("\\") and "#" not in line:  # a comment may end in a path
+            begun = line[:-1] + " "
+            continue
         key, rest = (*line.split(maxsplit=1), "", "")[:2]
         if key in current:
             current[key] = _COMMENT.sub("", rest).strip()

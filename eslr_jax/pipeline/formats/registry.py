@@ -26,6 +26,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, check_meshes
 
+_SCENES = (".fbx", ".usd", ".usda", ".usdc", ".usdz", ".abc", ".dae", ".blend")  # of other programs
 WRITERS = ("scene", "animation", "point cache", "frames")
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -91,7 +92,7 @@ def find_reader(kind: str, path: str | Path) -> Callable[..., Any]:
     for form in sorted(found, key=lambda form: form.accepts is None):
         if form.accepts is None or form.accepts(Path(path)):
             return form.function
-    hint = "export it as glTF (in Blender: File > Export > glTF 2.0), or " if suffix == ".fbx" else ""
+    hint = "export it as glTF (in Blender: File > Export > glTF 2.0), or " if suffix in _SCENES else ""
     known = ", ".join(suffixes_of(kind))
     raise AssetError(f"{kind} file {path} has the unknown suffix {suffix!r}; {hint}give one of {known}")
 

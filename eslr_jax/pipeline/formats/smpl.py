@@ -1,8 +1,8 @@
 """Read SMPL, SMPL-H and SMPL-X: body models from the user's own .npz or .pkl, and motions as their parameters.
 
 The models don't ship with this package: their licence asks every user to fetch them. Motions are AMASS .npz
-(Z up) and the pickles of HOOD and of the VTO dataset (Y up), which hold rotations of numbered joints and no
-skeleton.
+(mostly Z up) and the pickles of HOOD and of the VTO dataset (Y up), which hold rotations of numbered joints and
+no skeleton.
 
 Source: Loper et al. 2015 (doi:10.1145/2816795.2818013); Pavlakos et al. 2019 (arXiv:1904.05866); AMASS,
 Mahmood et al. 2019 (arXiv:1904.03278).
@@ -63,7 +63,6 @@ _MODEL = {
     "kintree_table": ("fiu", "2 joints"),
 }
 _BLENDS = {"shapedirs": ("fiu", "vertices 3 shapes"), "posedirs": ("fiu", "vertices 3 entries")}
-_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # to Y up
 
 # A person of 1.7 m in a T-pose [m], for motions that come without a body: straight limbs with the segments of
 # Drillis and Contini (1966). Only directions and the length of the legs are used.
@@ -160,20 +159,32 @@ def _joint_names(path: Path, values: Mapping[str, Any], joints: int) -> list[str
 
 # ---------------------------------------------------------------- motions
 
+_KEYS = {  # of AMASS, and of what is made with SMPL-X; the face moves no cloth
+    "poses": ("poses",),
+    "root": ("root_orient", "global_orient"),
+    "body": ("pose_body", "body_pose"),
+    "hands": ("pose_hand",),
+    "moves": ("trans", "transl", "translation"),
+    "rate": ("mocap_framerate", "mocap_frame_rate", "fps"),
+}
+
 
 @reader("motion", [".npz"])
 def read_amass(path: Path, _clip: str = "") -> SkeletonMotion:
-    """Read a motion of AMASS, Z up: `poses`, `trans` and `mocap_framerate` (or `mocap_frame_rate`)."""
-    keys = ("poses", "trans", "mocap_framerate", "mocap_frame_rate")
-    values = read_arrays(path, content="motion", names=keys)
-    rates = [values[key] for key in keys[2:] if key in values]
-    missing = [key for key in keys[:2] if key not in values] + ([] if rates else [keys[2]])
-    if missing:
+    """Read a motion with keys of AMASS or SMPL-X: rotations, whole or in parts, translations and frame rate."""
+    values = read_arrays(path, content="motion", names=[key for keys in _KEYS.values() for key in keys])
+    found = {what: next((values[k] for k in keys if k in values), None) for what, keys in _KEYS.items()}
+    if found["poses"] is None and found["root"] is not None and found["body"] is not None:
+        parts = [part for part in (found["root"], found["body"], found["hands"]) if part is not None]
+        found["poses"] = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    if missing := [" or ".join(_KEYS[what]) for what in ("poses", "moves", "rate") if found[what] is None]:
+        keys = ", ".join(values) or "no key of a motion"
         raise MotionError(
-            f"motion file {path} lacks {', '.join(missing)}; give a motion of AMASS, not its shape"
+            f"motion file {path} has {keys}; it lacks {', '.join(missing)} (in place of poses: root_orient and "
+            "pose_body); give a motion of AMASS, not its shape"
         )
-    fps = read_number(rates[0], f"motion file {path}: the frame rate")
-    return _parameters(path, values["poses"], values["trans"], fps, _Z_UP)
+    fps = read_number(found["rate"], f"motion file {path}: the frame rate")
+    return _parameters(path, found["poses"], found["moves"], fps, "z")
 
 
 @reader("motion", [".pkl"])
@@ -196,11 +207,11 @@ def read_smpl_pickle(path: Path, _clip: str = "") -> SkeletonMotion:
         raise MotionError(f"motion file {path} has {found}; it needs body_pose and global_orient, or pose")
     if move is None:
         raise MotionError(f"motion file {path} has no transl or translation; give a motion of HOOD or VTO")
-    return _parameters(path, poses, values[move], HOOD_FPS, np.eye(3))
+    return _parameters(path, poses, values[move], HOOD_FPS, "y")
 
 
-def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray) -> SkeletonMotion:
-    """Return the motion of rotations [frames, 3 joints] [rad] and root translations [m], turned to our axes."""
+def _parameters(path: Path, poses: Any, moves: Any, fps: float, up: str) -> SkeletonMotion:
+    """Return the motion of rotations [frames, 3 joints] [rad] and root translations [m]; `up` is usual."""
     poses, moves = np.asarray(poses), np.asarray(moves)
     is_table = poses.ndim == 2 and poses.dtype.kind in "fiu" and moves.dtype.kind in "fiu"
     if (
@@ -218,11 +229,9 @@ def _parameters(path: Path, poses: Any, moves: Any, fps: float, axes: np.ndarray
     if not is_finite.all():
         raise MotionError(f"motion file {path}: frame {np.argmin(is_finite)} is not finite; cut or repair it")
     skeleton = _standing_skeleton(poses.shape[1] // 3)
-    local = rotation_matrices(poses.reshape(len(poses), -1, 3))
-    local[:, 0] = axes @ local[:, 0]
-    rotations = chain_rotations(local, skeleton.parents)
-    positions = chain_positions(rotations, moves.astype(np.float64) @ axes.T, skeleton)
-    return SkeletonMotion(path.stem, skeleton, rotations, positions, fps, root_axes=axes)
+    rotations = chain_rotations(rotation_matrices(poses.reshape(len(poses), -1, 3)), skeleton.parents)
+    positions = chain_positions(rotations, moves.astype(np.float64), skeleton)
+    return SkeletonMotion(path.stem, skeleton, rotations, positions, fps, usual_up=up)
 
 
 def _standing_skeleton(joints: int) -> Skeleton:

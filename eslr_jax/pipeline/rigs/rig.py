@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.mesh.validate import UNITS, check_outward
 from eslr_jax.pipeline.formats.mesh import shared_vertices
-from eslr_jax.pipeline.rigs.alignment import align_rests, match_parts, rig_scale
+from eslr_jax.pipeline.rigs.alignment import LIMBS, align_rests, match_parts, rig_scale
 from eslr_jax.pose.joints import HAND, find_named_parts, find_parts, map_joints
 from eslr_jax.pose.motion import Motion
 from eslr_jax.pose.retarget import ARM_ABDUCTION, global_rotations, leg_length, local_rotations
@@ -86,7 +86,8 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     Vertices at one place are joined, the hips become joint 0, and hands are no obstacle.
 
     Raises:
-        AssetError: The mesh is empty or not finite, its weights and faces don't fit, or its unit is unknown.
+        AssetError: The mesh is empty, not finite or hands alone, its weights and faces don't fit, or its unit is
+            unknown.
         MeshError: Its faces point inside.
     """
     _check_mesh(mesh)
@@ -113,6 +114,9 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
     for joint, parent in enumerate(skeleton.parents):
         is_hand[joint] |= parent >= 0 and is_hand[parent]
     leading = np.take_along_axis(indices, weights.argmax(1)[:, None], axis=1)[:, 0]
+    is_obstacle = ~is_hand[leading][faces].all(axis=1)
+    if not is_obstacle.any():
+        raise AssetError(f"body {mesh.name} is hands alone; bind its other meshes to its skeleton")
     return Body(
         rest_positions=lengths(mesh.positions[vertices]),
         shape_directions=lengths(shapes[vertices]),
@@ -121,7 +125,7 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
         skin_weights=jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32),
         skin_indices=jnp.asarray(indices, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
-        is_obstacle=jnp.asarray(~is_hand[leading][faces].all(axis=1)),
+        is_obstacle=jnp.asarray(is_obstacle),
         parents=skeleton.parents,
         joint_names=skeleton.joint_names,
         pose_directions=None if mesh.pose_directions is None else lengths(mesh.pose_directions[vertices]),
@@ -196,19 +200,17 @@ def make_motion(
     keeps one still. The source's axis "y" or "z" points up, or "auto" judges by how it stands.
 
     Raises:
-        MotionError: No joint is known to both, or the source does not stand at rest.
+        MotionError: No joint is known to both, or the source stands neither at rest nor in a frame.
     """
-    is_judged = up == "auto" and _stands_along_z(source.skeleton, source.positions)
-    if is_judged and not _stands_along_z(source.skeleton, source.skeleton.rest_positions[None]):
-        warnings.warn(
-            f"{source.name}: taken as Z up, as the figure is longest along z, though not at rest; if it crawls "
-            "or lies, say that Y is up (--motion-up y)",
-            stacklevel=2,
-        )
-    if up == "z" or is_judged:
-        rest = dataclasses.replace(source.skeleton, rest_positions=source.skeleton.rest_positions @ _Y_UP.T)
-        turned, moved = _Y_UP @ source.rotations @ _Y_UP.T, source.positions @ _Y_UP.T
-        source = dataclasses.replace(source, skeleton=rest, rotations=turned, positions=moved)
+    axes = _Y_UP if (_judge_up(source) if up == "auto" else up) == "z" else np.eye(3)
+    rest_axes = axes if source.usual_up is None else np.eye(3)
+    rest = source.skeleton.rest_positions @ rest_axes.T
+    source = dataclasses.replace(
+        source,
+        skeleton=dataclasses.replace(source.skeleton, rest_positions=rest),
+        rotations=axes @ source.rotations @ rest_axes.T,
+        positions=source.positions @ axes.T,
+    )
     target = body_skeleton(body)
     is_model = is_body_model(target, source)
     mapping = map_joints(target, source.skeleton, joint_map, same_names=is_model)
@@ -220,11 +222,22 @@ def make_motion(
         )
     place = {name: joint for joint, name in enumerate(source.skeleton.joint_names)}
     followed = [place[mapping[name]] if name in mapping else -1 for name in target.joint_names]
+    lost = [
+        " ".join(part).strip()
+        for part, joints in find_parts(target).items()
+        if part[1] in (*LIMBS, "spine") and not mapping.keys() & {target.joint_names[k] for k in joints}
+    ]
+    if lost and joint_map is None:
+        warnings.warn(
+            f"{source.name}: no joint of it is known as {', '.join(lost)}, which move with what they hang on; "
+            "write a map with eslr joints --out map.json, and give it as --joint-map map.json",
+            stacklevel=2,
+        )
     scale = 1.0 if is_model else rig_scale(target, source.skeleton, followed)
     ours, theirs = match_parts(target, source.skeleton, followed)
     alignments = np.tile(np.eye(3), (len(target), 1, 1))
     if scale is None:
-        alignments = align_rests(target, source.skeleton, ours, theirs, source.name)
+        alignments = align_rests(target, source.skeleton, ours, theirs, source.name, source)
     turned = np.empty((len(source.rotations), len(target), 3, 3))
     for joint, (other, parent) in enumerate(zip(followed, target.parents, strict=True)):
         if other >= 0:
@@ -238,8 +251,8 @@ def make_motion(
         if leg and other:
             translations = leg / other * translations
         translations = _put_on_floor(turned, translations, target, body)
-    elif source.root_axes is not None:
-        translations = translations + source.root_axes @ target.rest_positions[0]
+    elif source.usual_up is not None:
+        translations = translations + axes @ target.rest_positions[0]
     else:
         translations = scale * translations
         places = chain_positions(turned, translations, target)
@@ -288,8 +301,24 @@ def skeleton_motion(motion: Motion, body: Body) -> SkeletonMotion:
     return SkeletonMotion(motion.name, skeleton, turned, positions, motion.fps)
 
 
-def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
-    """Tell whether the head is mostly above the feet along z rather than y; positions: [frames, joints, 3]."""
+def _judge_up(source: SkeletonMotion) -> str:
+    """Return the axis "y" or "z" that points up in a motion; warn with one line if that is a guess."""
+    rest, is_model = source.skeleton.rest_positions[None], source.usual_up is not None
+    usual = source.usual_up or _standing_axis(source.skeleton, rest)
+    found = _standing_axis(source.skeleton, source.positions) or usual or "y"
+    if found != usual and (is_model or found == "z"):
+        other = "z" if found == "y" else "y"
+        warnings.warn(
+            f"{source.name}: taken as {found.upper()} up, as the figure is longest along {found}, though not "
+            f"{'as usual' if is_model else 'at rest'}; if it crawls or lies, say that {other.upper()} is up "
+            f"(--motion-up {other})",
+            stacklevel=3,
+        )
+    return found
+
+
+def _standing_axis(skeleton: Skeleton, positions: np.ndarray) -> str | None:
+    """Return "y" or "z", along which the head is above the feet; positions: [frames, joints, 3]."""
     parts = find_parts(skeleton)
     upper = next((parts["", chain][-1] for chain in ("head", "neck", "spine") if ("", chain) in parts), None)
     lower = [
@@ -299,9 +328,9 @@ def _stands_along_z(skeleton: Skeleton, positions: np.ndarray) -> bool:
         if (side, chain) in parts
     ]
     if upper is None or not lower:
-        return False
-    rise = (positions[:, upper] - positions[:, lower].mean(axis=1)).mean(axis=0)
-    return bool(rise[2] > abs(rise[1]))
+        return None
+    _, along_y, along_z = (positions[:, upper] - positions[:, lower].mean(axis=1)).mean(axis=0)
+    return "z" if along_z > abs(along_y) else "y" if along_y > abs(along_z) else None
 
 
 def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
@@ -310,7 +339,7 @@ def is_body_model(target: Skeleton, source: SkeletonMotion) -> bool:
     Joints then follow by name, and rest where the parameters have none.
     """
     shared = set(target.joint_names) & set(source.skeleton.joint_names)
-    return source.root_axes is not None and len(shared) >= MODEL_JOINTS
+    return source.usual_up is not None and len(shared) >= MODEL_JOINTS
 
 
 def _put_on_floor(turned: NDArray, translations: NDArray, target: Skeleton, body: Body) -> NDArray:

@@ -23,6 +23,7 @@ from eslr_jax.pose.skeleton import nearest_rotations
 from eslr_jax.types import Body, BodyMotion
 
 NUM_PATCHES = 48  # pieces that move almost rigidly; about two a limb segment
+STILL_FRAMES = 60  # that a single mesh is held for by default: a garment hangs still by then
 _BLEND_STEPS = 12  # Laplacian smoothings of the patches' weights
 _INFLUENCES = 4
 
@@ -35,7 +36,8 @@ def pose_sequence(
     The vertices move as in the sequence, resampled in time by straight lines. Patches of the surface stand for
     joints: each follows the best rigid motion of its vertices. They carry a garment that fits the first frame,
     which is the rest pose. `fps` are the simulation's; the first `num_frames` of its frames are kept, by default
-    all. The unit is by default recognised, see `metres_per_unit`.
+    all. A sequence of one frame, as a mannequin, is held. The unit is by default recognised, see
+    `metres_per_unit`.
 
     Raises:
         AssetError: The unit is unknown.
@@ -45,6 +47,8 @@ def pose_sequence(
     faces = np.asarray(sequence.faces, np.int64)
     extent = float(np.ptp(sequence.positions[0], axis=0).max())
     scaled = metres_per_unit(sequence.name, extent, units) * sequence.positions
+    if len(scaled) == 1:
+        scaled = np.repeat(scaled, STILL_FRAMES if num_frames is None else num_frames, axis=0)
     # By straight lines between frames.
     at = np.arange(count_resampled(len(scaled), sequence.fps, fps)) * (sequence.fps / fps)
     before = np.clip(at.astype(int), 0, max(len(scaled) - 2, 0))
