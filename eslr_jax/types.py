@@ -51,6 +51,8 @@ class Garment:
     hinge_incidence: Int[Array, "vertices hinge_degree"]
     vertex_blocks: Int[Array, "vertex_blocks block"]  # compact groups of all vertices; some may be repeated
     face_blocks: Int[Array, "face_blocks face_block"]  # likewise of all faces
+    edges: Int[Array, "pairs 2"]  # every mesh edge once
+    edge_blocks: Int[Array, "edge_blocks edge_block"]  # compact groups of them
     edge_mask: Bool[Array, " edges"]
     vertex_mask: Bool[Array, " vertices"]
     geodesic_embedding: Float[Array, "vertices embedding"]  # [m]
@@ -149,6 +151,9 @@ class BodySurface:
     faces: Int[Array, "surface_faces 3"]  # into `vertex_ids`
     face_incidence: Int[Array, "surface_vertices degree"]  # see numerics.gather_corners
     patch_vertices: Int[Array, "patches members"]  # compact groups of all vertices; the last may repeat one
+    face_blocks: Int[Array, "face_blocks face_block"]  # likewise of all faces
+    edges: Int[Array, "surface_edges 2"]  # every edge once
+    edge_blocks: Int[Array, "edge_blocks edge_block"]  # likewise of all edges
     is_boundary: Bool[Array, " surface_vertices"]  # where the body goes on with faces that are left out
     vertex_areas: Float[Array, " surface_vertices"]  # a third of the incident areas at rest [m^2]
 

@@ -13,6 +13,7 @@ from eslr_jax.types import Garment
 
 BLOCK = 8  # vertices that a search handles together, see `Garment.vertex_blocks`
 FACE_BLOCK = 16  # likewise faces; at most 32
+EDGE_BLOCK = 16  # likewise edges
 STEPS_PER_OCTAVE = 16  # a size is rounded up by at most a sixteenth
 
 
@@ -127,6 +128,8 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
             block = np.broadcast_to(np.asarray(value, leaf.dtype), (rows, *leaf.shape[1:]))
             padded[name] = np.concatenate([leaf, block])
     itself = np.arange(have.edges, bucket.edges, dtype=leaves["reverse_edges"].dtype)
+    extra = (bucket.edges - have.edges) // 2
+    padded["edges"] = np.pad(leaves["edges"], ((0, extra), (0, 0)), constant_values=last)
     padded["reverse_edges"] = np.concatenate([leaves["reverse_edges"], itself])
     neighbors = np.arange(bucket.vertices, dtype=leaves["neighbors"].dtype)[:, None].repeat(bucket.degree, 1)
     neighbors[: have.vertices, : have.degree] = leaves["neighbors"]
@@ -145,6 +148,7 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
     for name, size, count in (
         ("vertex_blocks", BLOCK, bucket.vertices),
         ("face_blocks", FACE_BLOCK, bucket.faces),
+        ("edge_blocks", EDGE_BLOCK, bucket.edges // 2),
     ):
         spare = -(-count // size) - len(leaves[name])
         padded[name] = np.pad(leaves[name], ((0, spare), (0, 0)), constant_values=count - 1)

@@ -14,7 +14,15 @@ from eslr_jax.errors import MeshError
 from eslr_jax.mesh import topology
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.embedding import EmbeddingMode, geodesic_embedding
-from eslr_jax.mesh.padding import BLOCK, FACE_BLOCK, Bucket, common_bucket, garment_bucket, pad_garment
+from eslr_jax.mesh.padding import (
+    BLOCK,
+    EDGE_BLOCK,
+    FACE_BLOCK,
+    Bucket,
+    common_bucket,
+    garment_bucket,
+    pad_garment,
+)
 from eslr_jax.mesh.surface import compact_groups
 from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
 from eslr_jax.types import Garment
@@ -77,7 +85,8 @@ def prepare_garment(
 
     areas = topology.face_areas(sewn, faces)
     hinges, hinge_faces = topology.find_hinges(faces)
-    senders, receivers, reverse = topology.directed_edges(topology.unique_edges(faces))
+    edges = topology.unique_edges(faces)
+    senders, receivers, reverse = topology.directed_edges(edges)
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
     leaves: dict[str, Any] = dict(
         rest_positions=positions,
@@ -98,6 +107,8 @@ def prepare_garment(
         hinge_incidence=topology.incidence_table(hinges, num_vertices),
         vertex_blocks=compact_groups(positions, BLOCK),
         face_blocks=compact_groups(positions[faces].mean(axis=1), FACE_BLOCK),
+        edges=edges,
+        edge_blocks=compact_groups(positions[edges].mean(axis=1), EDGE_BLOCK),
         edge_mask=np.ones(len(senders), bool),
         vertex_mask=np.ones(num_vertices, bool),
         geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode),

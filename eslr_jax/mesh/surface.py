@@ -6,10 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.mesh.topology import face_areas, incidence_table, vertex_areas
+from eslr_jax.mesh.topology import face_areas, incidence_table, unique_edges, vertex_areas
 from eslr_jax.types import BodySurface
 
-_PATCH_SIZE = 16  # vertices in a patch; more make the first level cheaper and the second dearer
+_PATCH_SIZE = (
+    16  # vertices, faces or edges in a group; more make the first level cheaper and the second dearer
+)
 
 
 def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
@@ -41,11 +43,15 @@ def prepare_surface(
     vertex_ids, flat = np.unique(faces, return_inverse=True)
     faces = flat.reshape(-1, 3)
     positions = np.asarray(rest_positions, np.float64)[vertex_ids]
+    edges = unique_edges(faces)
     return BodySurface(
         vertex_ids=jnp.asarray(vertex_ids, jnp.int32),
         faces=jnp.asarray(faces, jnp.int32),
         face_incidence=jnp.asarray(incidence_table(faces, len(positions)), jnp.int32),
         patch_vertices=jnp.asarray(compact_groups(positions, _PATCH_SIZE), jnp.int32),
+        face_blocks=jnp.asarray(compact_groups(positions[faces].mean(axis=1), _PATCH_SIZE), jnp.int32),
+        edges=jnp.asarray(edges, jnp.int32),
+        edge_blocks=jnp.asarray(compact_groups(positions[edges].mean(axis=1), _PATCH_SIZE), jnp.int32),
         is_boundary=jnp.asarray(np.isin(vertex_ids, [] if boundary is None else boundary)),
         vertex_areas=jnp.asarray(
             vertex_areas(face_areas(positions, faces), faces, len(positions)), jnp.float32

@@ -88,6 +88,7 @@ def make_stepper(
             point, _, status = _begin(network, problem, state)
             unknown = jnp.full_like(point.value, jnp.inf)
             minimum = Minimum(*point, iterations=jnp.int32(0), gap_bound=unknown)
+        problem = problem.on_course(minimum.course)
         position = pin(problem, minimum.position)
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(

@@ -202,8 +202,8 @@ def check_every_parameter(scene, frames=(-1,), steps=STEPS):
     """Hold gradients of the loss after some of the frames against central difference quotients.
 
     A large step crosses a change of contact, a small one divides what the solver leaves by little, and which is
-    which differs by parameter. So the median of the quotients of all steps counts, and its error is three times their
-    median distance from it.
+    which differs by parameter. So the median of the quotients of all steps counts, and its error is three times
+    their median distance from it.
     """
     losses, along = loss_by_frames(scene), directions(scene)
     zeros = jax.tree.map(jnp.zeros_like, along)
