@@ -14,7 +14,9 @@ from eslr_jax.terms.contact import Contact
 TERMS = (*CLOTH, Contact(), Friction())
 
 
-@pytest.mark.parametrize(("speed", "integrator"), [(0.3, "euler"), (3.0, "bdf2")])
+@pytest.mark.parametrize(
+    ("speed", "integrator"), [pytest.param(0.3, "euler", marks=pytest.mark.slow), (3.0, "bdf2")]
+)
 def test_a_ball_passes_through_no_sheet(speed, integrator):
     pytest.importorskip("ipctk")
     poses = drifting_ball(9, speed=speed)
@@ -31,6 +33,7 @@ def test_a_ball_passes_through_no_sheet(speed, integrator):
         assert len(intersecting_pairs(cloth, faces, body, np.asarray(scene.body.surface.faces))) == 0
 
 
+@pytest.mark.slow
 def test_a_pinned_sheet_folds_onto_itself_without_crossing():
     pytest.importorskip("ipctk")
     is_pinned = np.zeros(64, bool)
