@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
 import tomllib
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from eslr_jax.errors import ConfigError
@@ -244,6 +246,20 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         if isinstance(origin, type) and isinstance(value, origin):
             return value
     raise ConfigError(f"{name} = {value!r} has the wrong type; expected {hint}")
+
+
+def import_own(module: str, user: str) -> ModuleType:
+    """Return a module of the user's own; `user` is what messages call that which needs it (host).
+
+    Raises:
+        ConfigError: It can't be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ConfigError(
+            f"{user}: {error}; run the command where {module}.py is, or put its folder on PYTHONPATH"
+        ) from error
 
 
 def apply_overrides(values: dict[str, Any], overrides: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Found, Meshes, Motion, find_pairs, nearer_pairs
 from eslr_jax.contact.pairs import Pairs, mended, no_pairs, shares
-from eslr_jax.numerics import Vector3, dot3
+from eslr_jax.numerics import Vector3, safe_norm
 
 CAUTION = 0.9  # share of its room that a vertex may take in one step
 _PUSH = 4e-3  # [m] by which cloth that the body carries may be pushed in one part of its motion
@@ -42,7 +42,6 @@ class Course:
     wide: Pairs
     wide_center: Float[Array, "3 vertices"]
     wide_radius: Float[Array, " vertices"]
-    last: Float[Array, "3 vertices"]  # positions when pairs were last looked for [m]
     most: Int[Array, ""]  # rows that the fullest table would have needed
     searches: Int[Array, ""]
     lists: Int[Array, ""]
@@ -62,9 +61,7 @@ def start_course(position: Float[Array, "vertices 3"], rows: tuple[int, int]) ->
     nothing = jnp.zeros(position.shape[0], dtype)
     wide, fine = (Pairs(no_pairs(size, dtype), no_pairs(size, dtype)) for size in rows)
     no, one = jnp.zeros((), bool), jnp.ones((), dtype)
-    return Course(
-        0 * one, one, fine, nowhere, nothing, wide, nowhere, nothing, position.T, zero, zero, zero, no, no
-    )
+    return Course(0 * one, one, fine, nowhere, nothing, wide, nowhere, nothing, zero, zero, zero, no, no)
 
 
 @struct.dataclass
@@ -74,9 +71,8 @@ class Around:
     meshes: Meshes
     body: Float[Array, "3 surface_vertices"]  # at t [m]
     way: Float[Array, "3 surface_vertices"]  # that the body moves in the frame [m]
-    carried: Float[
-        Array, "3 vertices"
-    ]  # by which the body takes the cloth along [m]; pins go where they must
+    # By which the body takes the cloth along [m]; pins go where they must.
+    carried: Float[Array, "3 vertices"]
     goal: Float[Array, "3 vertices"]  # where the solver would like to begin [m]
     is_free: Bool[Array, " vertices"]
     reach: Float[Array, ""]  # of contact [m]
@@ -104,7 +100,7 @@ def follow(
 def _searched(x: Array, course: Course, around: Around) -> Course:
     """Return the course with wide tables around x and its way, if those at hand don't serve."""
     remaining = 1.0 - course.share
-    room = course.wide_radius - _lengths(x - course.wide_center)
+    room = course.wide_radius - safe_norm(x - course.wide_center, axis=0)
     is_due = (remaining > 0) | jnp.any((room < 2.0 * _FINE[0]) & around.is_free)
     rows = course.wide.faces.areas.shape[0]
 
@@ -112,10 +108,10 @@ def _searched(x: Array, course: Course, around: Around) -> Course:
         part = jnp.minimum(scale * tried.part, remaining)
         # The goal counts once the body has arrived.
         ahead = jnp.where(part >= remaining, around.goal - x - remaining * around.carried, 0.0)
-        length = _lengths(ahead)
+        length = safe_norm(ahead, axis=0)
         ahead = ahead * jnp.minimum(1.0, scale * _FARTHEST / jnp.where(length > 0, length, 1.0))[None]
         way = part * around.carried + 0.5 * ahead
-        radius = 0.5 * _lengths(ahead) + scale * _WIDE
+        radius = 0.5 * safe_norm(ahead, axis=0) + scale * _WIDE
         whole = jnp.concatenate([way, part * around.way], axis=1)
         half = 0.5 * whole
         relative = half - 0.5 * part * jnp.mean(around.way, axis=1, keepdims=True)
@@ -158,7 +154,7 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
         ways = jnp.concatenate([part * around.carried, part * around.way], axis=1)
         ends = _rows(jnp.stack(start) + ways)
         moved, lack = mended(start, ends, course.wide, is_free, _SWEEPS)
-        farthest = jnp.max(_lengths(jnp.stack(moved) - jnp.stack(ends)))
+        farthest = jnp.max(safe_norm(jnp.stack(moved) - jnp.stack(ends), axis=0))
         return part, jnp.stack(moved)[:, : x.shape[1]], (lack == 0) & (farthest < _PUSH)
 
     def is_wanting(carry):
@@ -176,8 +172,10 @@ def _listed(x: Array, course: Course, around: Around) -> Course:
     """Return the course with fine tables around x, as wide as the last steps were long."""
     z = around.joined(x, course.share)
     is_first = course.lists == 0
-    moved = jnp.where(is_first, _lengths(around.goal - x), _MOVES * _lengths(x - course.last))
-    room = course.wide_radius - _lengths(x - course.wide_center)
+    moved = jnp.where(
+        is_first, safe_norm(around.goal - x, axis=0), _MOVES * safe_norm(x - course.center, axis=0)
+    )
+    room = course.wide_radius - safe_norm(x - course.wide_center, axis=0)
     wanted = jnp.clip(jnp.minimum(jnp.clip(moved, *_FINE), room), 0.0, None)
     rows = course.pairs.faces.areas.shape[0]
 
@@ -196,7 +194,6 @@ def _listed(x: Array, course: Course, around: Around) -> Course:
         pairs=found.pairs,
         center=x,
         radius=radius,
-        last=x,
         lists=course.lists + 1,
         is_full=course.is_full | (found.most > rows),
     )
@@ -220,12 +217,8 @@ def limited(
 
 def is_spent(x: Float[Array, "3 vertices"], course: Course, around: Around) -> Bool[Array, ""]:
     """Return whether a vertex has used up so much of its allowance that pairs should be looked for again."""
-    return jnp.any((_lengths(x - course.center) > _SPENT * course.radius) & around.is_free)
+    return jnp.any((safe_norm(x - course.center, axis=0) > _SPENT * course.radius) & around.is_free)
 
 
 def _rows(values: Float[Array, "3 vertices"]) -> Vector3:
     return (values[0], values[1], values[2])
-
-
-def _lengths(values: Float[Array, "3 vertices"]) -> Float[Array, " vertices"]:
-    return jnp.sqrt(dot3(_rows(values), _rows(values)))

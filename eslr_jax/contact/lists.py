@@ -10,13 +10,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.pairs import Pairs, Rows, closest, corners_of, over_rows, signs
-from eslr_jax.numerics import Vector3, dot3, entries_of_words, sub3, true_entries
+from eslr_jax.contact.search import Candidates, append, test_candidates
+from eslr_jax.numerics import Vector3, dot3, sub3, true_entries
 from eslr_jax.types import BodySurface, Garment
-
-_BLOCK_PAIRS = (
-    2048  # pairs of blocks that are looked at together; what is read of them then stays in the cache
-)
-_CANDIDATES = 2048  # pairs of primitives that are tested exactly at a time
 
 
 @struct.dataclass
@@ -159,35 +155,22 @@ def _find_kind(
     close = true_entries(_are_close(first, second, balls, is_edge))
     table = _table(second, balls[1])
 
-    def look(carry):
-        begin, found = carry
-        number = begin + jnp.arange(_BLOCK_PAIRS, dtype=jnp.int32)
-        block, others = close.find(number)
-        words = _candidates(first.blocks[block], others, balls[0], table)
-        words = jnp.where((number < close.count)[:, None], words, 0)
-        candidates = entries_of_words(words)
+    def words_of(group: Array, other: Array) -> Array:
+        return _candidates(first.blocks[group], other, balls[0], table)
 
-        def test(carry):
-            begin, found = carry
-            number = begin + jnp.arange(_CANDIDATES, dtype=jnp.int32)
-            pair, column = candidates.find(number)
-            one = first.blocks[block[pair], column // 32]
-            other = second.blocks[others[pair], column % 32]
-            ids = jnp.concatenate([first.corners[:, one], second.corners[:, other]])
-            is_pair = _may_touch(ids, is_edge, motion, meshes.num_cloth, reach, pieces)
-            if is_edge:  # within a group, each couple once
-                is_pair = is_pair & ((block[pair] != others[pair]) | (one < other))
-            is_pair = is_pair & (number < candidates.count)
-            areas = jnp.minimum(first.areas[one], second.areas[other]) if is_edge else first.areas[one]
-            return begin + _CANDIDATES, _append(found, ids, areas, is_pair)
+    def test(found, candidates: Candidates):
+        (group, other), (row, column) = candidates.groups, candidates.members
+        one, two = first.blocks[group, row], second.blocks[other, column]
+        ids = jnp.concatenate([first.corners[:, one], second.corners[:, two]])
+        is_pair = _may_touch(ids, is_edge, motion, meshes.num_cloth, reach, pieces) & candidates.is_used
+        areas = first.areas[one]
+        if is_edge:
+            is_pair = is_pair & ((group != other) | (one < two))  # within a group, each couple once
+            areas = jnp.minimum(areas, second.areas[two])
+        return append(*found, (ids, areas), is_pair)
 
-        return begin + _BLOCK_PAIRS, jax.lax.while_loop(
-            lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found)
-        )[1]
-
-    nothing = (jnp.zeros((4, rows), jnp.int32), jnp.zeros(rows, reach.dtype), jnp.int32(0))
-    start = (jnp.int32(0), nothing)
-    _, (ids, areas, count) = jax.lax.while_loop(lambda carry: carry[0] < close.count, look, start)
+    nothing = (jnp.zeros((4, rows), jnp.int32), jnp.zeros(rows, reach.dtype))
+    (ids, areas), count = test_candidates(close, words_of, test, (nothing, jnp.int32(0)))
     return _completed(ids, areas, jnp.minimum(count, rows), is_edge, meshes, reach), count
 
 
@@ -297,16 +280,6 @@ def balls_of(radius: Array, ids: Array, is_edge: bool) -> Float[Array, " rows"]:
     return r[0] + jnp.maximum(jnp.maximum(r[1], r[2]), r[3])
 
 
-def _append(found: tuple, ids: Array, areas: Array, is_pair: Array) -> tuple:
-    """Append pairs; those beyond the table are counted, but not stored."""
-    all_ids, all_areas, count = found
-    capacity = all_areas.shape[0]
-    slot = jnp.where(is_pair, count + jnp.cumsum(is_pair, dtype=jnp.int32) - 1, capacity)
-    all_ids = all_ids.at[:, slot].set(ids, mode="drop")
-    all_areas = all_areas.at[slot].set(areas, mode="drop")
-    return all_ids, all_areas, count + jnp.sum(is_pair, dtype=jnp.int32)
-
-
 def nearer_pairs(x: Vector3, radius: Float[Array, " vertices"], pairs: Pairs, rows: int) -> Found:
     """Return those of some pairs that may come within reach while every vertex stays within its ball around x.
 
@@ -320,14 +293,9 @@ def nearer_pairs(x: Vector3, radius: Float[Array, " vertices"], pairs: Pairs, ro
     for kind, is_edge in pairs.kinds:
 
         def add(found: tuple, part: Rows, is_edge: bool = is_edge) -> tuple:
-            table, count = found
             distance = closest(corners_of(x, part.ids), is_edge).distance
             is_pair = (part.areas > 0) & (distance < part.reach + balls_of(radius, part.ids, is_edge))
-            slot = jnp.where(is_pair, count + jnp.cumsum(is_pair, dtype=jnp.int32) - 1, rows)
-            table = tuple(
-                old.at[..., slot].set(new, mode="drop") for old, new in zip(table, part[:4], strict=True)
-            )
-            return table, count + jnp.sum(is_pair, dtype=jnp.int32)
+            return append(*found, part[:4], is_pair)
 
         nothing = jnp.zeros(rows, x[0].dtype)
         start = ((jnp.zeros((4, rows), jnp.int32), nothing, nothing, nothing), jnp.int32(0))

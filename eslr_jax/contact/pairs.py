@@ -7,7 +7,8 @@ its length is their exact distance, and its direction separates the two, since b
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -275,7 +276,10 @@ def shares(x: Vector3, step: Vector3, pairs: Pairs, caution: float) -> Float[Arr
             # Heights over the closest point of the second primitive. Those of the first are d or more.
             height = [dot3(normal, sub3(corner, p[0])) for corner in p]  # type: ignore[arg-type]
             zero = sum(near.weights[k] * height[k] for k in range(4) if side[k] < 0)
-            speeds = [sum_of_greatest([toward[k] for k in range(4) if side[k] == sign]) for sign in (1, -1)]
+            speeds = [
+                _greatest([jnp.zeros_like(near.distance), *(toward[k] for k in range(4) if side[k] == sign)])
+                for sign in (1, -1)
+            ]
             both = speeds[0] + speeds[1]
             part = jnp.where(both > 0, speeds[1] / jnp.where(both > 0, both, 1.0), 0.5)
             plane = near.distance * jnp.clip(part, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
@@ -290,25 +294,8 @@ def shares(x: Vector3, step: Vector3, pairs: Pairs, caution: float) -> Float[Arr
     return least
 
 
-def sum_of_greatest(values: list[Array]) -> Array:
-    """Return the greatest of some arrays, or zero where all are negative."""
-    greatest = jnp.zeros_like(values[0])
-    for value in values:
-        greatest = jnp.maximum(greatest, value)
-    return greatest
-
-
-def least_gap(x: Vector3, pairs: Pairs) -> Float[Array, ""]:
-    """Return the least distance of any pair [m]; infinite without one."""
-    least = jnp.full((), jnp.inf, x[0].dtype)
-    for kind, is_edge in pairs.kinds:
-
-        def add(least: Array, rows: Rows, is_edge: bool = is_edge) -> Array:
-            distance = closest(corners_of(x, rows.ids), is_edge).distance
-            return jnp.minimum(least, jnp.min(jnp.where(rows.areas > 0, distance, jnp.inf)))
-
-        least = over_rows(kind, least, add)
-    return least
+def _greatest(values: Sequence[Array]) -> Array:
+    return functools.reduce(jnp.maximum, values)
 
 
 def mended(
@@ -361,10 +348,10 @@ def _pushes(
     first = [k for k in range(4) if side[k] > 0]
     second = [k for k in range(4) if side[k] < 0]
     least = jnp.minimum(along[first[0]], along[first[-1]])
-    most = sum_of_greatest([along[k] - along[second[0]] for k in second]) + along[second[0]]
+    most = _greatest([along[k] for k in second])
     wanted = 0.5 * jnp.minimum(near.distance, 10.0 * FLOOR)
     can_first = jnp.maximum(free[first[0]], free[first[-1]]) > 0
-    can_second = jnp.maximum(jnp.maximum(free[second[0]], free[second[1]]), free[second[-1]]) > 0
+    can_second = _greatest([free[k] for k in second]) > 0
     is_lacking = (rows.areas > 0) & (can_first | can_second) & (least - most < wanted)
     lack = jnp.where(is_lacking, wanted - (least - most), 0.0)
     middle = 0.5 * (least + most)

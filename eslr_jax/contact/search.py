@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from eslr_jax.numerics import (
     TrueEntries,
     Vector3,
     dot3,
+    entries_of_words,
     sub3,
     take3,
     true_entries,
@@ -24,9 +25,13 @@ from eslr_jax.types import BodySurface
 
 _INFINITY = 0x7F800000  # bits of the float32 infinity
 _COLUMNS = 32  # patches are padded to a multiple: XLA packs bits four times as fast without a rest
+_BLOCK_PAIRS = 2048  # of groups looked at together; what is read of them then stays in the cache
+_CANDIDATES = 1024  # that are tested exactly at a time
 _FIRST = 2  # patches that every block looks into; what they hold bounds the distance to the others
 _PAIRS = 4  # pairs of a block and a patch that are looked at together, times the number of blocks
 _SHARE_FACING = 4  # one block in so many is searched for its opposing faces at a time
+
+_Kept = TypeVar("_Kept")
 
 
 class PosedSurface(NamedTuple):
@@ -145,6 +150,61 @@ def opposing_faces(
     _, face = jax.lax.while_loop(lambda carry: carry[0] < num_found, locate, start)
     nothing = jnp.zeros(query.shape[0], jnp.int32)
     return nothing.at[blocks].set(face), nothing.astype(bool).at[blocks].set(is_found)
+
+
+class Candidates(NamedTuple):
+    """Members of two groups that are to be tested exactly, some at a time."""
+
+    groups: tuple[Int[Array, " rows"], Int[Array, " rows"]]
+    members: tuple[Int[Array, " rows"], Int[Array, " rows"]]  # their places in these groups
+    is_used: Bool[Array, " rows"]
+
+
+def test_candidates(
+    close: TrueEntries,
+    words_of: Callable[[Int[Array, " pairs"], Int[Array, " pairs"]], Int[Array, "pairs members"]],
+    test: Callable[[_Kept, Candidates], _Kept],
+    start: _Kept,
+) -> _Kept:
+    """Return what is left of a start after all candidates are tested.
+
+    Args:
+        close: Pairs of groups.
+        words_of: From groups and others to the candidates of their members: bit k of a word is for the other's
+            member k.
+        test: Takes candidates in.
+        start: Before any is tested.
+    """
+
+    def look(carry):
+        first, kept = carry
+        number = first + jnp.arange(_BLOCK_PAIRS, dtype=jnp.int32)
+        group, other = close.find(number)
+        candidates = entries_of_words(jnp.where((number < close.count)[:, None], words_of(group, other), 0))
+
+        def test_some(carry):
+            first, kept = carry
+            number = first + jnp.arange(_CANDIDATES, dtype=jnp.int32)
+            pair, column = candidates.find(number)
+            rows = Candidates(
+                (group[pair], other[pair]), (column // 32, column % 32), number < candidates.count
+            )
+            return first + _CANDIDATES, test(kept, rows)
+
+        return first + _BLOCK_PAIRS, jax.lax.while_loop(
+            lambda carry: carry[0] < candidates.count, test_some, (jnp.int32(0), kept)
+        )[1]
+
+    return jax.lax.while_loop(lambda carry: carry[0] < close.count, look, (jnp.int32(0), start))[1]
+
+
+def append(
+    tables: tuple[Array, ...], count: Int[Array, ""], rows: tuple[Array, ...], is_kept: Bool[Array, " rows"]
+) -> tuple[tuple[Array, ...], Int[Array, ""]]:
+    """Append rows, along the last axis; those beyond the tables are counted, but not stored."""
+    slot = jnp.where(is_kept, count + jnp.cumsum(is_kept, dtype=jnp.int32) - 1, tables[0].shape[-1])
+    tables = tuple(old.at[..., slot].set(new, mode="drop") for old, new in zip(tables, rows, strict=True))
+    return tables, count + jnp.sum(is_kept, dtype=jnp.int32)
 
 
 class _Boxes(NamedTuple):

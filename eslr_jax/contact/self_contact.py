@@ -10,14 +10,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.crossing import sides_where_crossed
-from eslr_jax.contact.search import box_gaps
+from eslr_jax.contact.search import Candidates, append, box_gaps, test_candidates
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.errors import Status
 from eslr_jax.numerics import (
     Vector3,
     cross3,
     dot3,
-    entries_of_words,
     safe_norm,
     safe_normalize,
     sub3,
@@ -36,10 +35,6 @@ _MIN_COSINE = 0.8  # between a pair's direction and the face normal; beside a he
 _MAX_SLOPE = 0.75  # the same as sideways distance over height: sin / cos
 _REST_RADIUS = 0.02  # [m]; within it, topological neighbours are no pairs
 _SLACK = 1e-5  # [m] by which the cheap test is wider than the exact one: rounding
-_BLOCK_PAIRS = (
-    2048  # pairs of blocks that are looked at together; what is read of them then stays in the cache
-)
-_CANDIDATES = 1024  # pairs of a point and a face that are tested exactly at a time
 PAIRS_PER_VERTEX = 8  # rows per vertex, enough for all cloth in the hard cases, which needs at most 6.9
 _FEWEST_PAIRS = 64  # least number of rows of the first buffer
 _BEGINNING = 8  # vertices per row of the first buffer; a walking T-shirt has a pair per 20 to 130 vertices
@@ -225,43 +220,19 @@ def _search(
     garment = cloth.garment
     table = _face_table(cloth)
     boxes = true_entries(_are_close(points, cloth, radius))
-    size, rows = _BLOCK_PAIRS, _CANDIDATES
 
-    def look(carry):
-        first, found = carry
-        number = first + jnp.arange(size, dtype=jnp.int32)
-        block, faces = boxes.find(number)
-        words = _candidates(points.blocks[block], faces, points, table, (radius, cloth.has_points))
-        words = jnp.where((number < boxes.count)[:, None], words, 0)
-        candidates = entries_of_words(words)
+    def words_of(block: Array, faces: Array) -> Array:
+        return _candidates(points.blocks[block], faces, points, table, (radius, cloth.has_points))
 
-        def test(carry):
-            first, found = carry
-            number = first + jnp.arange(rows, dtype=jnp.int32)
-            pair, column = candidates.find(number)
-            point = points.blocks[block[pair], column // 32]
-            face = garment.face_blocks[faces[pair], column % 32]
-            side = _exactly(point, face, points, cloth, radius).side
-            is_pair = (side != 0) & (number < candidates.count)
-            return first + rows, _append(found, (point, face), is_pair, capacity)
-
-        _, found = jax.lax.while_loop(lambda carry: carry[0] < candidates.count, test, (jnp.int32(0), found))
-        return first + size, found
+    def test(found, rows: Candidates):
+        point = points.blocks[rows.groups[0], rows.members[0]]
+        face = garment.face_blocks[rows.groups[1], rows.members[1]]
+        side = _exactly(point, face, points, cloth, radius).side
+        return append(*found, (point, face), (side != 0) & rows.is_used)
 
     nobody = jnp.zeros(capacity, jnp.int32)
-    start = (jnp.int32(0), (nobody, nobody, jnp.int32(0)))
-    _, (point, face, count) = jax.lax.while_loop(lambda carry: carry[0] < boxes.count, look, start)
+    (point, face), count = test_candidates(boxes, words_of, test, ((nobody, nobody), jnp.int32(0)))
     return point, face, count
-
-
-def _append(
-    found: tuple[Array, Array, Array], rows: tuple[Array, Array], is_pair: Bool[Array, " rows"], capacity: int
-) -> tuple[Array, Array, Array]:
-    """Append points and faces of pairs; those beyond the capacity are counted, but not stored."""
-    *before, count = found
-    slot = jnp.where(is_pair, count + jnp.cumsum(is_pair, dtype=jnp.int32) - 1, capacity)
-    point, face = (old.at[slot].set(new, mode="drop") for old, new in zip(before, rows, strict=True))
-    return point, face, count + jnp.sum(is_pair, dtype=jnp.int32)
 
 
 def _are_close(points: _Points, cloth: _Cloth, radius: float) -> Bool[Array, "blocks face_blocks"]:

@@ -7,7 +7,6 @@ of `eslr train`. Files of weights name it, so that `eslr simulate --model` finds
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,6 +14,7 @@ import jax
 from flax import struct
 from jaxtyping import Array, Float
 
+from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError
 from eslr_jax.solver.guess import InitialGuess
 from eslr_jax.solver.potential import Point
@@ -155,12 +155,7 @@ def find_system(name: str) -> type[System] | None:
     """
     module = name.partition(":")[0]
     if name not in _systems and module != name:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise ConfigError(
-                f"model {name}: {error}; run the command where {module}.py is, or put its folder on PYTHONPATH"
-            ) from error
+        import_own(module, f"model {name}")
     return _systems.get(name)
 
 

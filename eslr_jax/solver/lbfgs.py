@@ -148,15 +148,17 @@ def minimize(
         x, course = domain.follow(state.x, course)
         state = state._replace(x=x)
         # The preconditioner is that of the place where the minimisation begins: the history was made with it.
-        matrix = jax.lax.cond(state.iterations <= 0, lambda: matrix_at(state, course), lambda: matrix)
+        is_new = state.iterations <= 0
+
+        def begin() -> tuple[Stiffness, Array]:
+            matrix = matrix_at(state, course)
+            return matrix, _flat_inverse(matrix)(state.gradient)
+
+        matrix, smoothed = jax.lax.cond(is_new, begin, lambda: (matrix, state.smoothed))
         steps = _Steps(
             lambda x: function(x, course), matrix, start, lambda x, step: domain.limit(x, step, course)
         )
-        is_new = state.iterations <= 0
-        state = state._replace(
-            smoothed=jnp.where(is_new, steps.inverse(state.gradient), state.smoothed),
-            is_kept=state.is_kept & ~is_new,
-        )
+        state = state._replace(smoothed=smoothed, is_kept=state.is_kept & ~is_new)
 
         def is_running(state: _State) -> Array:
             return _is_running(state, stop) & domain.is_open(course) & ~domain.is_spent(state.x, course)

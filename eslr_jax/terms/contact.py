@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from eslr_jax.contact import course as courses
 from eslr_jax.contact.course import Around, Course
-from eslr_jax.contact.lists import joint_meshes
+from eslr_jax.contact.lists import Meshes, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body, find_contacts
 from eslr_jax.contact.pairs import CHUNK, Rows, diagonal, energies, energy, loads
 from eslr_jax.errors import Status
@@ -51,18 +51,17 @@ class Contact(Term):
 
     name = "contact"
     reads_body = True
-    unless_needed = "no body in reach, and no layers that can meet"
     ranges = MappingProxyType({"stiffness": STIFFNESS_RANGE, "reach": THICKNESS_RANGE})
 
     stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
     reach: Float[Array, ""] | float = 3e-3  # [m] below which a pair acts
-    # Which layers of cloth keep apart: those of different pieces, also those of one piece, or none.
-    layers: Literal["pieces", "all", "none"] = struct.field(pytree_node=False, default="all")
+    # Which layers of cloth keep apart: those of different pieces, or also those of one piece.
+    layers: Literal["pieces", "all"] = struct.field(pytree_node=False, default="all")
     rows: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     pieces: Int[Array, " vertices"] | None = None
 
-    def plan(self, worn: Worn, others: Sequence[Term]) -> Contact | None:
-        """Return itself, or None where nothing can touch."""
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Contact:
+        """Return itself, with the pieces of the cloth where only different ones keep apart."""
         pieces = jnp.asarray(worn.pieces) if self.layers == "pieces" else None
         return self.replace(pieces=pieces)
 
@@ -75,21 +74,24 @@ class Contact(Term):
         now = body.positions[0]
         position = clear_of_body(position, now, body.surface, garment)
         inwards = -_GROWTH * vertex_normals(now, body.surface.faces, body.surface.face_incidence)
-        around = Around(
-            meshes=joint_meshes(garment, body.surface),
+        around = self._around(
+            position,
+            joint_meshes(garment, body.surface),
             body=(now + inwards).T,
             way=-inwards.T,
             carried=jnp.zeros_like(position.T),
-            goal=position.T,
             is_free=garment.vertex_mask & ~garment.is_pinned,
-            reach=jnp.asarray(self.reach, position.dtype),
-            pieces=self.pieces,
         )
         begin = position.T, courses.start_course(position, self._tables(position))
         grown, _ = jax.lax.while_loop(
             lambda carry: carry[1].share < 1.0, lambda carry: courses.follow(*carry, around), begin
         )
         return grown.T
+
+    def _around(self, position: Float[Array, "vertices 3"], meshes: Meshes, **parts: Array) -> Around:
+        """Return what a course depends on whose goal is where it begins."""
+        reach = jnp.asarray(self.reach, position.dtype)
+        return Around(meshes=meshes, goal=position.T, reach=reach, pieces=self.pieces, **parts)
 
     def _tables(self, position: Float[Array, "vertices 3"]) -> tuple[int, int]:
         """Return the sizes of its tables."""
@@ -113,16 +115,8 @@ class Contact(Term):
             is_free = is_free & ~garment.is_pinned
             pins = (problem.pin_targets - position).T
             carried = jnp.where(garment.is_pinned[None], pins, carried)
-        around = Around(
-            meshes=joint_meshes(garment, None if body is None else body.surface),
-            body=start,
-            way=way,
-            carried=carried,
-            goal=position.T,
-            is_free=is_free,
-            reach=jnp.asarray(self.reach, position.dtype),
-            pieces=self.pieces,
-        )
+        meshes = joint_meshes(garment, None if body is None else body.surface)
+        around = self._around(position, meshes, body=start, way=way, carried=carried, is_free=is_free)
         stiffness = self.stiffness * contact_excess(problem.material)
         return ContactData(around, nearest, stiffness, courses.start_course(position, self._tables(position)))
 

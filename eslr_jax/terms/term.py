@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.numerics import Vector3, gather_corners, segment_sum
 from eslr_jax.ranges import Range, check_number
@@ -188,12 +188,7 @@ def find_term(name: str) -> type[Term]:
         ConfigError: There is no such module, or it has no such term.
     """
     module, _, kind = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), kind, None) if module and kind else None
-    except ImportError as error:
-        raise ConfigError(
-            f"term {name}: {error}; run the command where {module}.py is, or put its folder on PYTHONPATH"
-        ) from error
+    found = getattr(import_own(module, f"term {name}"), kind, None) if module and kind else None
     if not (isinstance(found, type) and issubclass(found, Term)):
         raise ConfigError(
             f"term {name}: no class of this name derives from eslr_jax.terms.Term; write it as MODULE:CLASS"

@@ -21,7 +21,7 @@ from eslr_jax.pipeline.dressing.repair import (
     consistent_orientation,
     join_components,
     largest_component,
-    share_along_seams,
+    shares_along_seams,
     weld,
 )
 from eslr_jax.pipeline.dressing.report import wearer_entry
@@ -195,7 +195,8 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any],
     chosen, warnings = options.components, []
     if chosen == "auto":
         gaps = (min(_SEAM, options.join_gap), options.join_gap)
-        is_open, is_near = (share_along_seams(clean.positions, clean.faces, gap) > _ALONG for gap in gaps)
+        shares = shares_along_seams(clean.positions, clean.faces, gaps)
+        is_open, is_near = (share > _ALONG for share in shares)
         chosen = "join" if is_open else "keep"
         if is_near:
             pieces = vertex_components(clean.faces, len(clean.positions))[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse
@@ -67,11 +68,12 @@ def join_components(
     return merge_vertices(positions, faces, pairs[distances <= gap])
 
 
-def share_along_seams(
-    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gap: float
-) -> float:
-    """Return the share of all boundary vertices that have a boundary of another part within `gap`."""
-    return float(np.mean(_seam_pairs(positions, faces)[1] <= gap)) if len(_boundary_vertices(faces)) else 0.0
+def shares_along_seams(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], gaps: Sequence[float]
+) -> list[float]:
+    """Return the share of all boundary vertices that have a boundary of another part within each of some gaps."""
+    _, distances = _seam_pairs(positions, faces)
+    return [float(np.sum(distances <= gap)) / max(len(distances), 1) for gap in gaps]
 
 
 def _seam_pairs(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
