@@ -22,9 +22,9 @@ CAUTION = 0.9  # share of its room that a vertex may take in one step
 _PUSH = 4e-3  # [m] by which cloth that the body carries may be pushed in one part of its motion
 _SWEEPS = 40  # of pushes
 _LEAST_PART = 1.0 / 256.0  # of a frame's motion, below which the cloth is let through
-_WIDE = 6e-3  # [m] allowance of a search, besides half of the way to the goal
+_WIDE = (3e-3, 2e-2)  # [m] least and greatest allowance of a search, besides half of the way to the goal
 _FARTHEST = 0.02  # [m] of the way to the goal that a search allows for
-_FINE = (5e-4, 8e-3)  # [m] least and greatest allowance of the finer tables
+_FINE = (2e-3, 8e-3)  # [m] least and greatest allowance of the finer tables
 _MOVES = 4.0  # of the last step, that the next finer tables allow for
 _SPENT = 0.8  # share of its allowance after which pairs are looked for again
 _LEAST_SCALE = 1.0 / 64.0  # of the allowances of a search whose tables are too small
@@ -100,18 +100,20 @@ def follow(
 def _searched(x: Array, course: Course, around: Around) -> Course:
     """Return the course with wide tables around x and its way, if those at hand don't serve."""
     remaining = 1.0 - course.share
-    room = course.wide_radius - safe_norm(x - course.wide_center, axis=0)
-    is_due = (remaining > 0) | jnp.any((room < 2.0 * _FINE[0]) & around.is_free)
+    moved = safe_norm(x - course.wide_center, axis=0)
+    is_due = (remaining > 0) | jnp.any((moved > _SPENT * course.wide_radius) & around.is_free)
     rows = course.wide.faces.areas.shape[0]
 
     def look(tried: Course, scale: Array) -> Course:
         part = jnp.minimum(scale * tried.part, remaining)
         # The goal counts once the body has arrived.
-        ahead = jnp.where(part >= remaining, around.goal - x - remaining * around.carried, 0.0)
+        ahead = jnp.where((part > 0) & (part >= remaining), around.goal - x - remaining * around.carried, 0.0)
         length = safe_norm(ahead, axis=0)
         ahead = ahead * jnp.minimum(1.0, scale * _FARTHEST / jnp.where(length > 0, length, 1.0))[None]
         way = part * around.carried + 0.5 * ahead
-        radius = 0.5 * safe_norm(ahead, axis=0) + scale * _WIDE
+        # Who has moved far since the last search may do so again.
+        more = jnp.where(remaining > 0, _WIDE[0], jnp.clip(moved, *_WIDE))
+        radius = 0.5 * safe_norm(ahead, axis=0) + scale * more
         whole = jnp.concatenate([way, part * around.way], axis=1)
         half = 0.5 * whole
         relative = half - 0.5 * part * jnp.mean(around.way, axis=1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -61,7 +62,7 @@ def joint_meshes(garment: Garment, surface: BodySurface | None) -> Meshes:
         ]
     else:
         bodies = [None, None, None]
-    primitives = [_joined(cloth, body, count) for cloth, body in zip(parts, bodies, strict=True)]
+    primitives = [_joined(cloth, other, count) for cloth, other in zip(parts, bodies, strict=True)]
     rest = jnp.pad(garment.sewn_positions.T, ((0, 0), (0, size)))
     return Meshes(*primitives, rest=(rest[0], rest[1], rest[2]), num_cloth=count)
 
@@ -116,29 +117,26 @@ def find_pairs(
     return Found(Pairs(faces, edges), jnp.maximum(num_faces, num_edges))
 
 
-class _Balls(NamedTuple):
-    """Spheres around primitives."""
+class _Boxes(NamedTuple):
+    """Boxes along the axes around moving primitives, each with half of the reach."""
 
-    middle: Vector3
-    half: Vector3
-    size: Float[Array, " primitives"]  # [m]
+    middle: Vector3  # [m]
+    half: Vector3  # half of the way [m]
+    size: Vector3  # half of the sides [m]; of no size where padded
 
 
-def _balls(primitives: Primitives, motion: Motion, reach: Array) -> _Balls:
-    """Return balls around moving primitives, each with half of the reach; of no size where padded."""
+def _boxes(primitives: Primitives, motion: Motion, reach: Array) -> _Boxes:
+    """Return a box around every primitive that moves with the middle of its corners."""
     count = primitives.corners.shape[0]
-    places, ways = (corners_of(values, primitives.corners) for values in (motion.middle, motion.half))
-    middle, half = (
-        tuple(sum(corner[axis] for corner in values) / count for axis in range(3))
-        for values in (places, ways)
-    )
-    size = jnp.zeros_like(middle[0])
-    for k in range(count):
-        away = [sub3(places[k], middle), sub3(ways[k], half)]  # type: ignore[arg-type]
-        own = sum(jnp.sqrt(dot3(one, one)) for one in away) + motion.radius[primitives.corners[k]]
-        size = jnp.maximum(size, own)
-    size = jnp.where(primitives.areas > 0, size + 0.5 * reach, -jnp.inf)
-    return _Balls(middle, half, size)  # type: ignore[arg-type]
+    radius = functools.reduce(jnp.maximum, [motion.radius[corner] for corner in primitives.corners])
+    radius = jnp.where(primitives.areas > 0, radius + 0.5 * reach, -jnp.inf)
+    parts = []
+    for places, ways in zip(motion.middle, motion.half, strict=True):
+        own, moves = ([values[corner] for corner in primitives.corners] for values in (places, ways))
+        middle, half = sum(own) / count, sum(moves) / count
+        away = [jnp.abs(a - middle) + jnp.abs(b - half) for a, b in zip(own, moves, strict=True)]
+        parts.append((middle, half, functools.reduce(jnp.maximum, away) + radius))
+    return _Boxes(*zip(*parts, strict=True))  # type: ignore[arg-type]
 
 
 def _find_kind(
@@ -148,15 +146,16 @@ def _find_kind(
     motion: Motion,
     meshes: Meshes,
     reach: Array,
-    rows: int,
+    size: int,
     pieces: Array | None,
 ) -> tuple[Rows, Array]:
-    balls = [_balls(one, motion, reach) for one in (first, second)]
-    close = true_entries(_are_close(first, second, balls, is_edge))
-    table = _table(second, balls[1])
+    own, others = (_boxes(one, motion, reach) for one in (first, second))
+    close = true_entries(_are_close(first, second, own, others, is_edge))
+    rows = _table(first.blocks, own)
+    table = _table(second.blocks, others).transpose(2, 1, 0)  # [members, numbers, blocks]
 
     def words_of(group: Array, other: Array) -> Array:
-        return _candidates(first.blocks[group], other, balls[0], table)
+        return _candidates(rows[group], other, table)
 
     def test(found, candidates: Candidates):
         (group, other), (row, column) = candidates.groups, candidates.members
@@ -169,9 +168,9 @@ def _find_kind(
             areas = jnp.minimum(areas, second.areas[two])
         return append(*found, (ids, areas), is_pair)
 
-    nothing = (jnp.zeros((4, rows), jnp.int32), jnp.zeros(rows, reach.dtype))
+    nothing = (jnp.zeros((4, size), jnp.int32), jnp.zeros(size, reach.dtype))
     (ids, areas), count = test_candidates(close, words_of, test, (nothing, jnp.int32(0)))
-    return _completed(ids, areas, jnp.minimum(count, rows), is_edge, meshes, reach), count
+    return _completed(ids, areas, jnp.minimum(count, size), is_edge, meshes, reach), count
 
 
 def _completed(ids: Array, areas: Array, count: Array, is_edge: bool, meshes: Meshes, reach: Array) -> Rows:
@@ -189,60 +188,50 @@ def _completed(ids: Array, areas: Array, count: Array, is_edge: bool, meshes: Me
 
 
 def _are_close(
-    first: Primitives, second: Primitives, balls: list[_Balls], is_edge: bool
+    first: Primitives, second: Primitives, own: _Boxes, others: _Boxes, is_edge: bool
 ) -> Bool[Array, "blocks others"]:
     """Return which groups hold primitives whose boxes meet; the body is not looked for in itself."""
-    ranges = []
-    for one, ball in zip((first, second), balls, strict=True):
-        size = ball.size[one.blocks]
-        is_real = size > 0
-        axes = []
-        for axis in range(3):
-            middle, spread = ball.middle[axis][one.blocks], size + jnp.abs(ball.half[axis][one.blocks])
-            low = jnp.min(jnp.where(is_real, middle - spread, jnp.inf), axis=1)
-            high = jnp.max(jnp.where(is_real, middle + spread, -jnp.inf), axis=1)
-            axes.append((low, high))
-        ranges.append(axes)
-    is_close = jnp.ones((first.blocks.shape[0], second.blocks.shape[0]), bool)
-    for (low, high), (other_low, other_high) in zip(*ranges, strict=True):
+    # A couple of groups of edges is looked at once; the cloth's come first.
+    rows = first.blocks[: first.num_cloth] if is_edge else first.blocks
+    is_close = jnp.ones((rows.shape[0], second.blocks.shape[0]), bool)
+    for axis in range(3):
+        low, high = _range(rows, own, axis)
+        other_low, other_high = _range(second.blocks, others, axis)
         is_close = is_close & (low[:, None] <= other_high[None]) & (other_low[None] <= high[:, None])
-    own = jnp.arange(first.blocks.shape[0]) < first.num_cloth
-    others = jnp.arange(second.blocks.shape[0]) < second.num_cloth
-    is_close = is_close & (own[:, None] | others[None])
-    if is_edge:  # each couple of groups once; the cloth's come first
-        is_close = is_close & (
-            jnp.arange(first.blocks.shape[0])[:, None] <= jnp.arange(second.blocks.shape[0])[None]
-        )
-    return is_close
+    group, other = (jnp.arange(count) for count in is_close.shape)
+    if is_edge:
+        return is_close & (group[:, None] <= other[None])
+    return is_close & ((group < first.num_cloth)[:, None] | (other < second.num_cloth)[None])
 
 
-def _table(primitives: Primitives, balls: _Balls) -> Float[Array, "members numbers blocks"]:
-    """Return middle, half way and size of the members of every group; copies have no size."""
-    blocks = primitives.blocks
+def _range(blocks: Int[Array, "blocks members"], boxes: _Boxes, axis: int) -> tuple[Array, Array]:
+    """Return from where to where the boxes of every group reach, all the way [m]."""
+    middle, spread = boxes.middle[axis][blocks], (boxes.size[axis] + jnp.abs(boxes.half[axis]))[blocks]
+    return jnp.min(middle - spread, axis=1), jnp.max(middle + spread, axis=1)
+
+
+def _table(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "blocks numbers members"]:
+    """Return the boxes of the members of groups; copies have no size."""
     is_copy = jnp.pad(blocks[:, 1:] == blocks[:, :-1], ((0, 0), (1, 0)))
-    size = jnp.where(is_copy, -jnp.inf, balls.size[blocks])
-    values = [part[blocks] for part in (*balls.middle, *balls.half)]
-    return jnp.stack([*values, size]).transpose(2, 0, 1)
+    sizes = [jnp.where(is_copy, -jnp.inf, part[blocks]) for part in boxes.size]
+    return jnp.stack([*(part[blocks] for part in (*boxes.middle, *boxes.half)), *sizes], axis=1)
 
 
 def _candidates(
-    ids: Int[Array, "pairs rows"], others: Int[Array, " pairs"], balls: _Balls, table: Array
+    rows: Float[Array, "pairs numbers rows"], others: Int[Array, " pairs"], table: Array
 ) -> Int[Array, "pairs rows"]:
-    """Return for every primitive which members of a group its ball meets, as bits."""
-    middle, half = (tuple(part[ids] for part in parts) for parts in balls[:2])
-    is_copy = jnp.pad(ids[:, 1:] == ids[:, :-1], ((0, 0), (1, 0)))
-    size = jnp.where(is_copy, -jnp.inf, balls.size[ids])
+    """Return for every primitive of a group which members of another its box meets on the way, as bits."""
 
     def add_member(k: Array, words: Array) -> Array:
         member = table[k][:, others][:, :, None]
-        offset = sub3(middle, tuple(member[:3]))  # type: ignore[arg-type]
-        way = sub3(half, tuple(member[3:6]))  # type: ignore[arg-type]
-        room = size + member[6] + jnp.sqrt(dot3(way, way))
-        is_kept = (room > 0) & (dot3(offset, offset) < room * room)
-        return words | jnp.where(is_kept, jnp.left_shift(jnp.int32(1), k), 0)
+        is_met = jnp.ones(words.shape, bool)
+        for axis in range(3):
+            gap = jnp.abs(rows[:, axis] - member[axis]) - jnp.abs(rows[:, 3 + axis] - member[3 + axis])
+            is_met = is_met & (gap < rows[:, 6 + axis] + member[6 + axis])
+        return words | jnp.where(is_met, jnp.left_shift(jnp.int32(1), k), 0)
 
     # In a loop: XLA would gather the members anew for every row in a longer function.
-    return jax.lax.fori_loop(0, table.shape[0], add_member, jnp.zeros(ids.shape, jnp.int32))
+    return jax.lax.fori_loop(0, table.shape[0], add_member, jnp.zeros((rows.shape[0], rows.shape[2]), jnp.int32))
 
 
 def _may_touch(
@@ -254,19 +243,25 @@ def _may_touch(
     pieces: Array | None,
 ) -> Bool[Array, " rows"]:
     """Return which pairs may come within reach; those that share a vertex don't count."""
-    half, side = corners_of(motion.half, ids), signs(is_edge)
-    first, second = ([k for k in range(4) if side[k] == sign] for sign in (1, -1))
-    relative, shares_one = jnp.zeros_like(half[0][0]), jnp.zeros(ids.shape[1], bool)
-    for a in first:
-        for b in second:
-            way = sub3(half[a], half[b])
-            relative = jnp.maximum(relative, dot3(way, way))
-            shares_one = shares_one | (ids[a] == ids[b])
-    distance = closest(corners_of(motion.middle, ids), is_edge).distance
-    room = reach + jnp.sqrt(relative) + balls_of(motion.radius, ids, is_edge)
-    is_kept = ~shares_one & (distance < room)
+    p, half, side = corners_of(motion.middle, ids), corners_of(motion.half, ids), signs(is_edge)
+    near = closest(p, is_edge)
+    normal = tuple(part / near.distance for part in near.offset)
+    # A direction that parts two primitives at both ends of straight ways parts them all the way.
+    ends = []
+    for sign in (1.0, -1.0):
+        along = [
+            s * (dot3(normal, sub3(corner, p[0])) + sign * dot3(normal, way))  # type: ignore[arg-type]
+            for s, corner, way in zip(side, p, half, strict=True)
+        ]
+        lows = [functools.reduce(jnp.minimum, [a for a, t in zip(along, side, strict=True) if t == s]) for s in (1, -1)]
+        ends.append(lows[0] + lows[1])
+    shares_one = functools.reduce(
+        jnp.logical_or, [ids[a] == ids[b] for a in range(4) for b in range(a) if side[a] != side[b]]
+    )
+    room = reach + balls_of(motion.radius, ids, is_edge)
+    is_kept = ~shares_one & (jnp.minimum(*ends) < room)
     if pieces is not None:
-        one, other = (pieces[jnp.minimum(ids[k], num_cloth - 1)] for k in (first[0], second[0]))
+        one, other = (pieces[jnp.minimum(ids[k], num_cloth - 1)] for k in (0, 3))
         is_body = jnp.any(ids >= num_cloth, axis=0)
         is_kept = is_kept & (is_body | (one != other))
     return is_kept
