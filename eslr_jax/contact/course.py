@@ -22,10 +22,10 @@ CAUTION = 0.9  # share of its room that a vertex may take in one step
 _PUSH = 4e-3  # [m] by which cloth that the body carries may be pushed in one part of its motion
 _SWEEPS = 40  # of pushes
 _LEAST_PART = 1.0 / 256.0  # of a frame's motion, below which the cloth is let through
-_WIDE = (3e-3, 2e-2)  # [m] least and greatest allowance of a search, besides half of the way to the goal
+_WIDE = (6e-3, 2e-2)  # [m] least and greatest allowance of a search, besides half of the way to the goal
 _FARTHEST = 0.02  # [m] of the way to the goal that a search allows for
-_FINE = (2e-3, 8e-3)  # [m] least and greatest allowance of the finer tables
-_MOVES = 4.0  # of the last step, that the next finer tables allow for
+_FINE = (1e-3, 8e-3)  # [m] least and greatest allowance of the finer tables
+_MOVES = 2.0  # of the last step, that the next finer tables allow for
 _SPENT = 0.8  # share of its allowance after which pairs are looked for again
 _LEAST_SCALE = 1.0 / 64.0  # of the allowances of a search whose tables are too small
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import get_args
 
@@ -53,7 +54,7 @@ def plan_scene(
             planned.append(needed)
     if any(term.reads_body for term in planned) and worn.surface is not None:
         poses = poses.replace(surface=worn.surface)
-    return tuple(planned), poses
+    return tuple(planned), _cleared(poses, planned)
 
 
 def prepare_scene(
@@ -154,7 +155,7 @@ def prepare_scenes(
     return [
         _build(
             one.garment,
-            one.poses if surface is None else one.poses.replace(surface=surface),
+            _cleared(one.poses if surface is None else one.poses.replace(surface=surface), plan),
             material,
             tuple(plan),
             **stepping,
@@ -162,6 +163,11 @@ def prepare_scenes(
         )
         for one, plan, material in zip(worn, plans, fabrics, strict=True)
     ]
+
+
+def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:
+    """Return the motion of the body as all terms can take it."""
+    return functools.reduce(lambda poses, term: term.clear_body(poses), terms, poses)
 
 
 def _check_stepping(integrator: str, substeps: int) -> None:

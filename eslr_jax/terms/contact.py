@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -15,6 +16,7 @@ from eslr_jax.contact import course as courses
 from eslr_jax.contact.course import Around, Course
 from eslr_jax.contact.lists import Meshes, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body, find_contacts
+from eslr_jax.contact.parting import parted
 from eslr_jax.contact.pairs import CHUNK, Rows, diagonal, energies, energy, loads
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, vertex_normals
@@ -22,13 +24,13 @@ from eslr_jax.terms.problem import CONTACT_STIFFNESS, STIFFNESS_RANGE, THICKNESS
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Domain, Elements, Term, sum_elements
 from eslr_jax.terms.worn import Worn
-from eslr_jax.types import Contacts, Garment, Obstacle
+from eslr_jax.types import BodyMotion, Contacts, Garment, Obstacle
 
 _FADES = 0.02  # [m] from the body, beyond which it takes cloth along less and less
 _FADING = 0.05  # [m] over which it does, or half as much more than the body moves in a frame
 _SMOOTHINGS = 4  # of the motion by which the body takes cloth along
 _GROWTH = 8e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
-_WIDE_ROWS, _FINE_ROWS = 24, 4  # per vertex of the cloth, of the tables that a scene begins with
+_WIDE_ROWS, _FINE_ROWS = 40, 4  # per vertex of the cloth, of the tables that a scene begins with
 
 
 class ContactData(NamedTuple):
@@ -64,6 +66,15 @@ class Contact(Term):
         """Return itself, with the pieces of the cloth where only different ones keep apart."""
         pieces = jnp.asarray(worn.pieces) if self.layers == "pieces" else None
         return self.replace(pieces=pieces)
+
+    def clear_body(self, poses: BodyMotion) -> BodyMotion:
+        """Return the motion of a body whose parts don't pass through each other, see `contact.parting`."""
+        if (surface := poses.surface) is None:
+            return poses
+        ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
+        positions = np.array(poses.positions)
+        positions[:, ids] = parted(positions[:, ids], np.asarray(poses.rest_positions)[ids], faces)
+        return poses.replace(positions=positions)
 
     def start(
         self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None

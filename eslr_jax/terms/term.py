@@ -18,7 +18,7 @@ from eslr_jax.ranges import Range, check_number
 if TYPE_CHECKING:
     from eslr_jax.terms.problem import FrameProblem
     from eslr_jax.terms.worn import Worn
-    from eslr_jax.types import Contacts, Garment, Obstacle
+    from eslr_jax.types import BodyMotion, Contacts, Garment, Obstacle
 
 
 class Elements(NamedTuple):
@@ -72,6 +72,10 @@ class Term:
             others: Terms that stand before it, planned.
         """
         return self
+
+    def clear_body(self, poses: BodyMotion) -> BodyMotion:
+        """Return the motion of the body as the term can take it (host)."""
+        return poses
 
     def alike(self, worn: Worn, planned: Sequence[Any]) -> Term:
         """Return the term for one scene of a batch, in the shape that all of them share (host).
