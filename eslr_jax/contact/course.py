@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.lists import Found, Meshes, Motion, find_pairs, nearer_pairs
-from eslr_jax.contact.pairs import Pairs, mended, no_pairs, shares
+from eslr_jax.contact.pairs import Pairs, least_gaps, mended, no_pairs, shares
 from eslr_jax.numerics import Vector3, safe_norm
 
 CAUTION = 0.9  # share of its room that a vertex may take in one step
@@ -39,6 +39,7 @@ class Course:
     pairs: Pairs  # over which energies are summed
     center: Float[Array, "3 vertices"]  # of the allowances [m]
     radius: Float[Array, " vertices"]  # allowances [m]
+    gaps: Float[Array, " vertices"]  # between the vertices of `pairs` at the centre, the least of each [m]
     wide: Pairs
     wide_center: Float[Array, "3 vertices"]
     wide_radius: Float[Array, " vertices"]
@@ -61,7 +62,9 @@ def start_course(position: Float[Array, "vertices 3"], rows: tuple[int, int]) ->
     nothing = jnp.zeros(position.shape[0], dtype)
     wide, fine = (Pairs(no_pairs(size, dtype), no_pairs(size, dtype)) for size in rows)
     no, one = jnp.zeros((), bool), jnp.ones((), dtype)
-    return Course(0 * one, one, fine, nowhere, nothing, wide, nowhere, nothing, zero, zero, zero, no, no)
+    return Course(
+        0 * one, one, fine, nowhere, nothing, nothing, wide, nowhere, nothing, zero, zero, zero, no, no
+    )
 
 
 @struct.dataclass
@@ -196,6 +199,7 @@ def _listed(x: Array, course: Course, around: Around) -> Course:
         pairs=found.pairs,
         center=x,
         radius=radius,
+        gaps=least_gaps(z, found.pairs)[: x.shape[1]],
         lists=course.lists + 1,
         is_full=course.is_full | (found.most > rows),
     )
@@ -205,10 +209,18 @@ def limited(
     x: Float[Array, "3 vertices"], step: Float[Array, "3 vertices"], course: Course, around: Around
 ) -> Float[Array, "3 vertices"]:
     """Return a step [m] that crosses nothing and leaves no allowance, cut vertex by vertex."""
+    away = x - course.center
+    # Who stays within half of his gap meets nobody who does.
+    is_clear = jnp.all(
+        safe_norm(away + step, axis=0) < jnp.minimum(0.5 * CAUTION * course.gaps, course.radius)
+    )
+    return jax.lax.cond(is_clear, lambda: step, lambda: _cut(x, step, away, course, around))
+
+
+def _cut(x: Array, step: Array, away: Array, course: Course, around: Around) -> Array:
     z = around.joined(x, 1.0)
     moves = _rows(jnp.concatenate([step, jnp.zeros_like(around.way)], axis=1))
     share = shares(z, moves, course.pairs, CAUTION)[: x.shape[1]]
-    away = x - course.center
     # The ball around the centre: |away + t step| = radius.
     b, c = jnp.sum(away * step, axis=0), jnp.sum(step * step, axis=0)
     rest = jnp.sum(away * away, axis=0) - jnp.square(course.radius)

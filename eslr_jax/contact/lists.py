@@ -231,7 +231,9 @@ def _candidates(
         return words | jnp.where(is_met, jnp.left_shift(jnp.int32(1), k), 0)
 
     # In a loop: XLA would gather the members anew for every row in a longer function.
-    return jax.lax.fori_loop(0, table.shape[0], add_member, jnp.zeros((rows.shape[0], rows.shape[2]), jnp.int32))
+    return jax.lax.fori_loop(
+        0, table.shape[0], add_member, jnp.zeros((rows.shape[0], rows.shape[2]), jnp.int32)
+    )
 
 
 def _may_touch(
@@ -253,7 +255,10 @@ def _may_touch(
             s * (dot3(normal, sub3(corner, p[0])) + sign * dot3(normal, way))  # type: ignore[arg-type]
             for s, corner, way in zip(side, p, half, strict=True)
         ]
-        lows = [functools.reduce(jnp.minimum, [a for a, t in zip(along, side, strict=True) if t == s]) for s in (1, -1)]
+        lows = [
+            functools.reduce(jnp.minimum, [a for a, t in zip(along, side, strict=True) if t == s])
+            for s in (1, -1)
+        ]
         ends.append(lows[0] + lows[1])
     shares_one = functools.reduce(
         jnp.logical_or, [ids[a] == ids[b] for a in range(4) for b in range(a) if side[a] != side[b]]

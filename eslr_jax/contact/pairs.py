@@ -294,6 +294,20 @@ def shares(x: Vector3, step: Vector3, pairs: Pairs, caution: float) -> Float[Arr
     return least
 
 
+def least_gaps(x: Vector3, pairs: Pairs) -> Float[Array, " vertices"]:
+    """Return the distance of the nearest pair that every vertex belongs to [m]; infinite without any."""
+    least = jnp.full_like(x[0], jnp.inf)
+    for kind, is_edge in pairs.kinds:
+
+        def take(least: Array, rows: Rows, is_edge: bool = is_edge) -> Array:
+            distance = closest(corners_of(x, rows.ids), is_edge).distance
+            distance = jnp.where(rows.areas > 0, distance, jnp.inf)
+            return least.at[rows.ids.ravel()].min(jnp.tile(distance, 4))
+
+        least = over_rows(kind, least, take)
+    return least
+
+
 def _greatest(values: Sequence[Array]) -> Array:
     return functools.reduce(jnp.maximum, values)
 

@@ -23,7 +23,10 @@ from eslr_jax.numerics import pierces
 _GAP = 8e-3  # [m] between two parts: cloth on both sides, each within its reach of contact
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
 _AROUND = 0.04  # [m] in which faces are looked for
-_CREASE = 0.04, 0.2  # [m] apart at rest, below which places belong to one crease; and gap over what is beyond 30 mm
+_CREASE = (
+    0.04,
+    0.2,
+)  # [m] apart at rest, below which places belong to one crease; and gap over what is beyond 30 mm
 _CREASE_START = 0.03  # [m]
 _TURNED = -0.2  # cosine between normals, below which two places face each other
 _FOLDED = 0.7  # cosine between normals, below which faces may cross
@@ -54,6 +57,42 @@ def parted(
     return out.astype(positions.dtype)
 
 
+def uncrossed(
+    points: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Return the vertices of a mesh [m], moved towards their neighbours' where faces cross.
+
+    So a crease that skinning folds through itself opens. What `_SWEEPS` moves don't free stays crossed.
+    """
+    mesh, moved = _Mesh(np.asarray(faces), len(points)), np.asarray(points, float)
+    for _ in range(_SWEEPS):
+        crossing = _crossing(moved, mesh.faces)
+        if not crossing.any():
+            break
+        moved = moved + mesh.smoothing(moved, mesh.faces[crossing])
+    return moved.astype(points.dtype)
+
+
+class _Mesh:
+    """Faces, and which vertices are neighbours."""
+
+    def __init__(self, faces: Int[np.ndarray, "faces 3"], num_vertices: int):
+        self.faces = faces
+        sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        shape = (num_vertices, num_vertices)
+        one_way = scipy.sparse.coo_matrix((np.ones(len(sides)), sides.T), shape).tocsr()
+        self.neighbors = ((one_way + one_way.T) > 0).astype(float)
+        self.degrees = np.maximum(np.asarray(self.neighbors.sum(axis=1)).ravel(), 1.0)
+
+    def smoothing(self, points: np.ndarray, crossing: Int[np.ndarray, "crossing 3"]) -> np.ndarray:
+        """Return moves of vertices of crossing faces towards their neighbours', and half as much around [m]."""
+        crossed = np.zeros(len(points))
+        crossed[crossing.ravel()] = 1.0
+        crossed = np.maximum(crossed, 0.5 * (self.neighbors @ crossed > 0))
+        mean = (self.neighbors @ points) / self.degrees[:, None]
+        return _SMOOTHING * crossed[:, None] * (mean - points)
+
+
 class _Opposed(NamedTuple):
     """Vertices before faces that they turn to."""
 
@@ -64,17 +103,13 @@ class _Opposed(NamedTuple):
     gaps: Float[np.ndarray, " rows"]  # to keep [m]
 
 
-class _Body:
+class _Body(_Mesh):
     """What does not move with the body."""
 
     def __init__(self, rest: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]):
-        self.rest, self.faces = rest, faces
+        super().__init__(faces, len(rest))
+        self.rest = rest
         self.middles, self.normals, _ = _middles_and_normals(rest, faces)
-        count = len(rest)
-        sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        one_way = scipy.sparse.coo_matrix((np.ones(len(sides)), sides.T), (count, count)).tocsr()
-        self.neighbors = ((one_way + one_way.T) > 0).astype(float)
-        self.degrees = np.maximum(np.asarray(self.neighbors.sum(axis=1)).ravel(), 1.0)
 
     def yielding(
         self, posed: Float[np.ndarray, "vertices 3"], yielded: Float[np.ndarray, "vertices 3"]
@@ -89,15 +124,12 @@ class _Body:
             crossing = _crossing(posed + yielded, self.faces[folded])
             if not crossing.any():
                 break
-            crossed = np.zeros(len(posed))
-            crossed[self.faces[folded][crossing].ravel()] = 1.0
-            crossed = np.maximum(crossed, 0.5 * (self.neighbors @ crossed > 0))
-            now = posed + yielded
-            mean = (self.neighbors @ now) / self.degrees[:, None]
-            yielded = yielded + _SMOOTHING * crossed[:, None] * (mean - now)
+            yielded = yielded + self.smoothing(posed + yielded, self.faces[folded][crossing])
         return yielded
 
-    def _looked_for(self, posed: Float[np.ndarray, "vertices 3"]) -> tuple[_Opposed, Bool[np.ndarray, " faces"]]:
+    def _looked_for(
+        self, posed: Float[np.ndarray, "vertices 3"]
+    ) -> tuple[_Opposed, Bool[np.ndarray, " faces"]]:
         """Return opposed places, and faces that may cross others."""
         middles, normals, sizes = _middles_and_normals(posed, self.faces)
         facing = np.zeros_like(posed)

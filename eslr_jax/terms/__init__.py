@@ -19,6 +19,9 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
 | repulsion | between layers of cloth, where they can meet  | none                                        |
 | ground    | collision and friction as with the body       | none                                        |
+| contact   | in the place of collision and repulsion:      | none                                        |
+|           | pairs of vertices and faces, and of edges,    |                                             |
+|           | with steps that nothing crosses               |                                             |
 | air       | drag and lift of faces, `terms.air`           | none                                        |
 | damping   | of the fabric's strain, `terms.damping`       | none                                        |
 | your own  | a subclass of `terms.term.Term`               | none                                        |
@@ -27,6 +30,7 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 from eslr_jax.terms.air import Air
 from eslr_jax.terms.bending import Bending
 from eslr_jax.terms.collision import Collision
+from eslr_jax.terms.contact import Contact
 from eslr_jax.terms.damping import Damping
 from eslr_jax.terms.defaults import CLOTH, scene_terms
 from eslr_jax.terms.friction import Friction
@@ -38,6 +42,6 @@ from eslr_jax.terms.stretch import Stretch
 from eslr_jax.terms.term import Elements, Term
 
 __all__ = [
-    "CLOTH", "Air", "Bending", "Collision", "Damping", "Elements", "Friction", "Gravity", "Ground", "Inertia",
-    "Repulsion", "Stretch", "Term", "scene_terms",
+    "CLOTH", "Air", "Bending", "Collision", "Contact", "Damping", "Elements", "Friction", "Gravity", "Ground",
+    "Inertia", "Repulsion", "Stretch", "Term", "scene_terms",
 ]  # fmt: skip

@@ -16,8 +16,8 @@ from eslr_jax.contact import course as courses
 from eslr_jax.contact.course import Around, Course
 from eslr_jax.contact.lists import Meshes, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body, find_contacts
-from eslr_jax.contact.parting import parted
 from eslr_jax.contact.pairs import CHUNK, Rows, diagonal, energies, energy, loads
+from eslr_jax.contact.parting import parted, uncrossed
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, vertex_normals
 from eslr_jax.terms.problem import CONTACT_STIFFNESS, STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem
@@ -46,9 +46,9 @@ class ContactData(NamedTuple):
 class Contact(Term):
     """Vertices keep off faces, and edges off edges, of the cloth and of the body.
 
-    Steps are cut so that no pair passes through another. It takes the place of `Collision` and `Repulsion`, but
-    it is no scene's default yet: a frame takes ten times as long, cloth has to start free of crossings, and where
-    parts of the body pass through each other it lets cloth through, and says so.
+    Steps are cut so that no pair passes through another. It takes the place of `Collision` and `Repulsion`, at
+    several times their cost. The body yields where its own parts pass through each other (`contact.parting`).
+    Where that does not make room, cloth is let through, and the status says so.
     """
 
     name = "contact"
@@ -61,11 +61,15 @@ class Contact(Term):
     layers: Literal["pieces", "all"] = struct.field(pytree_node=False, default="all")
     rows: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     pieces: Int[Array, " vertices"] | None = None
+    # [m] by which cloth that the first pose folds through itself is moved, see `contact.parting.uncrossed`
+    unfolding: Float[Array, "vertices 3"] | float = 0.0
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Contact:
         """Return itself, with the pieces of the cloth where only different ones keep apart."""
         pieces = jnp.asarray(worn.pieces) if self.layers == "pieces" else None
-        return self.replace(pieces=pieces)
+        skinned, garment = worn.skinned[0], worn.garment
+        faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
+        return self.replace(pieces=pieces, unfolding=jnp.asarray(uncrossed(skinned, faces) - skinned))
 
     def clear_body(self, poses: BodyMotion) -> BodyMotion:
         """Return the motion of a body whose parts don't pass through each other, see `contact.parting`."""
@@ -79,7 +83,8 @@ class Contact(Term):
     def start(
         self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None
     ) -> Float[Array, "vertices 3"]:
-        """Return positions [m] that the body, grown from under its skin, has pushed off."""
+        """Return unfolded positions [m], which the body, grown from under its skin, has pushed off."""
+        position = position + self.unfolding
         if body is None:
             return position
         now = body.positions[0]

@@ -22,11 +22,16 @@ def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[T
     A scene leaves out those of them that it does not need, see `simulation.plan.plan_scene`.
 
     Args:
-        changed: Terms in the place of the default ones of their types; others are added behind them.
+        changed: Terms in the place of the default ones of their types; others are added behind them, or before
+            friction where cloth rubs on them.
         without: Types of default terms to leave out.
     """
     usual = (*CLOTH, Collision(), Ground(), Friction(), Repulsion())
     given = {type(term): term for term in changed}
-    kinds = {type(term) for term in usual}
-    kept = (given.get(type(term), term) for term in usual if not isinstance(term, without))
-    return (*kept, *(term for term in changed if type(term) not in kinds))
+    kept = [given.pop(type(term), term) for term in usual]
+    rubbed = [term for kind, term in given.items() if kind.touched is not Term.touched]
+    others = [term for kind, term in given.items() if kind.touched is Term.touched]
+    terms: list[Term] = []
+    for term in kept:
+        terms += [*rubbed, term] if isinstance(term, Friction) else [term]
+    return tuple(term for term in (*terms, *others) if not isinstance(term, without))

@@ -1,0 +1,47 @@
+"""Bodies that pass through themselves make room for cloth; cloth that a pose folds through itself opens."""
+
+import numpy as np
+import pytest
+
+from eslr_jax.contact.parting import parted, uncrossed
+from eslr_jax.pipeline.report.referee import intersecting_pairs
+
+
+@pytest.fixture(scope="module")
+def walking(body, tshirt):
+    """What a T-shirt reaches of a walking body: arms touch the trunk, and a crease crosses itself."""
+    from eslr_jax.pipeline.assets import load_motion
+    from eslr_jax.pose.motion import pose_body
+    from eslr_jax.terms.worn import Worn
+
+    poses = pose_body(body, load_motion("cmu_016_32"))
+    surface = Worn(tshirt, poses).surface
+    ids = np.asarray(surface.vertex_ids)
+    positions = np.asarray(poses.positions)[[0, 48, 84]][:, ids]
+    return positions, np.asarray(body.rest_positions)[ids], np.asarray(surface.faces)
+
+
+def test_a_body_that_crosses_itself_yields_by_millimetres(walking):
+    positions, rest, faces = walking
+    made = parted(positions, rest, faces)
+    assert all(len(intersecting_pairs(frame, faces)) > 0 for frame in positions)
+    assert not any(len(intersecting_pairs(frame, faces)) for frame in made)
+    yielded = np.linalg.norm(made - positions, axis=2)
+    assert 1e-3 < yielded.max() < 9e-3
+    assert np.mean(yielded > 0) < 0.05  # the rest of the body stays where it is
+
+
+def test_a_body_that_crosses_nothing_stays(walking):
+    _, rest, faces = walking
+    np.testing.assert_array_equal(parted(rest[None], rest, faces)[0], rest)
+
+
+def test_a_crease_that_skinning_folds_through_itself_opens(tshirt, body, walk):
+    from eslr_jax.pose.lbs import skin_garment
+
+    skinned = np.asarray(skin_garment(tshirt, walk.joint_transforms[:1]))[0]
+    faces = np.asarray(tshirt.faces)
+    assert len(intersecting_pairs(skinned, faces)) > 0
+    opened = uncrossed(skinned, faces)
+    assert len(intersecting_pairs(opened, faces)) == 0
+    assert np.linalg.norm(opened - skinned, axis=1).max() < 0.02
