@@ -93,11 +93,18 @@ class Around:
 def follow(
     x: Float[Array, "3 vertices"], course: Course, around: Around
 ) -> tuple[Float[Array, "3 vertices"], Course]:
-    """Let the body move on, if it has not come to the frame's end, and look for the pairs around the cloth."""
+    """Let the body move on, if it has not come to the frame's end, and list the pairs around the cloth."""
+    x, course = move_on(x, course, around)
+    return x, _listed(x, course, around)
+
+
+def move_on(
+    x: Float[Array, "3 vertices"], course: Course, around: Around
+) -> tuple[Float[Array, "3 vertices"], Course]:
+    """Let the body move on, if it has not come to the frame's end, and search anew where that is due."""
     course = _searched(x, course, around)
     is_moving = course.part > 0
-    x, course = jax.lax.cond(is_moving, _carried, lambda x, course, around: (x, course), x, course, around)
-    return x, _listed(x, course, around)
+    return jax.lax.cond(is_moving, _carried, lambda x, course, around: (x, course), x, course, around)
 
 
 def _searched(x: Array, course: Course, around: Around) -> Course:

@@ -29,7 +29,7 @@ from eslr_jax.types import BodyMotion, Contacts, Garment, Obstacle
 _FADES = 0.02  # [m] from the body, beyond which it takes cloth along less and less
 _FADING = 0.05  # [m] over which it does, or half as much more than the body moves in a frame
 _SMOOTHINGS = 4  # of the motion by which the body takes cloth along
-_GROWTH = 8e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
+_GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
 _WIDE_ROWS, _FINE_ROWS = 40, 4  # per vertex of the cloth, of the tables that a scene begins with
 
 
@@ -71,6 +71,10 @@ class Contact(Term):
         faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
         return self.replace(pieces=pieces, unfolding=jnp.asarray(uncrossed(skinned, faces) - skinned))
 
+    def alike(self, worn: Worn, planned: Sequence[Contact]) -> Contact:
+        """Return itself, with the pieces and the folds of this scene's cloth."""
+        return self.plan(worn, ())
+
     def clear_body(self, poses: BodyMotion) -> BodyMotion:
         """Return the motion of a body whose parts don't pass through each other, see `contact.parting`."""
         if (surface := poses.surface) is None:
@@ -100,7 +104,7 @@ class Contact(Term):
         )
         begin = position.T, courses.start_course(position, self._tables(position))
         grown, _ = jax.lax.while_loop(
-            lambda carry: carry[1].share < 1.0, lambda carry: courses.follow(*carry, around), begin
+            lambda carry: carry[1].share < 1.0, lambda carry: courses.move_on(*carry, around), begin
         )
         return grown.T
 
