@@ -8,10 +8,15 @@ from draped_ball import drifting_ball, square
 from eslr_jax import SimConfig, prepare_scene
 from eslr_jax.pipeline.report.referee import intersecting_pairs
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import CLOTH, Friction
-from eslr_jax.terms.contact import Contact
+from eslr_jax.terms import CLOTH, Contact, Friction
 
 TERMS = (*CLOTH, Contact(), Friction())
+
+
+def assert_nothing_crosses(trajectory, scene):
+    faces, surface = np.asarray(scene.garment.faces), np.asarray(scene.body.surface.faces)
+    for cloth, body in zip(np.asarray(trajectory.positions), np.asarray(scene.body.positions), strict=True):
+        assert len(intersecting_pairs(cloth, faces, body, surface)) == 0
 
 
 @pytest.mark.parametrize(
@@ -27,10 +32,17 @@ def test_a_ball_passes_through_no_sheet(speed, integrator):
     trajectory = rollout_scene(None, scene, SimConfig())
     assert int(trajectory.status) == 0
     assert float(trajectory.energies["contact"].max()) > 1e-6
-    faces = np.asarray(scene.garment.faces)
-    bodies = np.asarray(scene.body.positions)
-    for cloth, body in zip(np.asarray(trajectory.positions), bodies, strict=True):
-        assert len(intersecting_pairs(cloth, faces, body, np.asarray(scene.body.surface.faces))) == 0
+    assert_nothing_crosses(trajectory, scene)
+
+
+@pytest.mark.slow
+def test_a_shirt_that_starts_folded_through_itself_walks_and_crosses_nothing(tshirt, walk):
+    pytest.importorskip("ipctk")
+    scene = prepare_scene(tshirt, walk, terms=TERMS, integrator="bdf2")
+    trajectory = rollout_scene(None, scene, SimConfig())
+    assert int(trajectory.status) == 0
+    assert float(trajectory.gap_bounds.max()) <= 0.01
+    assert_nothing_crosses(trajectory, scene)
 
 
 @pytest.mark.slow
