@@ -28,10 +28,10 @@ def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[T
     """
     usual = (*CLOTH, Collision(), Ground(), Friction(), Repulsion())
     given = {type(term): term for term in changed}
-    kept = [given.pop(type(term), term) for term in usual]
-    rubbed = [term for kind, term in given.items() if kind.touched is not Term.touched]
-    others = [term for kind, term in given.items() if kind.touched is Term.touched]
-    terms: list[Term] = []
-    for term in kept:
-        terms += [*rubbed, term] if isinstance(term, Friction) else [term]
-    return tuple(term for term in (*terms, *others) if not isinstance(term, without))
+    kinds = {type(term) for term in usual}
+    kept = tuple(given.get(type(term), term) for term in usual if not isinstance(term, without))
+    others = [term for term in changed if type(term) not in kinds]
+    rubbed = [term for term in others if type(term).touched is not Term.touched]
+    behind = (term for term in others if type(term).touched is Term.touched)
+    first = next((i for i, term in enumerate(kept) if isinstance(term, Friction)), len(kept))
+    return (*kept[:first], *rubbed, *kept[first:], *behind)

@@ -8,7 +8,7 @@ from draped_ball import drifting_ball, square
 from eslr_jax import SimConfig, prepare_scene
 from eslr_jax.pipeline.report.referee import intersecting_pairs
 from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import CLOTH, Contact, Friction
+from eslr_jax.terms import CLOTH, Collision, Contact, Damping, Friction, Repulsion, scene_terms
 
 TERMS = (*CLOTH, Contact(), Friction())
 
@@ -66,3 +66,9 @@ def test_a_pinned_sheet_folds_onto_itself_without_crossing():
     assert int(trajectory.status) == 0
     for cloth in np.asarray(trajectory.positions):
         assert len(intersecting_pairs(cloth, np.asarray(garment.faces))) == 0
+
+
+def test_cloth_rubs_on_what_takes_the_place_of_collision_and_terms_of_one_kind_are_all_kept():
+    strict = scene_terms(Contact(), Damping(0.1), without=(Collision, Repulsion))
+    assert [term.name for term in strict[-3:]] == ["contact", "friction", "damping"]
+    assert scene_terms(Damping(0.1), Damping(0.2))[-2:] == (Damping(0.1), Damping(0.2))
