@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -17,13 +16,12 @@ from eslr_jax.contact.course import Around, Course
 from eslr_jax.contact.lists import Meshes, joint_meshes
 from eslr_jax.contact.nearest import clear_of_body, find_contacts
 from eslr_jax.contact.pairs import CHUNK, Rows, diagonal, energies, energy, loads
-from eslr_jax.contact.parting import parted, uncrossed
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, vertex_normals
 from eslr_jax.terms.problem import CONTACT_STIFFNESS, STIFFNESS_RANGE, THICKNESS_RANGE, FrameProblem
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.term import Domain, Elements, Term, sum_elements
-from eslr_jax.terms.worn import Worn
+from eslr_jax.terms.worn import Worn, parted_body
 from eslr_jax.types import BodyMotion, Contacts, Garment, Obstacle
 
 _FADES = 0.02  # [m] from the body, beyond which it takes cloth along less and less
@@ -47,7 +45,7 @@ class Contact(Term):
     """Vertices keep off faces, and edges off edges, of the cloth and of the body.
 
     Steps are cut so that no pair passes through another. It takes the place of `Collision` and `Repulsion`, at
-    several times their cost. The body yields where its own parts pass through each other (`contact.parting`).
+    several times their cost. The body yields where its own parts pass through each other (`mesh.parting`).
     Where that does not make room, cloth is let through, and the status says so.
     """
 
@@ -61,28 +59,21 @@ class Contact(Term):
     layers: Literal["pieces", "all"] = struct.field(pytree_node=False, default="all")
     rows: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     pieces: Int[Array, " vertices"] | None = None
-    # [m] by which cloth that the first pose folds through itself is moved, see `contact.parting.uncrossed`
+    # [m] by which cloth that the first pose folds through itself is moved, see `mesh.parting.uncrossed`
     unfolding: Float[Array, "vertices 3"] | float = 0.0
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Contact:
         """Return itself, with the pieces of the cloth where only different ones keep apart."""
         pieces = jnp.asarray(worn.pieces) if self.layers == "pieces" else None
-        skinned, garment = worn.skinned[0], worn.garment
-        faces = np.asarray(garment.faces)[np.asarray(garment.rest_areas) > 0]
-        return self.replace(pieces=pieces, unfolding=jnp.asarray(uncrossed(skinned, faces) - skinned))
+        return self.replace(pieces=pieces, unfolding=jnp.asarray(worn.unfolding))
 
     def alike(self, worn: Worn, planned: Sequence[Contact]) -> Contact:
         """Return itself, with the pieces and the folds of this scene's cloth."""
         return self.plan(worn, ())
 
     def clear_body(self, poses: BodyMotion) -> BodyMotion:
-        """Return the motion of a body whose parts don't pass through each other, see `contact.parting`."""
-        if (surface := poses.surface) is None:
-            return poses
-        ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
-        positions = np.array(poses.positions)
-        positions[:, ids] = parted(positions[:, ids], np.asarray(poses.rest_positions)[ids], faces)
-        return poses.replace(positions=positions)
+        """Return the motion of a body whose parts don't pass through each other, see `mesh.parting`."""
+        return parted_body(poses)
 
     def start(
         self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from eslr_jax.contact.self_contact import SEARCH_RADIUS
+from eslr_jax.mesh.parting import parted, uncrossed
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.mesh.topology import vertex_components
 from eslr_jax.pose.lbs import skin_garment
@@ -40,6 +41,12 @@ class Worn:
     def skinned(self) -> Float[np.ndarray, "frames vertices 3"]:
         """The garment carried by the joints [m]."""
         return np.asarray(_skin(self.garment, self.poses.joint_transforms))
+
+    @property
+    def unfolding(self) -> Float[np.ndarray, "vertices 3"]:
+        """Moves of the first frame's cloth that open what skinning folds through itself [m]."""
+        faces = np.asarray(self.garment.faces)[np.asarray(self.garment.rest_areas) > 0]
+        return uncrossed(self.skinned[0], faces) - self.skinned[0]
 
     @functools.cached_property
     def radii(self) -> Float[np.ndarray, " real_vertices"]:
@@ -134,6 +141,16 @@ class Worn:
         """The frames that are looked at to decide what is modelled: first and last included."""
         last, spacing = len(self.poses.positions) - 1, max(round(_SPACING / float(self.poses.timestep)), 1)
         return np.unique(np.linspace(0, last, -(-last // spacing) + 1).astype(int))
+
+
+def parted_body(poses: BodyMotion) -> BodyMotion:
+    """Return the motion of a body whose parts, as far as cloth reaches them, don't pass through each other."""
+    if (surface := poses.surface) is None:
+        return poses
+    ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
+    positions = np.array(poses.positions)
+    positions[:, ids] = parted(positions[:, ids], np.asarray(poses.rest_positions)[ids], faces)
+    return poses.replace(positions=positions)
 
 
 def surface_near(is_near: np.ndarray, body: Body | BodyMotion) -> BodySurface | None:

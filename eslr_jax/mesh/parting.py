@@ -18,7 +18,8 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.numerics import pierces
+from eslr_jax.mesh.piercing import piercing_edges
+from eslr_jax.mesh.topology import unique_edges
 
 _GAP = 8e-3  # [m] between two parts: cloth on both sides, each within its reach of contact
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
@@ -78,10 +79,10 @@ class _Mesh:
 
     def __init__(self, faces: Int[np.ndarray, "faces 3"], num_vertices: int):
         self.faces = faces
-        sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        edges = unique_edges(faces)
+        ends = np.concatenate([edges, edges[:, ::-1]]).T
         shape = (num_vertices, num_vertices)
-        one_way = scipy.sparse.coo_matrix((np.ones(len(sides)), sides.T), shape).tocsr()
-        self.neighbors = ((one_way + one_way.T) > 0).astype(float)
+        self.neighbors = scipy.sparse.coo_matrix((np.ones(ends.shape[1]), tuple(ends)), shape).tocsr()
         self.degrees = np.maximum(np.asarray(self.neighbors.sum(axis=1)).ravel(), 1.0)
 
     def smoothing(self, points: np.ndarray, crossing: Int[np.ndarray, "crossing 3"]) -> np.ndarray:
@@ -184,20 +185,7 @@ def _pushes(points: np.ndarray, opposed: _Opposed) -> np.ndarray | None:
 
 def _crossing(points: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, " faces"]:
     """Return which faces cross another one; neighbours don't count."""
-    middles, _, sizes = _middles_and_normals(points, faces)
+    owners, _, pierced = piercing_edges(points, faces)
     is_crossing = np.zeros(len(faces), bool)
-    if not len(faces):
-        return is_crossing
-    pairs = cKDTree(middles).query_pairs(2.0 * sizes.max(), output_type="ndarray")
-    low, high = points[faces].min(axis=1), points[faces].max(axis=1)
-    one, other = pairs.T
-    is_kept = ((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1)
-    is_kept &= ~(faces[one][:, :, None] == faces[other][:, None, :]).any(axis=(1, 2))
-    pairs = pairs[is_kept]
-    for one, other in (pairs.T, pairs.T[::-1]):
-        triangle = [tuple(points[corner].T) for corner in faces[other].T]
-        for k in range(3):
-            start, end = (tuple(points[faces[one, side]].T) for side in (k, (k + 1) % 3))
-            hits = np.asarray(pierces(start, end, triangle))  # type: ignore[arg-type]
-            is_crossing[one[hits]] = is_crossing[other[hits]] = True
+    is_crossing[owners] = is_crossing[pierced] = True
     return is_crossing

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eslr_jax.contact.parting import parted, uncrossed
+from eslr_jax.mesh.parting import parted, uncrossed
 from eslr_jax.pipeline.report.referee import intersecting_pairs
 
 
