@@ -72,8 +72,14 @@ def waiting(text: str) -> Iterator[None]:
 
 
 def use_compile_cache() -> None:
-    """Keep compiled programs between runs: the second run of the same command starts at once."""
+    """Keep compiled programs between runs: the second run of the same command starts at once.
+
+    A cache that the user has set (JAX_COMPILATION_CACHE_DIR) is kept.
+    """
     import jax
+
+    if jax.config.jax_compilation_cache_dir is not None:
+        return
 
     from eslr_jax.pipeline.assets.cache import user_cache
 
