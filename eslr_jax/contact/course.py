@@ -23,6 +23,8 @@ _PUSH = 4e-3  # [m] by which cloth that the body carries may be pushed in one pa
 _SWEEPS = 40  # of pushes
 _LEAST_PART = 1.0 / 256.0  # of a frame's motion, below which the cloth is let through
 _WIDE = (6e-3, 2e-2)  # [m] least and greatest allowance of a search, besides half of the way to the goal
+_AGAIN = 2.0  # times its way since the last search, that a search allows a vertex
+_STALE = 0.5  # share of its allowance from which a vertex is looked for, where a search is due
 _FARTHEST = 0.02  # [m] of the way to the goal that a search allows for
 _FINE = (1e-3, 8e-3)  # [m] least and greatest allowance of the finer tables
 _MOVES = 2.0  # of the last step, that the next finer tables allow for
@@ -121,19 +123,24 @@ def _searched(x: Array, course: Course, around: Around) -> Course:
         length = safe_norm(ahead, axis=0)
         ahead = ahead * jnp.minimum(1.0, scale * _FARTHEST / jnp.where(length > 0, length, 1.0))[None]
         way = part * around.carried + 0.5 * ahead
-        # Who has moved far since the last search may do so again.
-        more = jnp.where(remaining > 0, _WIDE[0], jnp.clip(moved, *_WIDE))
-        radius = 0.5 * safe_norm(ahead, axis=0) + scale * more
+        # Once the body has arrived, only who has moved far can have new pairs. He may move as far again.
+        is_whole = (remaining > 0) | (scale < 1)
+        is_new = is_whole | (moved > _STALE * course.wide_radius)
+        more = jnp.where(remaining > 0, _WIDE[0], jnp.clip(_AGAIN * moved, *_WIDE))
+        radius = jnp.where(is_new, 0.5 * safe_norm(ahead, axis=0) + scale * more, course.wide_radius)
+        origin = jnp.where(is_new, x, course.wide_center)
         whole = jnp.concatenate([way, part * around.way], axis=1)
         half = 0.5 * whole
         relative = half - 0.5 * part * jnp.mean(around.way, axis=1, keepdims=True)
-        start = jnp.concatenate([x, around.body + tried.share * around.way], axis=1)
+        start = jnp.concatenate([origin, around.body + tried.share * around.way], axis=1)
         motion = Motion(_rows(start + half), _rows(relative), around.of_cloth(radius))
-        found = find_pairs(motion, around.meshes, around.reach, rows, around.pieces)
+        of_new = jnp.concatenate([is_new, jnp.full(around.body.shape[1], is_whole)])
+        known = nearer_pairs(motion.middle, motion.radius, course.wide, rows, of_new)
+        found = find_pairs(motion, around.meshes, around.reach, known, of_new, around.pieces)
         return tried.replace(
             part=part,
             wide=found.pairs,
-            wide_center=x + way,
+            wide_center=origin + way,
             wide_radius=radius,
             most=found.most,
             searches=tried.searches + 1,
@@ -177,7 +184,13 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
     share = course.share + part
     # A whole that is added up of parts is one but for rounding.
     share = jnp.where(share > 1.0 - 0.5 * _LEAST_PART, 1.0, share)
-    return moved, course.replace(share=share, part=2.0 * part, is_passed=course.is_passed | ~is_good)
+    # Where the body has arrived, pairs that its motion alone might have brought together are left out.
+    rows = course.wide.faces.areas.shape[0]
+    there = around.joined(course.wide_center, share)
+    wide = nearer_pairs(there, around.of_cloth(course.wide_radius), course.wide, rows).pairs
+    return moved, course.replace(
+        share=share, part=2.0 * part, wide=wide, is_passed=course.is_passed | ~is_good
+    )
 
 
 def _listed(x: Array, course: Course, around: Around) -> Course:

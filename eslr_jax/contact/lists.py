@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.pairs import Pairs, Rows, closest, corners_of, over_rows, signs
+from eslr_jax.contact.pairs import CHUNK, Pairs, Rows, closest, corners_of, over_rows, signs
 from eslr_jax.contact.search import Candidates, append, test_candidates
 from eslr_jax.numerics import Vector3, dot3, sub3, true_entries
 from eslr_jax.types import BodySurface, Garment
@@ -100,7 +100,12 @@ class Found(NamedTuple):
 
 
 def find_pairs(
-    motion: Motion, meshes: Meshes, reach: Float[Array, ""], rows: int, pieces: Int[Array, " vertices"] | None
+    motion: Motion,
+    meshes: Meshes,
+    reach: Float[Array, ""],
+    known: Found,
+    is_new: Bool[Array, " vertices"],
+    pieces: Int[Array, " vertices"] | None,
 ) -> Found:
     """Return all pairs that come within the reach of contact while their vertices move.
 
@@ -108,13 +113,14 @@ def find_pairs(
         motion: Where vertices may be.
         meshes: Cloth and body.
         reach: Distance below which pairs act [m].
-        rows: Size of either table; static.
+        known: All pairs of vertices that are not new, in tables of the size that is returned.
+        is_new: Vertices whose pairs are looked for.
         pieces: Piece of every vertex of the cloth, where only cloth of different pieces may touch; None: all.
     """
-    scope = (motion, meshes, reach, rows, pieces)
-    faces, num_faces = _find_kind(meshes.vertices, meshes.faces, False, *scope)
-    edges, num_edges = _find_kind(meshes.edges, meshes.edges, True, *scope)
-    return Found(Pairs(faces, edges), jnp.maximum(num_faces, num_edges))
+    scope = (motion, meshes, reach, is_new, pieces)
+    faces, num_faces = _find_kind(meshes.vertices, meshes.faces, False, known.pairs.faces, *scope)
+    edges, num_edges = _find_kind(meshes.edges, meshes.edges, True, known.pairs.edges, *scope)
+    return Found(Pairs(faces, edges), jnp.maximum(known.most, jnp.maximum(num_faces, num_edges)))
 
 
 class _Boxes(NamedTuple):
@@ -143,14 +149,17 @@ def _find_kind(
     first: Primitives,
     second: Primitives,
     is_edge: bool,
+    known: Rows,
     motion: Motion,
     meshes: Meshes,
     reach: Array,
-    size: int,
+    is_new: Array,
     pieces: Array | None,
 ) -> tuple[Rows, Array]:
     own, others = (_boxes(one, motion, reach) for one in (first, second))
-    close = true_entries(_are_close(first, second, own, others, is_edge))
+    has_new = [jnp.any(is_new[one.corners][:, one.blocks], axis=(0, 2)) for one in (first, second)]
+    is_close = _are_close(first, second, own, others, is_edge)
+    close = true_entries(is_close & (has_new[0][: is_close.shape[0], None] | has_new[1][None]))
     rows = _table(first.blocks, own)
     table = _table(second.blocks, others).transpose(2, 1, 0)  # [members, numbers, blocks]
 
@@ -161,30 +170,37 @@ def _find_kind(
         (group, other), (row, column) = candidates.groups, candidates.members
         one, two = first.blocks[group, row], second.blocks[other, column]
         ids = jnp.concatenate([first.corners[:, one], second.corners[:, two]])
-        is_pair = _may_touch(ids, is_edge, motion, meshes.num_cloth, reach, pieces) & candidates.is_used
+        is_pair = _may_touch(ids, is_edge, motion, meshes.num_cloth, reach, pieces)
+        is_pair = is_pair & jnp.any(is_new[ids], axis=0) & candidates.is_used
         areas = first.areas[one]
         if is_edge:
             is_pair = is_pair & ((group != other) | (one < two))  # within a group, each couple once
             areas = jnp.minimum(areas, second.areas[two])
         return append(*found, (ids, areas), is_pair)
 
-    nothing = (jnp.zeros((4, size), jnp.int32), jnp.zeros(size, reach.dtype))
-    (ids, areas), count = test_candidates(close, words_of, test, (nothing, jnp.int32(0)))
-    return _completed(ids, areas, jnp.minimum(count, size), is_edge, meshes, reach), count
+    (ids, areas), count = test_candidates(close, words_of, test, (known[:2], known.count))
+    return _completed(ids, areas, jnp.minimum(count, areas.size), is_edge, meshes, reach), count
 
 
 def _completed(ids: Array, areas: Array, count: Array, is_edge: bool, meshes: Meshes, reach: Array) -> Rows:
     """Return rows with their reach: at most half of the distance at rest, where both sides are cloth."""
-    p = corners_of(meshes.rest, ids)
-    apart = closest(p, is_edge).distance
-    is_cloth = jnp.all(ids < meshes.num_cloth, axis=0)
-    own = jnp.where(is_cloth, jnp.minimum(reach, 0.5 * apart), reach)
-    rest = jnp.zeros_like(areas)
-    if is_edge:
-        lengths = [sub3(p[k + 1], p[k]) for k in (0, 2)]
-        squared = [dot3(one, one) for one in lengths]
-        rest = jnp.where(is_cloth, squared[0] * squared[1], squared[0] * squared[0])
-    return Rows(ids, areas, own, rest, count)
+
+    def add(carry, part: Rows):
+        first, own, rest = carry
+        p = corners_of(meshes.rest, part.ids)
+        is_cloth = jnp.all(part.ids < meshes.num_cloth, axis=0)
+        near = jnp.where(is_cloth, jnp.minimum(reach, 0.5 * closest(p, is_edge).distance), reach)
+        own = jax.lax.dynamic_update_slice(own, near, (first,))
+        if is_edge:
+            squared = [dot3(one, one) for one in (sub3(p[1], p[0]), sub3(p[3], p[2]))]
+            lengths = squared[0] * jnp.where(is_cloth, squared[1], squared[0])
+            rest = jax.lax.dynamic_update_slice(rest, lengths, (first,))
+        return first + CHUNK, own, rest
+
+    nothing = jnp.zeros_like(areas)
+    rows = Rows(ids, areas, nothing, nothing, count)
+    _, own, rest = over_rows(rows, (jnp.int32(0), nothing, nothing), add)
+    return rows._replace(reach=own, rest=rest)
 
 
 def _are_close(
@@ -280,7 +296,13 @@ def balls_of(radius: Array, ids: Array, is_edge: bool) -> Float[Array, " rows"]:
     return r[0] + jnp.maximum(jnp.maximum(r[1], r[2]), r[3])
 
 
-def nearer_pairs(x: Vector3, radius: Float[Array, " vertices"], pairs: Pairs, rows: int) -> Found:
+def nearer_pairs(
+    x: Vector3,
+    radius: Float[Array, " vertices"],
+    pairs: Pairs,
+    rows: int,
+    is_left_out: Bool[Array, " vertices"] | None = None,
+) -> Found:
     """Return those of some pairs that may come within reach while every vertex stays within its ball around x.
 
     Args:
@@ -288,6 +310,7 @@ def nearer_pairs(x: Vector3, radius: Float[Array, " vertices"], pairs: Pairs, ro
         radius: Of the balls [m]; zero for the body.
         pairs: Of `find_pairs`.
         rows: Size of either table; static.
+        is_left_out: Vertices whose pairs are left out; None: no vertex.
     """
     tables, counts = [], []
     for kind, is_edge in pairs.kinds:
@@ -295,6 +318,8 @@ def nearer_pairs(x: Vector3, radius: Float[Array, " vertices"], pairs: Pairs, ro
         def add(found: tuple, part: Rows, is_edge: bool = is_edge) -> tuple:
             distance = closest(corners_of(x, part.ids), is_edge).distance
             is_pair = (part.areas > 0) & (distance < part.reach + balls_of(radius, part.ids, is_edge))
+            if is_left_out is not None:
+                is_pair = is_pair & ~jnp.any(is_left_out[part.ids], axis=0)
             return append(*found, part[:4], is_pair)
 
         nothing = jnp.zeros(rows, x[0].dtype)

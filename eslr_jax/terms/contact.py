@@ -28,7 +28,7 @@ _FADES = 0.02  # [m] from the body, beyond which it takes cloth along less and l
 _FADING = 0.05  # [m] over which it does, or half as much more than the body moves in a frame
 _SMOOTHINGS = 4  # of the motion by which the body takes cloth along
 _GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
-_WIDE_ROWS, _FINE_ROWS = 40, 4  # per vertex of the cloth, of the tables that a scene begins with
+_WIDE_ROWS, _FINE_ROWS = 64, 4  # per vertex of the cloth, of the tables that a scene begins with
 
 
 class ContactData(NamedTuple):

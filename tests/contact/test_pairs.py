@@ -99,6 +99,41 @@ def test_pushed_ends_cross_nothing(is_edge):
     assert not any(meets(*x[ids[:, row]].astype(float), *ends[ids[:, row]])[0] for row in range(ROWS))
 
 
+def search(motion, meshes, rows):
+    """Return all pairs: every vertex is new."""
+    nothing = pairs.Pairs(*[pairs.no_pairs(rows, jnp.float32)] * 2)
+    everyone = jnp.ones(motion.radius.shape, bool)
+    known = lists.Found(nothing, jnp.int32(0))
+    return lists.find_pairs(motion, meshes, jnp.float32(3e-3), known, everyone, None)
+
+
+def listed(rows):
+    """Return the pairs of a table as a set."""
+    return {tuple(row) for row in np.asarray(rows.ids).T[: int(rows.count)]}
+
+
+def test_a_search_for_some_vertices_completes_the_pairs_of_the_others():
+    garment, poses = square(side=12), drifting_ball(2)
+    surface = prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
+    meshes = lists.joint_meshes(garment, surface)
+    start = np.concatenate(
+        [np.asarray(garment.rest_positions) - np.float32([0.0, 0.004, 0.0]), poses.positions[0]]
+    )
+    random = np.random.default_rng(4)
+    is_cloth = np.arange(len(start)) < 144
+    radius = np.where(is_cloth, 3e-3, 0.0).astype(np.float32)
+    before = search(lists.Motion(columns(start), columns(0 * start), jnp.asarray(radius)), meshes, 8192)
+    is_new = is_cloth & (random.random(len(start)) < 0.1)
+    start[is_new] += 8e-3 * random.normal(size=(is_new.sum(), 3)).astype(np.float32)
+    radius[is_new] = 5e-3
+    after = lists.Motion(columns(start), columns(0 * start), jnp.asarray(radius))
+    kept = lists.nearer_pairs(*after[::2], before.pairs, 8192, jnp.asarray(is_new))
+    found = lists.find_pairs(after, meshes, jnp.float32(3e-3), kept, jnp.asarray(is_new), None)
+    for rows, rest, whole in zip(found.pairs, kept.pairs, search(after, meshes, 8192).pairs, strict=True):
+        assert int(rest.count) < int(rows.count) == int(whole.count) < 8192
+        assert listed(rows) == listed(whole)
+
+
 def test_the_search_finds_every_pair_within_reach_while_vertices_move():
     garment, poses = square(side=12), drifting_ball(2)
     surface = prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
@@ -112,7 +147,7 @@ def test_the_search_finds_every_pair_within_reach_while_vertices_move():
     radius = np.where(np.arange(len(start)) < 144, 2e-3, 0.0).astype(np.float32)
     motion = lists.Motion(columns(start), columns(half), jnp.asarray(radius))
     reach = 3e-3
-    found = lists.find_pairs(motion, meshes, jnp.float32(reach), 4096, None)
+    found = search(motion, meshes, 4096)
     for (rows, is_edge), first, second in zip(
         found.pairs.kinds, (meshes.vertices, meshes.edges), (meshes.faces, meshes.edges), strict=True
     ):
@@ -142,6 +177,6 @@ def test_rows_beyond_a_table_are_counted():
     )
     start = np.concatenate([garment.rest_positions, poses.positions[0]])
     still = lists.Motion(columns(start), columns(0 * start), jnp.full(len(start), 0.02))
-    few, many = (lists.find_pairs(still, meshes, jnp.float32(3e-3), rows, None) for rows in (512, 65536))
+    few, many = (search(still, meshes, rows) for rows in (512, 65536))
     assert int(few.most) == int(many.most) > 512
     assert int(few.pairs.edges.count) == 512
