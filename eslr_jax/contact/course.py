@@ -21,7 +21,7 @@ from eslr_jax.numerics import Vector3, safe_norm
 CAUTION = 0.9  # share of its room that a vertex may take in one step
 _PUSH = 4e-3  # [m] by which cloth that the body carries may be pushed in one part of its motion
 _SWEEPS = 40  # of pushes
-_LEAST_PART = 1.0 / 256.0  # of a frame's motion, below which the cloth is let through
+_LEAST_PART = 1.0 / 256.0  # of a frame's motion, at which cloth is pushed farther, or else let through
 _WIDE = (6e-3, 2e-2)  # [m] least and greatest allowance of a search, besides half of the way to the goal
 _AGAIN = 2.0  # times its way since the last search, that a search allows a vertex
 _STALE = 0.5  # share of its allowance from which a vertex is looked for, where a search is due
@@ -174,13 +174,14 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
         ends = _rows(jnp.stack(start) + ways)
         moved, lack = mended(start, ends, course.wide, is_free, _SWEEPS)
         farthest = jnp.max(safe_norm(jnp.stack(moved) - jnp.stack(ends), axis=0))
-        return part, jnp.stack(moved)[:, : x.shape[1]], (lack == 0) & (farthest < _PUSH)
+        return part, jnp.stack(moved)[:, : x.shape[1]], lack, farthest
 
     def is_wanting(carry):
-        part, _, is_good = carry
-        return ~is_good & (part > _LEAST_PART)
+        part, _, lack, farthest = carry
+        return ((lack > 0) | (farthest > _PUSH)) & (part > _LEAST_PART)
 
-    part, moved, is_good = jax.lax.while_loop(is_wanting, push, (2.0 * course.part, x, jnp.zeros((), bool)))
+    untried = (2.0 * course.part, x, jnp.full((), jnp.inf, x.dtype), jnp.zeros((), x.dtype))
+    part, moved, lack, _ = jax.lax.while_loop(is_wanting, push, untried)
     share = course.share + part
     # A whole that is added up of parts is one but for rounding.
     share = jnp.where(share > 1.0 - 0.5 * _LEAST_PART, 1.0, share)
@@ -189,7 +190,7 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
     there = around.joined(course.wide_center, share)
     wide = nearer_pairs(there, around.of_cloth(course.wide_radius), course.wide, rows).pairs
     return moved, course.replace(
-        share=share, part=2.0 * part, wide=wide, is_passed=course.is_passed | ~is_good
+        share=share, part=2.0 * part, wide=wide, is_passed=course.is_passed | (lack > 0)
     )
 
 
