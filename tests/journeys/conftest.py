@@ -41,11 +41,10 @@ def fit_report(eslr):
 
 @pytest.fixture(scope="session")
 def worn(eslr):
-    """A function that simulates a garment file and returns the report and the trajectory's arrays."""
+    """A function that simulates a garment file as the command does; it returns the report and the arrays."""
 
-    def run(path, out, *options, frames=20, iterations=20):
-        words = ("--simulator", "physics", "--iterations", iterations, "--frames", frames)
-        words += ("--no-pictures", "--json")
+    def run(path, out, *options, frames=20):
+        words = ("--simulator", "physics", "--frames", frames, "--no-pictures", "--json")
         result = eslr("simulate", "--garment", path, *words, *options, "--out", out)
         assert result.returncode == 0, result.stderr
         with np.load(out / "trajectory.npz") as arrays:

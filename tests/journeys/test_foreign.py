@@ -36,14 +36,11 @@ def motions(tmp_path_factory, body):
     ("shape", "motion", "most_stretch", "most_depth_mm"),
     [
         (skirt, "amass.npz", 1.5, 1.0),
-        # The walk's end does not meet its beginning, and the thighs jump by 16 cm a frame in between. Twenty
-        # iterations leave forces of 570 weights there, and the walls between the legs stretch 2.5 times; with
-        # a hundred it is 1.7, and 1.2 on `cmu_01_01.bvh`. The body doesn't cut itself there.
-        (shorts, "makehuman_walk1.bvh", 3.3, 12.0),
+        # The walk's end does not meet its beginning: the thighs jump by 16 cm a frame in between.
+        (shorts, "makehuman_walk1.bvh", 2.35, 1.0),
         (trousers, "cmu_01_01.bvh", 1.5, 1.0),
         (tube_dress, "hood.pkl", 1.45, 1.0),
-        # Fingers, which are no obstacles, are 12 mm in the cloth, and the report has 26 mm beside an elbow.
-        (poncho, "cmu_01_01.bvh", 1.9, 33.0),
+        (poncho, "cmu_01_01.bvh", 1.7, 1.3),
         (cape, "amass.npz", 1.7, 1.0),
     ],
 )
@@ -52,9 +49,8 @@ def test_a_foreign_garment_is_worn_on_a_foreign_motion(
 ):
     path = write_obj(tmp_path / "garment.obj", shape())
     loop = ("--loop", 40) if motion.startswith("makehuman") else ()  # it has 17 frames
-    # The cape, which starts on the shoulders, has not settled by frame 0 with twenty: it sinks by 0.2 m then.
     words = ("--motion", motions / motion, *loop)
-    report, run = worn(path, tmp_path / "run", *words, frames=40, iterations=100 if shape is cape else 20)
+    report, run = worn(path, tmp_path / "run", *words, frames=40)
     cloth, wearer = run["positions"], run["body_positions"]
     above = cloth[..., 1].mean(axis=1) - wearer[..., 1].mean(axis=1)
     assert abs(above[-1] - above[0]) < 0.1, "it falls off"
