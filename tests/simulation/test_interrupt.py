@@ -15,6 +15,8 @@ def test_only_the_second_signal_reaches_those_who_act_on_it():
         sender.setblocking(False)
         receiver.setblocking(False)
         before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+        # A shell's background jobs ignore it.
+        handler = signal.signal(signal.SIGINT, signal.default_int_handler)
         said = []
         try:
             with Interruption(lambda: said.append("stopping")) as stop:
@@ -27,5 +29,6 @@ def test_only_the_second_signal_reaches_those_who_act_on_it():
                     os.kill(os.getpid(), signal.SIGINT)
                 assert receiver.recv(1) == bytes([signal.SIGINT])
         finally:
+            signal.signal(signal.SIGINT, handler)
             assert signal.set_wakeup_fd(before) == sender.fileno()
     assert said == ["stopping"]
