@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from commands import eslr, eslr_here, refused
@@ -18,6 +19,7 @@ from own_term import Push
 from eslr_jax.config import from_dict
 from eslr_jax.errors import ConfigError
 from eslr_jax.pipeline.assets import load_body, load_garment_file, load_motion
+from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.garment import read_garment_npz
@@ -112,6 +114,15 @@ def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
+def test_a_compile_cache_that_is_set_is_kept(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    own = jax.config.jax_compilation_cache_dir
+    use_compile_cache()
+    assert own is not None
+    assert jax.config.jax_compilation_cache_dir == own
+    assert not list(tmp_path.iterdir())
+
+
 def test_waiting_counts_its_seconds_on_a_terminal():
     import pty
 
