@@ -113,7 +113,6 @@ def test_a_bundled_network_alone_steps_by_the_integrator_it_was_trained_with(
     assert report["finite"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
 def test_a_compile_cache_that_is_set_is_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     own = jax.config.jax_compilation_cache_dir
@@ -123,6 +122,7 @@ def test_a_compile_cache_that_is_set_is_kept(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals differ")
 def test_waiting_counts_its_seconds_on_a_terminal():
     import pty
 

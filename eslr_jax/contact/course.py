@@ -178,7 +178,7 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
 
     def is_wanting(carry):
         part, _, lack, farthest = carry
-        return ((lack > 0) | (farthest > _PUSH)) & (part > _LEAST_PART)
+        return ~((lack == 0) & (farthest < _PUSH)) & (part > _LEAST_PART)
 
     untried = (2.0 * course.part, x, jnp.full((), jnp.inf, x.dtype), jnp.zeros((), x.dtype))
     part, moved, lack, _ = jax.lax.while_loop(is_wanting, push, untried)
@@ -190,7 +190,7 @@ def _carried(x: Array, course: Course, around: Around) -> tuple[Array, Course]:
     there = around.joined(course.wide_center, share)
     wide = nearer_pairs(there, around.of_cloth(course.wide_radius), course.wide, rows).pairs
     return moved, course.replace(
-        share=share, part=2.0 * part, wide=wide, is_passed=course.is_passed | (lack > 0)
+        share=share, part=2.0 * part, wide=wide, is_passed=course.is_passed | (lack != 0)
     )
 
 

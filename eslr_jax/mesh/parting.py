@@ -24,10 +24,8 @@ from eslr_jax.mesh.topology import unique_edges
 _GAP = 8e-3  # [m] between two parts: cloth on both sides, each within its reach of contact
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
 _AROUND = 0.04  # [m] in which faces are looked for
-_CREASE = (
-    0.04,
-    0.2,
-)  # [m] apart at rest, below which places belong to one crease; and gap over what is beyond 30 mm
+# [m] apart at rest, below which places belong to one crease; and the gap over what is beyond `_CREASE_START`
+_CREASE = (0.04, 0.2)
 _CREASE_START = 0.03  # [m]
 _TURNED = -0.2  # cosine between normals, below which two places face each other
 _FOLDED = 0.7  # cosine between normals, below which faces may cross

@@ -99,6 +99,15 @@ def test_pushed_ends_cross_nothing(is_edge):
     assert not any(meets(*x[ids[:, row]].astype(float), *ends[ids[:, row]])[0] for row in range(ROWS))
 
 
+def sheet_in_ball():
+    """Return meshes and places of a sheet whose middle lies in a ball: there both are near each other."""
+    garment, poses = square(side=12), drifting_ball(2)
+    surface = prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
+    meshes = lists.joint_meshes(garment, surface)
+    sheet = np.asarray(garment.rest_positions) - np.float32([0.0, 0.004, 0.0])
+    return meshes, np.concatenate([sheet, poses.positions[0]])
+
+
 def search(motion, meshes, rows):
     """Return all pairs: every vertex is new."""
     nothing = pairs.Pairs(*[pairs.no_pairs(rows, jnp.float32)] * 2)
@@ -113,12 +122,7 @@ def listed(rows):
 
 
 def test_a_search_for_some_vertices_completes_the_pairs_of_the_others():
-    garment, poses = square(side=12), drifting_ball(2)
-    surface = prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
-    meshes = lists.joint_meshes(garment, surface)
-    start = np.concatenate(
-        [np.asarray(garment.rest_positions) - np.float32([0.0, 0.004, 0.0]), poses.positions[0]]
-    )
+    meshes, start = sheet_in_ball()
     random = np.random.default_rng(4)
     is_cloth = np.arange(len(start)) < 144
     radius = np.where(is_cloth, 3e-3, 0.0).astype(np.float32)
@@ -135,13 +139,7 @@ def test_a_search_for_some_vertices_completes_the_pairs_of_the_others():
 
 
 def test_the_search_finds_every_pair_within_reach_while_vertices_move():
-    garment, poses = square(side=12), drifting_ball(2)
-    surface = prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
-    meshes = lists.joint_meshes(garment, surface)
-    # The sheet's middle lies in the ball, where vertices and edges of both are near each other.
-    start = np.concatenate(
-        [np.asarray(garment.rest_positions) - np.float32([0.0, 0.004, 0.0]), poses.positions[0]]
-    )
+    meshes, start = sheet_in_ball()
     random = np.random.default_rng(3)
     half = random.normal(size=start.shape).astype(np.float32) * 2e-3
     radius = np.where(np.arange(len(start)) < 144, 2e-3, 0.0).astype(np.float32)
@@ -171,11 +169,7 @@ def test_the_search_finds_every_pair_within_reach_while_vertices_move():
 
 
 def test_rows_beyond_a_table_are_counted():
-    garment, poses = square(side=12), drifting_ball(2)
-    meshes = lists.joint_meshes(
-        garment, prepare_surface(np.asarray(poses.positions[0]), np.asarray(poses.faces))
-    )
-    start = np.concatenate([garment.rest_positions, poses.positions[0]])
+    meshes, start = sheet_in_ball()
     still = lists.Motion(columns(start), columns(0 * start), jnp.full(len(start), 0.02))
     few, many = (search(still, meshes, rows) for rows in (512, 65536))
     assert int(few.most) == int(many.most) > 512
