@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.pairs import CHUNK, Pairs, Rows, closest, corners_of, over_rows, signs
+from eslr_jax.contact.pairs import CHUNK, Pairs, Rows, closest, corners_of, no_pairs, over_rows, signs
 from eslr_jax.contact.search import Candidates, append, test_candidates
-from eslr_jax.numerics import Vector3, dot3, sub3, true_entries
+from eslr_jax.numerics import Vector3, dot3, in_memory, sub3, true_entries
 from eslr_jax.types import BodySurface, Garment
 
 
@@ -222,8 +222,9 @@ def _are_close(
 
 def _range(blocks: Int[Array, "blocks members"], boxes: _Boxes, axis: int) -> tuple[Array, Array]:
     """Return from where to where the boxes of every group reach, all the way [m]."""
-    middle, spread = boxes.middle[axis][blocks], (boxes.size[axis] + jnp.abs(boxes.half[axis]))[blocks]
-    return jnp.min(middle - spread, axis=1), jnp.max(middle + spread, axis=1)
+    middle, spread = boxes.middle[axis], boxes.size[axis] + jnp.abs(boxes.half[axis])
+    low, high = in_memory(middle - spread, middle + spread)
+    return jnp.min(low[blocks], axis=1), jnp.max(high[blocks], axis=1)
 
 
 def _table(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "blocks numbers members"]:
@@ -315,16 +316,33 @@ def nearer_pairs(
     tables, counts = [], []
     for kind, is_edge in pairs.kinds:
 
-        def add(found: tuple, part: Rows, is_edge: bool = is_edge) -> tuple:
+        def mark(carry: tuple, part: Rows, is_edge: bool = is_edge) -> tuple:
+            first, *kept = carry
             distance = closest(corners_of(x, part.ids), is_edge).distance
             is_pair = (part.areas > 0) & (distance < part.reach + balls_of(radius, part.ids, is_edge))
             if is_left_out is not None:
                 is_pair = is_pair & ~jnp.any(is_left_out[part.ids], axis=0)
-            return append(*found, part[:4], is_pair)
+            return first + CHUNK, *append(*kept, (first + jnp.arange(CHUNK, dtype=jnp.int32),), is_pair)
 
-        nothing = jnp.zeros(rows, x[0].dtype)
-        start = ((jnp.zeros((4, rows), jnp.int32), nothing, nothing, nothing), jnp.int32(0))
-        table, count = over_rows(kind, start, add)
-        tables.append(Rows(*table, jnp.minimum(count, rows)))
+        start = (jnp.int32(0), (jnp.zeros(rows, jnp.int32),), jnp.int32(0))
+        _, (numbers,), count = over_rows(kind, start, mark)
+        tables.append(_taken(kind, numbers, jnp.minimum(count, rows)))
         counts.append(count)
     return Found(Pairs(*tables), jnp.maximum(*counts))
+
+
+def _taken(pairs: Rows, numbers: Int[Array, " rows"], count: Int[Array, ""]) -> Rows:
+    """Return a table of the rows with these numbers, `CHUNK` at a time."""
+
+    def take(carry):
+        first, table = carry
+        row = jax.lax.dynamic_slice(numbers, (first,), (CHUNK,))
+        is_used = first + jnp.arange(CHUNK, dtype=jnp.int32) < count
+        part = [leaf[..., row] for leaf in pairs[:4]]
+        part[1] = jnp.where(is_used, part[1], 0.0)
+        start = [(0,) * (leaf.ndim - 1) + (first,) for leaf in part]
+        return first + CHUNK, tuple(map(jax.lax.dynamic_update_slice, table, part, start))
+
+    nothing = no_pairs(numbers.size, pairs.areas.dtype)[:4]
+    _, table = jax.lax.while_loop(lambda carry: carry[0] < count, take, (jnp.int32(0), nothing))
+    return Rows(*table, count)

@@ -174,7 +174,7 @@ def energy_and_gradient(x: Vector3, pairs: Pairs) -> tuple[Float[Array, ""], Vec
 
     The rows have no derivative. That of the gradient is exact: it is taken over the whole table.
     """
-    total, gradient = jnp.zeros((), x[0].dtype), jnp.zeros((x[0].shape[0], 3), x[0].dtype)
+    total, gradient = jnp.zeros((), x[0].dtype), tuple(jnp.zeros_like(part) for part in x)
     for kind, is_edge in pairs.kinds:
 
         def add(carry, rows: Rows, is_edge: bool = is_edge):
@@ -184,13 +184,11 @@ def energy_and_gradient(x: Vector3, pairs: Pairs) -> tuple[Float[Array, ""], Vec
                 return jnp.sum(row_energies(p, rows, is_edge, is_frozen=True))
 
             value, forces = jax.value_and_grad(summed)(corners_of(x, rows.ids))
-            flat = jnp.stack(
-                [jnp.concatenate([force[axis] for force in forces]) for axis in range(3)], axis=1
-            )
-            return total + value, gradient.at[rows.ids.ravel()].add(flat)
+            by_axis = zip(gradient, zip(*forces, strict=True), strict=True)
+            return total + value, tuple(_added(part, rows, force) for part, force in by_axis)
 
         total, gradient = over_rows(kind, (total, gradient), add)
-    return total, (gradient[:, 0], gradient[:, 1], gradient[:, 2])
+    return total, gradient  # type: ignore[return-value]
 
 
 @energy_and_gradient.defjvp
@@ -227,7 +225,7 @@ def diagonal(x: Vector3, pairs: Pairs) -> Float[Array, " vertices"]:
             low = 12.0 * t**3 / jnp.square(jnp.maximum(near.distance, FLOOR))
             bend = jnp.where(near.distance < t, low, 6.0 * jnp.maximum(rows.reach - near.distance, 0.0))
             values = rows.areas * bend / 3.0
-            return _add_to_vertices(total, rows, [w * w * values for w in near.weights])
+            return _added(total, rows, [w * w * values for w in near.weights])
 
         total = over_rows(kind, total, add)
     return total
@@ -244,14 +242,20 @@ def loads(
             near = closest(corners_of(x, rows.ids), is_edge)
             slope = jax.grad(lambda d: jnp.sum(barrier(d, rows.reach)))(near.distance)
             size = jnp.where(is_load(rows) & (rows.areas > 0), -rows.areas * slope, 0.0)
-            return _add_to_vertices(total, rows, [jnp.abs(w) * size for w in near.weights])
+            return _added(total, rows, [jnp.abs(w) * size for w in near.weights])
 
         total = over_rows(kind, total, add)
     return total
 
 
-def _add_to_vertices(total: Array, rows: Rows, values: list[Array]) -> Array:
-    return total.at[rows.ids.ravel()].add(jnp.concatenate(values))
+def _added(total: Array, rows: Rows, values: Sequence[Array]) -> Array:
+    """Return totals of vertices with values of the four corners of rows added.
+
+    Corner by corner: XLA would compute what is joined in a loop that it can't vectorise.
+    """
+    for corner, value in zip(rows.ids, values, strict=True):
+        total = total.at[corner].add(value)
+    return total
 
 
 def shares(x: Vector3, step: Vector3, pairs: Pairs, caution: float) -> Float[Array, " vertices"]:
@@ -283,12 +287,12 @@ def shares(x: Vector3, step: Vector3, pairs: Pairs, caution: float) -> Float[Arr
             both = speeds[0] + speeds[1]
             part = jnp.where(both > 0, speeds[1] / jnp.where(both > 0, both, 1.0), 0.5)
             plane = near.distance * jnp.clip(part, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
-            values = []
             for k in range(4):
                 room = caution * jnp.maximum(side[k] * (height[k] + zero - plane) - FLOOR, 0.0)
                 is_cut = (rows.areas > 0) & (toward[k] > room)
-                values.append(jnp.where(is_cut, room / jnp.where(is_cut, toward[k], 1.0), 1.0))
-            return least.at[rows.ids.ravel()].min(jnp.concatenate(values))
+                share = jnp.where(is_cut, room / jnp.where(is_cut, toward[k], 1.0), 1.0)
+                least = least.at[rows.ids[k]].min(share)
+            return least
 
         least = over_rows(kind, least, cut)
     return least
@@ -302,7 +306,9 @@ def least_gaps(x: Vector3, pairs: Pairs) -> Float[Array, " vertices"]:
         def take(least: Array, rows: Rows, is_edge: bool = is_edge) -> Array:
             distance = closest(corners_of(x, rows.ids), is_edge).distance
             distance = jnp.where(rows.areas > 0, distance, jnp.inf)
-            return least.at[rows.ids.ravel()].min(jnp.tile(distance, 4))
+            for corner in rows.ids:
+                least = least.at[corner].min(distance)
+            return least
 
         least = over_rows(kind, least, take)
     return least

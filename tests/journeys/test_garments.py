@@ -137,7 +137,7 @@ def test_quads_become_triangles_and_keep_their_waist(tmp_path, body):
     positions, faces = skirt()
     quads = faces.reshape(2, -1, 3).transpose(1, 0, 2)  # two triangles of every cell of the grid
     lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions]
-    lines += [f"f {a} {b} {c} {d}" for (a, b, c), (_, _, d) in (quads + 1).tolist()]
+    lines += [f"f {a} {d} {b} {c}" for (a, b, c), (_, d, _) in (quads + 1).tolist()]
     (tmp_path / "skirt.obj").write_text("\n".join(lines))
     fitted = load(tmp_path / "skirt.obj", body)
     assert len(fitted.faces) == len(faces)

@@ -109,9 +109,10 @@ def test_padding_does_not_change_the_answer():
 @pytest.mark.numerics
 @pytest.mark.slow
 def test_gradient_matches_finite_differences():
+    single = (trained(), *coarse_scene())
     with jax.enable_x64(True):
-        scene = tree_cast(coarse_scene(), jnp.float64)
-        network, graph, answer = run(tree_cast(trained(), jnp.float64), *scene)
+        network, *scene = (tree_cast(tree, jnp.float64) for tree in single)
+        network, graph, answer = run(network, *scene)
         generator = np.random.default_rng(0)
         direction = generator.standard_normal(answer.shape)
         rows = graph.nodes["garment"]
