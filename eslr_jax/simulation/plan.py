@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import get_args
+from typing import Any, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.padding import choose_bucket, common_bucket
 from eslr_jax.mesh.prepare import pad_alike
 from eslr_jax.pose.motion import check_length
+from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.scene import Integrator, build_scene, slice_tracks, worn_material
 from eslr_jax.terms import Term, scene_terms
 from eslr_jax.terms.worn import Worn, looseness, surface_near, within
 from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Scene
 
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
-_build = jax.jit(build_scene, static_argnames=("integrator", "substeps", "starts_at_rest", "has_pins"))
 
 
 def plan_scene(
@@ -94,9 +95,7 @@ def prepare_scene(
     planned, poses = plan_scene(garment, poses, terms, surface=surface)
     stepping = {"integrator": integrator, "substeps": substeps, "starts_at_rest": starts_at_rest}
     given = (garment, poses, worn_material(garment, material), planned)
-    has_pins = bool(np.any(garment.is_pinned))
-    on_shapes(_build.eval_shape(*given, **stepping, has_pins=has_pins))
-    return _build(*given, **stepping, has_pins=has_pins)
+    return _build(*given, on_shapes, **stepping, has_pins=bool(np.any(garment.is_pinned)))
 
 
 def prepare_scenes(
@@ -158,11 +157,27 @@ def prepare_scenes(
             _cleared(one.poses if surface is None else one.poses.replace(surface=surface), plan),
             material,
             tuple(plan),
+            lambda shapes: None,
             **stepping,
             has_pins=has_pins,
         )
         for one, plan, material in zip(worn, plans, fabrics, strict=True)
     ]
+
+
+def _build(
+    garment: Garment,
+    poses: BodyMotion,
+    material: Material,
+    terms: tuple[Term, ...],
+    on_shapes: Callable[[Scene], None],
+    **stepping: Any,
+) -> Scene:
+    """Return the scene of `build_scene`, by a program that is kept."""
+    given = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
+    program = find_program(build_scene, given, **stepping)
+    on_shapes(program.results)
+    return program.wait()(*given)
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:

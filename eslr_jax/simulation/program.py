@@ -1,50 +1,139 @@
-"""Programs that a thread compiles while the host prepares what they will run on."""
+"""Programs that are traced once for all runs, and compiled while the host prepares what they will run on.
+
+To trace and lower a rollout takes five seconds, as long as a hundred of its frames. So where JAX keeps compiled
+programs (`jax_compilation_cache_dir`), traced ones are kept beside them, in the portable form of `jax.export`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import pickle
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 import jax
+from jax import export
 
-from eslr_jax.config import SimConfig
+from eslr_jax.errors import AssetError
+from eslr_jax.files.atomic import atomic_write
 
 _compiler = ThreadPoolExecutor(1)
-# Programs that are kept. One with self-contact takes 2,700 of the 65,530 memory maps that Linux gives a process;
-# of 32 kept ones, a batch of scenes ended in "LLVM compilation error: Cannot allocate memory".
+# Programs that are kept in memory. One with self-contact takes 2,700 of the 65,530 memory maps that Linux gives a
+# process; of 32 kept ones, a batch of scenes ended in "LLVM compilation error: Cannot allocate memory".
 _KEPT = 12
+_KEPT_TRACES = 200  # files, of half a megabyte at most; those that were not used for longest go first
+_SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans")  # what a trace depends on
 
 
-def begin_program(function: Callable, config: SimConfig, arguments: tuple) -> None:
-    """Trace a function here, and begin to compile it in a thread; `find_program` waits for it.
+class Program:
+    """A traced function. It is compiled in a thread where that is begun, else when it is first waited for."""
+
+    def __init__(self, lowered: jax.stages.Lowered, results: Any):
+        self.results = results
+        """Shapes of what it returns."""
+        self._lowered = lowered
+        self._compiled: Future[jax.stages.Compiled] | None = None
+
+    def begin(self) -> None:
+        """Begin to compile it in a thread."""
+        if self._compiled is None:
+            self._compiled = _compiler.submit(self._lowered.compile)
+
+    def wait(self) -> Program:
+        """Return it when it is compiled."""
+        if self._compiled is None:
+            self._compiled = Future()
+            self._compiled.set_result(self._lowered.compile())
+        self._compiled.result()
+        return self
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the function's results for arrays of its shapes."""
+        assert self._compiled is not None
+        leaves = self._compiled.result()(*jax.tree.leaves(arguments))
+        return jax.tree.unflatten(jax.tree.structure(self.results), leaves)
+
+
+def find_program(function: Callable, arguments: tuple, **static: Any) -> Program:
+    """Return the program of a function for arguments of these shapes.
+
+    It is traced here, where JAX's settings of this thread hold.
 
     Args:
-        function: A pure function of arrays and of the keyword `config`.
-        config: Static.
+        function: A pure function of arrays and of static keywords.
         arguments: Arrays, or their shapes, of `jax.eval_shape`.
+        static: Its keywords; they can be hashed.
     """
-    _compile(function, config, *_signature(arguments))
-
-
-def find_program(function: Callable, config: SimConfig, arguments: tuple) -> Callable:
-    """Return the compiled function for arguments of these shapes; compile it if nobody has begun to."""
-    return _compile(function, config, *_signature(arguments)).result()
-
-
-def _signature(arguments: tuple) -> tuple[Any, tuple]:
-    """Return the structure of arguments, and shapes and types of their arrays."""
     leaves, structure = jax.tree.flatten(arguments)
-    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    settings = tuple(getattr(jax.config, name) for name in _SETTINGS)
+    return _program(function, structure, shapes, tuple(sorted(static.items())), settings)
 
 
 @lru_cache(maxsize=_KEPT)
-def _compile(function: Callable, config: SimConfig, structure: Any, shapes: tuple) -> Future[Callable]:
-    """Begin to compile a function, once for every configuration and every set of shapes.
-
-    It is traced here, where JAX's settings of this thread hold.
-    """
+def _program(function: Callable, structure: Any, shapes: tuple, static: tuple, settings: tuple) -> Program:
     described = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
-    lowered = jax.jit(partial(function, config=config)).lower(*jax.tree.unflatten(structure, described))
-    return _compiler.submit(lowered.compile)
+    seen = []
+
+    def flat(*leaves: Any) -> list:
+        results = function(*jax.tree.unflatten(structure, leaves), **dict(static))
+        seen.append(jax.tree.structure(results))
+        return jax.tree.leaves(results)
+
+    folder = jax.config.jax_compilation_cache_dir
+    if folder is None or not all(map(_is_known, (function, structure, static))):
+        lowered = jax.jit(flat).lower(*described)
+        return Program(lowered, jax.tree.unflatten(seen[-1], lowered.out_info))
+    key = repr(
+        (function.__qualname__, structure, shapes, static, settings, jax.__version__, jax.default_backend())
+    )
+    name = hashlib.sha256(_source() + key.encode()).hexdigest()
+    path = Path(folder) / "traced" / f"{name}.pickle"
+    with contextlib.suppress(Exception):  # missing or damaged: it is traced again
+        found, module = pickle.loads(path.read_bytes())  # of the folder from which JAX loads machine code
+        exported = export.deserialize(module)
+        os.utime(path)
+        seen.append(found)
+    if not seen:
+        exported = export.export(jax.jit(flat))(*described)
+        _keep(path, pickle.dumps((seen[-1], exported.serialize())))
+    shapes_out = [jax.ShapeDtypeStruct(out.shape, out.dtype) for out in exported.out_avals]
+    return Program(jax.jit(exported.call).lower(*described), jax.tree.unflatten(seen[-1], shapes_out))
+
+
+def _keep(path: Path, content: bytes) -> None:
+    """Write a file, and remove the oldest ones of its folder; a folder that can't be written costs time alone."""
+    with contextlib.suppress(AssetError, OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(content)
+        entries = sorted(path.parent.glob("*.pickle"), key=lambda entry: entry.stat().st_mtime)
+        for oldest in entries[:-_KEPT_TRACES]:
+            oldest.unlink(missing_ok=True)
+
+
+def _is_known(part: Any) -> bool:
+    """Return whether a part of a program's description is the package's own, whose source is hashed."""
+    if isinstance(part, jax.tree_util.PyTreeDef):
+        node = part.node_data()
+        return node is None or (all(map(_is_known, node)) and all(map(_is_known, part.children())))
+    if isinstance(part, (tuple, list)):
+        return all(map(_is_known, part))
+    if isinstance(part, dict):
+        return all(map(_is_known, part.items()))
+    owner = part.__module__ if isinstance(part, type) or callable(part) else type(part).__module__
+    return owner.split(".")[0] in ("builtins", __name__.split(".")[0])
+
+
+@cache
+def _source() -> bytes:
+    """Return a hash of the package's source."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.digest()

@@ -16,7 +16,7 @@ from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, 
 from eslr_jax.fabric.validate import validate_material, validate_timestep
 from eslr_jax.networks.network import Network, check_network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
-from eslr_jax.simulation.program import begin_program, find_program
+from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.scene import initial_state, slice_tracks
 from eslr_jax.simulation.stepper import make_stepper, past_state
@@ -133,7 +133,7 @@ def _in_chunks(
         bound = None if pace is None else jnp.int32(iterations)  # all numbers share a program
         arguments = (params, constant, state, part(first), bound)
         began = time.perf_counter()
-        program = find_program(_scan, config, arguments)
+        program = find_program(_scan, arguments, config=config).wait()
         compile_s += time.perf_counter() - began
         began = time.perf_counter()
         end, frames = jax.block_until_ready(program(*arguments))
@@ -220,7 +220,7 @@ def begin_compiling(
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound
 
-    begin_program(_scan, config, jax.eval_shape(first_chunk, params, scene))
+    find_program(_scan, jax.eval_shape(first_chunk, params, scene), config=config).begin()
 
 
 def _chunk_of(scene: Scene) -> int:

@@ -2,6 +2,7 @@
 
 import functools
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from eslr_jax.pipeline.cli.simulate import Unfinished
 from eslr_jax.pipeline.report.gap import GapOptions, measure_gap
 from eslr_jax.simulation.archive import read_tree, write_tree
 from eslr_jax.simulation.plan import first_frames, prepare_scene
-from eslr_jax.simulation.program import _compile, find_program
+from eslr_jax.simulation.program import _program, find_program
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.simulation.simulate import (
@@ -129,9 +130,9 @@ def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhe
     for count in (6, 2):
         first = good_frames(whole.replace(first_bad_frame=jnp.int32(count)))
         assert first.num_frames == count
-        programs = _compile.cache_info().misses
+        programs = _program.cache_info().misses
         joined = simulate(None, scene, config=SOLVER, done=first).trajectory
-        assert _compile.cache_info().misses == programs, "it is the same program"
+        assert _program.cache_info().misses == programs, "it is the same program"
         for (path, ours), theirs in zip(
             jax.tree_util.tree_leaves_with_path(joined), jax.tree.leaves(whole), strict=True
         ):
@@ -210,15 +211,16 @@ def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
 def compiled_early(pace):
     """Simulate by a program that was compiled while the scene was prepared; return the trajectory."""
     config = SimConfig(iterations=10)  # of no other test, whose programs are kept
-    before = _compile.cache_info().misses
+    prepare_scene(square(), drifting_ball(14))  # its start is a program too
+    before = _program.cache_info().misses
     scene = prepare_scene(
         square(),
         drifting_ball(14),
         on_shapes=lambda shapes: begin_compiling(None, shapes, config, is_paced=pace is not None),
     )
-    assert _compile.cache_info().misses == before + 1
+    assert _program.cache_info().misses == before + 1
     trajectory = simulate(None, scene, config=config, pace=pace).trajectory
-    assert _compile.cache_info().misses == before + 1, "another program runs"
+    assert _program.cache_info().misses == before + 1, "another program runs"
     return trajectory
 
 
@@ -243,7 +245,7 @@ def test_a_pace_sets_the_iterations_of_the_next_chunk():
 def test_tolerance_stops_early_and_is_kept(scene):
     loose = simulate(None, scene, config=SimConfig(iterations=300, tolerance=0.01)).trajectory
     assert int(loose.iterations[1:].max()) < 150
-    gap = measure_gap(None, loose, scene, None, GapOptions(iterations=()))
+    gap = measure_gap(None, loose, scene, GapOptions(iterations=()))
     assert float(gap.share(gap.reached).max()) <= 0.01
 
 
@@ -265,13 +267,13 @@ def slow_first_program(monkeypatch, seconds):
     """Make every run of the first program slower by `seconds`; return a list of waits for programs [s]."""
     waits = []
 
-    def find(*arguments):
+    def find(*arguments, **static):
         began = time.perf_counter()
-        program = find_program(*arguments)
+        program = find_program(*arguments, **static).wait()
         waits.append(time.perf_counter() - began)
-        if len(waits) > 1:
-            return program
-        return lambda *values: (time.sleep(seconds), program(*values))[1]
+        if len(waits) == 1:
+            return SimpleNamespace(wait=lambda: lambda *values: (time.sleep(seconds), program(*values))[1])
+        return program
 
     monkeypatch.setattr("eslr_jax.simulation.simulate.find_program", find)
     return waits

@@ -248,7 +248,7 @@ def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simu
     """Compile and simulate with progress; Ctrl-C ends it after the frames in work."""
     import jax
 
-    from eslr_jax.pipeline.report.metrics import measure_frames
+    from eslr_jax.pipeline.report.metrics import measures_program
     from eslr_jax.simulation.plan import first_frames
     from eslr_jax.simulation.simulate import simulate
 
@@ -264,7 +264,7 @@ def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simu
         # The measures of the frames that are kept are compiled while a thread compiles their rollout.
         num_frames, start = setting.actor.poses.positions.shape[0], scene.initial_state.position
         positions = jax.ShapeDtypeStruct((num_frames, *start.shape), start.dtype)
-        measure_frames.lower(positions, first_frames(scene, num_frames)).compile()
+        measures_program(positions, first_frames(scene, num_frames)).wait()
         waited = time.perf_counter() - began
         simulation = simulate(
             method.params,

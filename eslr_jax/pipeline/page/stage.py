@@ -15,7 +15,7 @@ from eslr_jax.contact.self_contact import default_rows
 from eslr_jax.numerics import Vector3
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.program import begin_program, find_program
+from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
 from eslr_jax.terms import Air, Collision, Elements, Repulsion, Term, scene_terms
@@ -87,7 +87,7 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
         return stage.constant, scene.initial_state, frame, jnp.int32(0), jnp.float32(0.0)
 
     def begin(scene: Scene) -> None:
-        begin_program(_step, _CONFIG, jax.eval_shape(first_step, scene))
+        find_program(_step, jax.eval_shape(first_step, scene), config=_CONFIG).begin()
 
     scene = prepare_scene(garment, poses, material=material, terms=terms, integrator="bdf2", on_shapes=begin)
     return _staged(scene, material)
@@ -128,7 +128,7 @@ def advance(
     row = min(now, then)
     frame = jax.tree.map(lambda leaf: leaf[row], inputs)
     arguments = (stage.constant, state, frame, jnp.int32(iterations), jnp.float32(tolerance))
-    return find_program(_step, _CONFIG, arguments)(*arguments)
+    return find_program(_step, arguments, config=_CONFIG).wait()(*arguments)
 
 
 def _step(

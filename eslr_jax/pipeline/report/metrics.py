@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
+from eslr_jax.simulation.program import Program, find_program
 from eslr_jax.terms.stretch import principal_stretches
-from eslr_jax.types import Garment, Scene
+from eslr_jax.types import Garment, Obstacle, Scene
 
 
 class FrameMeasures(NamedTuple):
@@ -23,26 +24,44 @@ class FrameMeasures(NamedTuple):
     speed: Float[Array, " frames"]  # root mean square vertex speed [m/s]
 
 
-@jax.jit
 def measure_frames(positions: Float[Array, "frames vertices 3"], scene: Scene) -> FrameMeasures:
     """Measure every simulated frame of a trajectory of a scene, given positions [m]; frame 0 is the start."""
-    garment = scene.garment
+    measured = jax.tree.map(jnp.asarray, _measured(positions, scene))
+    return measures_program(positions, scene).wait()(*measured)
+
+
+def measures_program(positions: Float[Array, "frames vertices 3"], scene: Scene) -> Program:
+    """Return the program of `measure_frames`; arrays may be shapes alone."""
+    return find_program(_measure, _measured(positions, scene))
+
+
+def _measured(positions: Any, scene: Scene) -> tuple:
+    """Return what measures depend on, which is not what the scene models."""
+    return positions, scene.garment, scene.timestep, scene.body
+
+
+def _measure(
+    positions: Float[Array, "frames vertices 3"],
+    garment: Garment,
+    timestep: Float[Array, ""],
+    body: Obstacle | None,
+) -> FrameMeasures:
     is_real = garment.rest_areas > 0
     count = jnp.sum(is_real, dtype=jnp.int32)
 
     def measure(frame):
-        position, moved_to, body = frame
+        position, moved_to, moved_body = frame
         stretch = jnp.sort(jnp.where(is_real, principal_stretches(moved_to, garment)[0], jnp.inf))
         distances = None
-        if scene.body is not None:
-            contacts = find_contacts(moved_to, body, body, scene.body.surface, garment.vertex_blocks)
+        if body is not None:
+            contacts = find_contacts(moved_to, moved_body, moved_body, body.surface, garment.vertex_blocks)
             distances = jnp.where(garment.vertex_mask, contacts.distances, jnp.inf)
-        moved = jnp.where(garment.vertex_mask[:, None], (moved_to - position) / scene.timestep, 0.0)
+        moved = jnp.where(garment.vertex_mask[:, None], (moved_to - position) / timestep, 0.0)
         speed = jnp.sqrt(jnp.sum(moved * moved) / jnp.sum(garment.vertex_mask, dtype=moved.dtype))
         return FrameMeasures(stretch[count - 1], stretch[(99 * (count - 1)) // 100], distances, speed)
 
-    body = None if scene.body is None else scene.body.positions[1:]
-    return jax.lax.map(measure, (positions[:-1], positions[1:], body))
+    bodies = None if body is None else body.positions[1:]
+    return jax.lax.map(measure, (positions[:-1], positions[1:], bodies))
 
 
 def extremes(measures: FrameMeasures, is_real: np.ndarray) -> dict[str, float]:
