@@ -177,7 +177,8 @@ def _build(
     given = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
     program = find_program(build_scene, given, **stepping)
     on_shapes(program.results)
-    return program.wait()(*given)
+    # Constants stay as they came: to `jax.jit` a number of Python is of another type than an array.
+    return program.wait()(*given).replace(material=given[2], terms=given[3])
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:

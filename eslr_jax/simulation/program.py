@@ -47,8 +47,9 @@ class Program:
     def wait(self) -> Program:
         """Return it when it is compiled."""
         if self._compiled is None:
-            self._compiled = Future()
-            self._compiled.set_result(self._lowered.compile())
+            compiled: Future[jax.stages.Compiled] = Future()
+            compiled.set_result(self._lowered.compile())  # it may be interrupted
+            self._compiled = compiled
         self._compiled.result()
         return self
 
