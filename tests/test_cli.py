@@ -163,6 +163,23 @@ def test_assets_lists_every_kind():
     assert {"body", "garment", "motion", "fabric"} <= kinds
 
 
+def test_what_runs_keep_is_shown_and_removed(tmp_path, monkeypatch):
+    from eslr_jax.pipeline.assets.cache import user_cache
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    programs = user_cache() / "compiled" / "traced"
+    programs.mkdir(parents=True)
+    (programs / "one").write_bytes(bytes(2_000_000))
+    (user_cache() / "calibration.json").write_text("{}")
+    shown = json.loads(eslr_here("cache", "--json").stdout)
+    assert (shown["compiled"]["files"], shown["compiled"]["mb"], shown["garments"]["files"]) == (1, 2.0, 0)
+    cleared = eslr_here("cache", "--clear")
+    assert "compiled: 1 files, 2.0 MB" in cleared.stdout
+    assert not programs.exists()
+    assert (user_cache() / "calibration.json").exists()  # a measurement of this machine stays
+    assert eslr_here("cache", "--clear").returncode == 0  # nothing is left
+
+
 def test_a_file_that_differs_from_its_checksum_is_told(monkeypatch):
     from eslr_jax.pipeline.assets import catalog
 

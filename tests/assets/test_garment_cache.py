@@ -1,6 +1,7 @@
 """Garments of a user through the front door: fitted once, kept by content, safe with two processes."""
 
 import dataclasses
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +14,13 @@ from flax import struct
 from garment_files import bundled, scanned_tshirt
 
 from eslr_jax.pipeline.assets import cache, garments, load_garment, load_garment_file
-from eslr_jax.pipeline.assets.cache import cache_folder, cached_arrays, cached_struct, content_key
+from eslr_jax.pipeline.assets.cache import (
+    cache_folder,
+    cached_arrays,
+    cached_struct,
+    content_key,
+    trim_folder,
+)
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.types import Garment
@@ -185,3 +192,14 @@ def test_a_doubtful_fit_is_told_with_every_load(empty_cache, tmp_path, body, mon
     monkeypatch.setattr(garments, "load_garment_file", lambda *_, **__: fitted)
     with pytest.warns(UserWarning, match="tank.npz: the place is doubtful"):
         load_garment(tmp_path / "tank.npz", body=body)
+
+
+def test_the_oldest_programs_go_where_they_take_too_much(tmp_path):
+    for age, name in enumerate(["new", "old", "older"]):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    trim_folder(tmp_path, most=300)
+    assert len(list(tmp_path.iterdir())) == 3
+    trim_folder(tmp_path, most=250)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "old"]
+    trim_folder(tmp_path / "missing", most=0)

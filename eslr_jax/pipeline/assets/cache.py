@@ -24,6 +24,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.files.npz import read_arrays, write_arrays
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
+MAX_COMPILED = 1_000_000_000  # bytes of compiled programs; a scene takes about 3 MB
 # A change in these makes every entry stale.
 _CODE = (
     "mesh",
@@ -51,6 +52,34 @@ def user_cache() -> Path:
 def cache_folder() -> Path:
     """Return the folder for cached garments, which may not exist yet."""
     return user_cache() / "garments"
+
+
+def compiled_folder() -> Path:
+    """Return the folder for what commands compile, which may not exist yet."""
+    return user_cache() / "compiled"
+
+
+def files_of(folder: Path) -> list[tuple[float, int, Path]]:
+    """Return all files below a folder by age, the oldest first: time of the last change [s], bytes, path."""
+    found = []
+    for file in folder.rglob("*"):
+        with contextlib.suppress(OSError):  # just removed by another process
+            status = file.stat()
+            if file.is_file():
+                found.append((status.st_mtime, status.st_size, file))
+    return sorted(found)
+
+
+def trim_folder(folder: Path, most: int = MAX_COMPILED) -> None:
+    """Remove the oldest files of a folder until the others take so many bytes at most."""
+    files = files_of(folder)
+    excess = sum(size for _, size, _ in files) - most
+    for _, size, file in files:
+        if excess <= 0:
+            return
+        with contextlib.suppress(OSError):
+            file.unlink()
+        excess -= size
 
 
 @cache

@@ -1,9 +1,10 @@
-"""`eslr assets` and `eslr info`: the bundled files, and what a network or a scene consists of."""
+"""`eslr assets`, `eslr info` and `eslr cache`: bundled files, what a network or a scene is, what runs keep."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any, Literal
 
@@ -227,3 +228,31 @@ class Info:
         print("cost on this device")
         for name, cost in costs.items():
             print(f"  {name}: {cost:.2f} ms")
+
+
+@app.command(name="cache")
+@dataclasses.dataclass(frozen=True)
+class Cache:
+    """Show what runs keep for the next ones: garments that were prepared, programs that were compiled."""
+
+    # Remove it; the next run prepares and compiles anew.
+    clear: bool = False
+    # Print as JSON.
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Print folders with their sizes, as they are or were."""
+        from eslr_jax.pipeline.assets.cache import cache_folder, compiled_folder, files_of
+
+        kept = {}
+        for folder in (cache_folder(), compiled_folder()):
+            sizes = [size for _, size, _ in files_of(folder)]
+            kept[folder.name] = {"folder": str(folder), "files": len(sizes), "mb": round(sum(sizes) / 1e6, 1)}
+            if self.clear:
+                shutil.rmtree(folder, ignore_errors=True)
+        if self.json:
+            print(json.dumps({**kept, "removed": self.clear}, indent=2))
+            return
+        for name, size in kept.items():
+            done = ", removed" * self.clear
+            print(f"{name}: {size['files']} files, {size['mb']} MB in {size['folder']}{done}")

@@ -81,11 +81,12 @@ def use_compile_cache() -> None:
     if jax.config.jax_compilation_cache_dir is not None:
         return
 
-    from eslr_jax.pipeline.assets.cache import user_cache
+    from eslr_jax.pipeline.assets.cache import compiled_folder, trim_folder
 
-    cache = user_cache() / "compiled"
+    cache = compiled_folder()
     with contextlib.suppress(OSError):
         cache.mkdir(parents=True, exist_ok=True)
+        trim_folder(cache)
         jax.config.update("jax_compilation_cache_dir", str(cache))
         # The sixty small programs of a start take a second together.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
