@@ -87,12 +87,12 @@ def _program(function: Callable, structure: Any, shapes: tuple, static: tuple, s
         return jax.tree.leaves(results)
 
     folder = jax.config.jax_compilation_cache_dir
-    if folder is None or not all(map(_is_known, (function, structure, static))):
+    # JAX also takes the address of a bucket.
+    if folder is None or "://" in folder or not all(map(_is_known, (function, structure, static))):
         lowered = jax.jit(flat).lower(*described)
         return Program(lowered, jax.tree.unflatten(seen[-1], lowered.out_info))
-    key = repr(
-        (function.__qualname__, structure, shapes, static, settings, jax.__version__, jax.default_backend())
-    )
+    version = settings, jax.__version__, jax.default_backend()
+    key = repr((function.__module__, function.__qualname__, structure, shapes, static, version))
     name = hashlib.sha256(_source() + key.encode()).hexdigest()
     path = Path(folder) / "traced" / f"{name}.pickle"
     with contextlib.suppress(Exception):  # missing or damaged: it is traced again

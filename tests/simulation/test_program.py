@@ -76,10 +76,18 @@ def test_a_folder_that_cannot_be_written_costs_time_alone(folder):
     assert find_again()
 
 
-def test_without_a_folder_nothing_is_kept(folder):
-    jax.config.update("jax_compilation_cache_dir", None)
+@pytest.mark.parametrize("setting", [None, "gs://bucket/programs"])
+def test_without_a_folder_of_this_machine_nothing_is_kept(folder, setting, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    jax.config.update("jax_compilation_cache_dir", setting)
     assert float(find_program(masked_sum, VALUES).wait()(*VALUES)) == 9.0
-    assert not folder.exists()
+    assert not list(folder.parent.iterdir())
+
+
+def test_functions_of_one_name_are_told_apart(folder, monkeypatch):
+    find_again()
+    monkeypatch.setattr(masked_sum, "__module__", "eslr_jax.another")
+    assert find_again()
 
 
 @pytest.mark.parametrize(
