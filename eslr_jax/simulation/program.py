@@ -12,15 +12,15 @@ import os
 import pickle
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache, lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax import export
 
-from eslr_jax.errors import AssetError
 from eslr_jax.files.atomic import atomic_write
+from eslr_jax.files.kept import source_hash, write_kept
 
 _compiler = ThreadPoolExecutor(1)
 # Programs that are kept in memory. One with self-contact takes 2,700 of the 65,530 memory maps that Linux gives a
@@ -93,7 +93,7 @@ def _program(function: Callable, structure: Any, shapes: tuple, static: tuple, s
         return Program(lowered, jax.tree.unflatten(seen[-1], lowered.out_info))
     version = settings, jax.__version__, jax.default_backend()
     key = repr((function.__module__, function.__qualname__, structure, shapes, static, version))
-    name = hashlib.sha256(_source() + key.encode()).hexdigest()
+    name = hashlib.sha256(source_hash() + key.encode()).hexdigest()
     path = Path(folder) / "traced" / f"{name}.pickle"
     with contextlib.suppress(Exception):  # missing or damaged: it is traced again
         found, module = pickle.loads(path.read_bytes())  # of the folder from which JAX loads machine code
@@ -102,20 +102,15 @@ def _program(function: Callable, structure: Any, shapes: tuple, static: tuple, s
         seen.append(found)
     if not seen:
         exported = export.export(jax.jit(flat))(*described)
-        _keep(path, pickle.dumps((seen[-1], exported.serialize())))
+        content = pickle.dumps((seen[-1], exported.serialize()))
+        write_kept(path, partial(_write, content), _KEPT_TRACES)
     shapes_out = [jax.ShapeDtypeStruct(out.shape, out.dtype) for out in exported.out_avals]
     return Program(jax.jit(exported.call).lower(*described), jax.tree.unflatten(seen[-1], shapes_out))
 
 
-def _keep(path: Path, content: bytes) -> None:
-    """Write a file, and remove the oldest ones of its folder; a folder that can't be written costs time alone."""
-    with contextlib.suppress(AssetError, OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(content)
-        entries = sorted(path.parent.glob("*.pickle"), key=lambda entry: entry.stat().st_mtime)
-        for oldest in entries[:-_KEPT_TRACES]:
-            oldest.unlink(missing_ok=True)
+def _write(content: bytes, path: Path) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _is_known(part: Any) -> bool:
@@ -129,12 +124,3 @@ def _is_known(part: Any) -> bool:
         return all(map(_is_known, part.items()))
     owner = part.__module__ if isinstance(part, type) or callable(part) else type(part).__module__
     return owner.split(".")[0] in ("builtins", __name__.split(".")[0])
-
-
-@cache
-def _source() -> bytes:
-    """Return a hash of the package's source."""
-    digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.digest()

@@ -59,7 +59,7 @@ def test_a_damaged_file_is_traced_again(folder, content):
 
 def test_changed_source_is_traced_again(folder, monkeypatch):
     find_again()
-    monkeypatch.setattr(program, "_source", lambda: b"another version")
+    monkeypatch.setattr(program, "source_hash", lambda: b"another version")
     assert find_again()
 
 

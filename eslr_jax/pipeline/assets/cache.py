@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import os
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +20,7 @@ import numpy as np
 import platformdirs
 
 from eslr_jax.errors import AssetError
+from eslr_jax.files.kept import source_hash, write_kept
 from eslr_jax.files.npz import read_arrays, write_arrays
 
 MAX_ENTRIES = 200  # a 4k garment takes 2 MB; the entries that were not used for longest go first
@@ -82,21 +82,9 @@ def trim_folder(folder: Path, most: int = MAX_COMPILED) -> None:
         excess -= size
 
 
-@cache
-def _code_hash() -> bytes:
-    """Return a hash of the source files in `_CODE`."""
-    package = Path(__file__).resolve().parents[2]
-    digest = hashlib.sha256()
-    for name in _CODE:
-        path = package / name
-        for file in sorted(path.glob("*.py")) if path.is_dir() else [path]:
-            digest.update(file.read_bytes())
-    return digest.digest()
-
-
 def content_key(*parts: Any) -> str:
     """Return a hash of arrays, of bytes, and of the `repr` of everything else; a path counts as its name."""
-    digest = hashlib.sha256(_code_hash())
+    digest = hashlib.sha256(source_hash(*_CODE))
     for part in parts:
         if isinstance(part, bytes):
             digest.update(b"b" + len(part).to_bytes(8, "little") + part)
@@ -117,12 +105,7 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
             os.utime(path)
             return arrays
     arrays = make()
-    with contextlib.suppress(AssetError, OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_arrays(path, arrays)
-        entries = sorted(path.parent.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
-        for oldest in entries[:-MAX_ENTRIES]:
-            oldest.unlink(missing_ok=True)
+    write_kept(path, lambda path: write_arrays(path, arrays), MAX_ENTRIES)
     return arrays
 
 
