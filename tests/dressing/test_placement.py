@@ -45,6 +45,15 @@ def test_garment_in_the_bodys_frame_stays_there_with_confidence(postures):
     assert placement.warnings == ()
 
 
+def test_trousers_that_are_partly_inside_are_doubted_though_nothing_fits_better(postures):
+    """Their origin is another body's pelvis, a hand above this one's, and their legs are close together."""
+    positions, faces = trousers()
+    narrow = (positions + standing(postures)) * [0.7, 1.0, 0.9] - [0.0, 0.14, 0.0]
+    placement = find_placement(narrow, faces, postures)
+    assert placement.confidence < DOUBTFUL
+    assert "% of it is more than 1 cm inside the body" in placement.warnings[0]
+
+
 def test_a_file_in_the_axes_of_a_body_that_faces_backwards_is_left_as_it_is(body):
     turn = np.diag([-1.0, 1.0, -1.0])  # as characters in VRM 0 stand
     turned = turn_about(body, turn)

@@ -59,7 +59,7 @@ def test_kept_place_is_not_refused(tmp_path, fit_report, shape, suffix):
     trimesh.Trimesh(*shape(), process=False).export(path)
     report = fit_report(path, *GIVEN)
     assert report["placement"]["moved_m"] == pytest.approx([0.0, -0.8184, 0.0], abs=1e-4)
-    assert report["placement"]["confidence"] == 1.0 or report["warnings"]
+    assert report["placement"]["confidence"] > 0.9 or report["warnings"]
     assert (report["pinned"] > 0) == (shape is cape)  # which would slip off
 
 

@@ -38,6 +38,7 @@ _LIMBS_INSIDE = 0.06  # share of points deep inside the body above which it is m
 _RIVAL = 0.05  # [m] mean distance from which two placements are different
 _COST_SPREAD = 0.1  # difference of costs that makes the better one 2.7 times as likely
 DOUBTFUL = 0.9  # confidence below which a person should look
+_CLOSE = _COST_SPREAD * np.log(DOUBTFUL / (1.0 - DOUBTFUL))  # a rival whose cost is nearer makes it so
 _SCALES = np.arange(0.88, 1.121, 0.01)  # of the unit, tried to see whether it is another
 _SCALE_TOLERANCE = 0.02  # deviation of the best scale from which it is told
 _LARGER, _SMALLER = 0.15, 0.35  # share of the cost that it must save; a roomy garment fits better if smaller
@@ -96,10 +97,10 @@ def find_placement(
 
     Every combination of what was not given is tried on a sample of points; `scoring` measures it. What is usual
     costs less: feet at the origin, Y up and facing Z, Z up and facing -Y, or the body's own axes. The confidence
-    compares the best placement with the next best one that differs from it. Postures are those that the garment
-    may have been modelled on, the rest pose first. Options tell what is known of unit, axes and place. A file
-    that `is_metric` has metres and Y up, unless others are given. The body faces +Z or the axis nearest to
-    `facing`.
+    compares the best placement with the next best one that differs from it, and is less by the share of points
+    deep inside the body. Postures are those that the garment may have been modelled on, the rest pose first.
+    Options tell what is known of unit, axes and place. A file that `is_metric` has metres and Y up, unless others
+    are given. The body faces +Z or the axis nearest to `facing`.
 
     Raises:
         MeshError: The size is no garment's in any unit, the axes contradict each other, or nothing fits. Where
@@ -129,7 +130,8 @@ def find_placement(
     if not keep_place and _is_poor(best, sample, postures):
         best, rival = _choose([*known, *_slide(sample, orientations, postures)], sample, postures)
     is_given = keep_place and "auto" not in (units, up, front)
-    near = np.abs(postures[best.posture].heights(best.apply(sample.points))) < _NEAR
+    heights = postures[best.posture].heights(best.apply(sample.points))
+    near, deep = np.abs(heights) < _NEAR, float(np.mean(heights < -DEEP))
     if near.mean() < _MIN_NEAR and not is_given:
         prescribed = is_metric and not {"--units", "--up"}.isdisjoint(missing)
         rule = " (its format prescribes metres and y up, unless --units and --up say otherwise)" * prescribed
@@ -138,12 +140,16 @@ def find_placement(
             f"{' and '.join(missing)}, or model it on the body of eslr assets --export body.obj"
         )
     margin = np.inf if rival is None else rival.cost - best.cost
-    confidence = float(1.0 / (1.0 + np.exp(-margin / _COST_SPREAD)))
+    # A rival that is worse still does not make a garment right of which a part is inside the body.
+    confidence = float((1.0 - deep) / (1.0 + np.exp(-margin / _COST_SPREAD)))
     warnings = []
-    if confidence < DOUBTFUL and rival is not None:
+    if confidence < DOUBTFUL:
+        doubts = [f"{deep:.0%} of it is more than 1 cm inside the body"] * (1.0 - deep < DOUBTFUL)
+        if rival is not None and margin < _CLOSE:
+            doubts.append(f"{rival.describe()} fits almost as well")
         warnings.append(
-            f"the place is doubtful (confidence {confidence:.0%}): {rival.describe()} fits almost as well; look "
-            "at the picture, and give eslr fit --units, --up, --front or --keep-place"
+            f"the place is doubtful (confidence {confidence:.0%}): {' and '.join(doubts)}; look at the picture, "
+            "and give eslr fit --units, --up, --front or --keep-place, or the body that it was made for"
         )
     if near.mean() < _MIN_NEAR:
         warnings.append("the garment is not on the body, and stays there as asked; look at the picture")
