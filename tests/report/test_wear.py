@@ -9,6 +9,7 @@ from cloth import make_sheet
 from draped_ball import RADIUS, ball, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 
+from eslr_jax import load_garment, load_motion, pose_body
 from eslr_jax.config import SimConfig
 from eslr_jax.pipeline.report.referee import judge
 from eslr_jax.pipeline.report.report import describe_report, describe_start, start_crossing, trajectory_report
@@ -141,6 +142,24 @@ def test_cloth_that_slides_or_falls_is_told(worn):
     assert report["below_feet_at"] == 1
     assert report["coverage"] == 0.0
     assert any("fell off: in frame 1" in text for text in describe_report(report).warnings)
+
+
+def test_a_bodice_that_slipped_is_told_though_the_skirt_is_in_its_place(worn, body):
+    """The upper quarter of a dress hangs up to 31 cm lower: its centre has moved by 2 cm."""
+    garment, poses = load_garment("dress"), pose_body(body, load_motion(), num_frames=3)
+    carried = np.asarray(skin_garment(garment, poses.joint_transforms))
+    height = np.asarray(garment.rest_positions)[:, 1]
+    slipped = carried.copy()
+    share = (height - height.min()) / np.ptp(height)
+    slipped[2, :, 1] -= 0.31 * np.clip((share - 0.75) / 0.25, 0.0, 1.0)
+    report = wear_report(slipped, garment, carried, poses)
+    assert report["slide_m"] < 0.05
+    assert 0.2 < report["edge_slide_m"] < 0.31
+    texts = describe_report(report_of(worn, worn[4]) | report).warnings
+    assert any(
+        re.search(r"its edge 1\.\d\d m above the soles is 0\.2\d m from its place, frame 2", t) for t in texts
+    )
+    assert wear_report(carried, garment, carried, poses)["edge_slide_m"] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ _PENETRATION_MM = 5.0
 _THROUGH_MM = 1.0  # of skin in front of cloth
 _UNTANGLED_MM = 20.0  # behind other cloth, up to which self-contact pulls it back: `contact.crossing`
 _SLID_M = 0.25
+_EDGE_SLID_M = 0.2  # of an edge that lies on the skin, as at neck, waist and wrists; sleeves ride up by less
 _LEFT = 0.75  # of the covered skin that cloth should still be near
 
 
@@ -290,6 +291,12 @@ def describe_report(report: dict[str, Any]) -> Words:
     elif slide > _SLID_M:
         place = _where(report["worst_slide"])
         warnings.append(f"the garment slid or fell: its centre is {slide:.2f} m from its place, {place}")
+    elif report["edge_slide_m"] > _EDGE_SLID_M:
+        worst = report["worst_edge_slide"]
+        warnings.append(
+            f"a part of the garment slid: its edge {worst['height_m']:.2f} m above the soles is "
+            f"{report['edge_slide_m']:.2f} m from its place, {_where(worst)}"
+        )
     elif coverage is not None and coverage < _LEFT:
         warnings.append(f"the garment left skin that it covered: {100 * (1 - coverage):.0f} % of it")
     else:

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float, Int
 from numpy.typing import NDArray
 
 from eslr_jax.mesh.closest import nearest_places
-from eslr_jax.mesh.topology import is_on_boundary, vertex_normals
+from eslr_jax.mesh.topology import boundary_loops, is_on_boundary, vertex_normals
 from eslr_jax.pipeline.report.report import Parts
 from eslr_jax.types import BodyMotion, Garment
 
@@ -42,7 +42,9 @@ def wear_report(
         Plain values: `coverage`, the least share of covered skin that cloth is still within 10 cm of;
         `skin_through_mm` and `skin_through_share` of the covered skin with `worst_skin_through`, its frame, time,
         body vertex and part; `slide_m`, the farthest that the garment's centre is from its skinned place, with
-        `worst_slide`; `below_feet_at`, the first frame in which all cloth is below the body, or None.
+        `worst_slide`; `edge_slide_m`, likewise of the edge that slid most, such as the neck's or waist's, with
+        `worst_edge_slide`: its frame and time, and its height above the soles at rest [m]. Edges that hang free
+        at rest don't count. `below_feet_at`, the first frame in which all cloth is below the body, or None.
     """
     is_real = np.asarray(garment.vertex_mask)
     cloth, carried = np.asarray(positions)[:, is_real], np.asarray(skinned)[:, is_real]
@@ -59,10 +61,19 @@ def wear_report(
         "worst_slide": {"frame": farthest, "time_s": farthest * timestep},
         "below_feet_at": int(is_below.argmax()) if is_below.any() else None,
     }
-    skin = np.unique(skin_faces[np.asarray(poses.is_obstacle)])
-    hem = is_on_boundary(faces, cloth.shape[1])
     rest = np.asarray(garment.rest_positions)[is_real]
     unposed = np.asarray(poses.rest_positions)
+    result |= {"edge_slide_m": 0.0, "worst_edge_slide": None}
+    for loop in boundary_loops(faces):
+        _, _, apart, _ = nearest_places(rest[loop], unposed, skin_faces, vertex_normals(unposed, skin_faces))
+        away = np.linalg.norm((cloth - carried)[:, loop].mean(axis=1), axis=-1)
+        frame = int(away.argmax())
+        if np.linalg.norm(apart, axis=1).mean() < _COVER and away[frame] > result["edge_slide_m"]:
+            height = float(rest[loop, 1].mean() - unposed[:, 1].min())
+            place = {"frame": frame, "time_s": frame * timestep, "height_m": height}
+            result |= {"edge_slide_m": float(away[frame]), "worst_edge_slide": place}
+    skin = np.unique(skin_faces[np.asarray(poses.is_obstacle)])
+    hem = is_on_boundary(faces, cloth.shape[1])
     side, distance, _ = _sides(unposed[skin], vertex_normals(unposed, skin_faces)[skin], rest, faces, hem)
     covered = skin[(side < 0) & (distance < _COVER)]
     if not len(covered):
