@@ -10,7 +10,7 @@ from garment_shapes import rings
 
 from eslr_jax import prepare_garment
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.mesh.topology import boundary_loops, unique_edges, vertex_components
+from eslr_jax.mesh.topology import boundary_loops, unique_edges, vertex_components, vertex_normals
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.postures import arm_postures
@@ -175,6 +175,29 @@ def test_pieces_whose_seams_were_left_open_are_sewn(body, shirt, gap, components
     if is_sewn:
         assert len(fitted.rest_positions) == len(shirt.rest_positions)
         assert len(fitted.faces) == len(shirt.faces)
+
+
+def test_a_double_sided_mesh_is_one_layer(body, shirt):
+    count = len(shirt.rest_positions)
+    both = np.concatenate([shirt.faces, shirt.faces[:, ::-1] + count])
+    fitted = fit_garment(source(np.tile(shirt.rest_positions, (2, 1)), both), body)
+    np.testing.assert_allclose(fitted.sewn_positions, shirt.rest_positions, atol=1e-9)
+    assert len(fitted.faces) == len(shirt.faces)
+    assert fitted.metadata["fit"]["warnings"] == []
+
+
+def test_a_thick_shell_is_doubted(body, shirt):
+    """A shirt that was exported with 2 mm of thickness: two layers, sewn along their edges."""
+    count = len(shirt.rest_positions)
+    inner = shirt.rest_positions - 0.002 * vertex_normals(shirt.rest_positions, shirt.faces)
+    rims = [np.stack([loop, np.roll(loop, -1)], axis=1) for loop in boundary_loops(shirt.faces)]
+    start, end = np.concatenate(rims).T
+    rim = np.concatenate(
+        [np.stack([start, start + count, end], 1), np.stack([end, start + count, end + count], 1)]
+    )
+    faces = np.concatenate([shirt.faces, shirt.faces[:, ::-1] + count, rim[:, ::-1]])
+    fitted = fit_garment(source(np.concatenate([shirt.rest_positions, inner]), faces), body)
+    assert any("two sides 2.0 mm apart" in text for text in fitted.metadata["fit"]["warnings"])
 
 
 @pytest.mark.parametrize(("components", "parts"), [("keep", 2), ("join", 1), ("largest", 1)])

@@ -22,6 +22,7 @@ from eslr_jax.pipeline.dressing.repair import (
     join_components,
     largest_component,
     shares_along_seams,
+    shell_thickness,
     weld,
 )
 from eslr_jax.pipeline.dressing.report import wearer_entry
@@ -81,9 +82,15 @@ def fit_garment(
         clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
-    clean, joined, unsewn = _join(
+    clean, joined, doubts = _join(
         dataclasses.replace(clean, positions=placement.apply(clean.positions)), options
     )
+    thickness = shell_thickness(clean.positions, clean.faces)
+    if thickness is not None:
+        doubts.append(
+            f"it is a closed shell with two sides {1e3 * thickness:.1f} mm apart, which is stiff as foam; "
+            "export a single layer (thin, without thickness)"
+        )
     # Faces are turned that disagree with neighbours, and parts that face the body.
     turn = consistent_orientation(clean.positions, clean.faces)
     crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
@@ -164,7 +171,7 @@ def fit_garment(
                 "penetration": penetration,
                 "pinned": int(is_pinned.sum()),
                 "pinned_by": pinned_by,
-                "warnings": [*placement.warnings, *unsewn, *lost, *falling],
+                "warnings": [*placement.warnings, *doubts, *lost, *falling],
                 **transfer,
             },
         },

@@ -11,7 +11,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from eslr_jax.mesh.topology import face_areas, half_edges, undirected_edges, vertex_components
+from eslr_jax.mesh.topology import face_areas, half_edges, undirected_edges, vertex_components, vertex_normals
+
+_AROUND = 12  # nearest vertices, one of which is on a shell's other side
+_OPPOSED = 0.5  # cosine between the normals of its two sides
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,13 +32,18 @@ def weld(
 ) -> Cleaned:
     """Join coincident boundary vertices, then drop collapsed faces, repeated faces and loose vertices.
 
-    Only boundary vertices are joined. This closes seams that were split for texture coordinates, and keeps two
-    layers of cloth apart that touch. The tolerance is relative to the bounding box's diagonal.
+    Boundary vertices are joined, and those of faces that coincide whole, as the two sides of a double-sided mesh.
+    This closes seams that were split for texture coordinates, and keeps two layers of cloth apart that touch. The
+    tolerance is relative to the bounding box's diagonal.
     """
     diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    candidates = _boundary_vertices(faces)
-    pairs = KDTree(positions[candidates]).query_pairs(tolerance * diagonal, output_type="ndarray")
-    return merge_vertices(positions, faces, candidates[pairs])
+    pairs = KDTree(positions).query_pairs(tolerance * diagonal, output_type="ndarray")
+    corners = np.sort(_first_of_groups(len(positions), pairs)[faces], axis=1)
+    _, group, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
+    is_joined = np.zeros(len(positions), bool)
+    is_joined[_boundary_vertices(faces)] = True
+    is_joined[faces[counts[group.ravel()] > 1]] = True
+    return merge_vertices(positions, faces, pairs[is_joined[pairs].all(axis=1)])
 
 
 def merge_vertices(
@@ -44,15 +52,39 @@ def merge_vertices(
     pairs: Int[np.ndarray, "pairs 2"],
 ) -> Cleaned:
     """Join the given pairs of vertices; a chain of pairs becomes its first vertex. See `weld`."""
-    num_vertices = len(positions)
-    graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (num_vertices, num_vertices))
-    _, label = connected_components(graph, directed=False)
-    _, first = np.unique(label, return_index=True)  # labels ascend with their first vertex
-    merged = np.asarray(first)[label]
+    merged = _first_of_groups(len(positions), pairs)
     joined = merged[faces]
     kept = np.flatnonzero((joined != joined[:, [1, 2, 0]]).all(axis=1))
     _, earliest = np.unique(np.sort(joined[kept], axis=1), axis=0, return_index=True)
     return _select_faces(positions, joined, kept[np.sort(earliest)], merged)
+
+
+def _first_of_groups(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Return the first vertex of the chain of pairs that each of `count` vertices is in, shape [count]."""
+    graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (count, count))
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)  # labels ascend with their first vertex
+    return np.asarray(first)[label]
+
+
+def shell_thickness(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> float | None:
+    """Return how far the two sides of a closed thin shell are apart in the median; None of any other mesh.
+
+    The unit is that of the positions. A vertex of a shell has one of opposed normal among its nearest, nearer
+    than the mean edge.
+    """
+    if len(_boundary_vertices(faces)):
+        return None
+    normals = vertex_normals(positions, faces)
+    distance, nearest = KDTree(positions).query(positions, k=min(_AROUND, len(positions)))
+    is_opposed = np.einsum("vkx,vx->vk", normals[nearest], normals) < -_OPPOSED
+    across = np.where(is_opposed, distance, np.inf).min(axis=1)
+    edges = undirected_edges(faces)[0]
+    usual = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1).mean()
+    thickness = float(np.median(across))
+    return thickness if thickness < usual else None
 
 
 def join_components(
