@@ -54,6 +54,16 @@ def test_trousers_that_are_partly_inside_are_doubted_though_nothing_fits_better(
     assert "% of it is more than 1 cm inside the body" in placement.warnings[0]
 
 
+def test_sleeves_that_limbs_pierce_are_told_to_name_their_body(postures):
+    garment = bundled("longsleeve_1k")
+    x, y, z = garment.rest_positions.T
+    raised = np.stack([x, y + 1.2 * np.maximum(np.abs(x) - 0.2, 0.0), z], axis=1)
+    placement = find_placement(raised, garment.faces, postures[:1], KEPT)
+    assert any(
+        "limbs of the body pierce the cloth" in text and "--made-for" in text for text in placement.warnings
+    )
+
+
 def test_a_file_in_the_axes_of_a_body_that_faces_backwards_is_left_as_it_is(body):
     turn = np.diag([-1.0, 1.0, -1.0])  # as characters in VRM 0 stand
     turned = turn_about(body, turn)

@@ -1,6 +1,7 @@
 """Bodies in odd units, and bodies of other shapes."""
 
 import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -25,7 +26,10 @@ from eslr_jax.pose.skeleton import RiggedMesh
     [(170.0, 0.01), (200.0, 0.01), (1700.0, 0.001), (71.0, 0.0254), (5.6, 0.3048), (0.017, 100.0)],
 )
 def test_a_body_in_odd_units_is_made_a_person_with_a_line_that_says_so(extent, scale):
-    with pytest.warns(UnitsWarning, match="name its unit if not"):
+    person = f"{1.7 / extent:.3g} m per unit"
+    with pytest.warns(
+        UnitsWarning, match=rf"name its unit if not \(a person of 1.7 m has {re.escape(person)}\)"
+    ):
         assert metres_per_unit("body", extent) == pytest.approx(scale)
 
 

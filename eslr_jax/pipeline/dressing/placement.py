@@ -151,6 +151,12 @@ def find_placement(
             f"the place is doubtful (confidence {confidence:.0%}): {' and '.join(doubts)}; look at the picture, "
             "and give eslr fit --units, --up, --front or --keep-place, or the body that it was made for"
         )
+    pierced = count_pierced(sample, best.bones(postures[best.posture]), postures[best.posture].is_limb)
+    if pierced:
+        warnings.append(
+            f"{pierced} limbs of the body pierce the cloth: it was made for another body or pose; give eslr fit "
+            "--made-for that body (for SMPL's garments a SMPL model)"
+        )
     if near.mean() < _MIN_NEAR:
         warnings.append("the garment is not on the body, and stays there as asked; look at the picture")
     if units == "auto":

@@ -69,7 +69,10 @@ def metres_per_unit(name: str, extent: float, units: str | None = None) -> float
         scale = _HUMAN / extent
         text = f"scaled to {_HUMAN} m, since no unit makes it a person"
     warnings.warn(
-        f"{name} is {extent:.4g} units large: {text}; name its unit if not", UnitsWarning, stacklevel=3
+        f"{name} is {extent:.4g} units large: {text}; name its unit if not (a person of {_HUMAN} m has "
+        f"{_HUMAN / extent:.3g} m per unit)",
+        UnitsWarning,
+        stacklevel=3,
     )
     return scale
 
