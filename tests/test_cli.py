@@ -157,6 +157,19 @@ def test_a_page_is_opened_where_a_person_sits(tmp_path):
     assert opened.read_text() == "http://localhost:9\n"
 
 
+def test_commands_silence_the_log_of_xla_before_jax_reads_the_setting():
+    """Its errors become exceptions; what is left asks a user whose compilation is slow to file a bug."""
+    code = (
+        "import os, sys; from eslr_jax.pipeline import cli; sys.argv = ['eslr', 'assets', '--kind', 'fabric']; "
+        "assert 'jax' not in sys.modules; cli.main(); print(os.environ['TF_CPP_MIN_LOG_LEVEL'])"
+    )
+    settings = {key: value for key, value in os.environ.items() if key != "TF_CPP_MIN_LOG_LEVEL"}
+    found = subprocess.run(
+        [sys.executable, "-c", code], env=settings, check=True, capture_output=True, text=True
+    )
+    assert found.stdout.split()[-1] == "3"
+
+
 def test_assets_lists_every_kind():
     result = eslr_here("assets", "--json", "--verify")
     kinds = {asset["kind"] for asset in json.loads(result.stdout)}

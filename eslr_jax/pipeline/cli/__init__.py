@@ -32,6 +32,8 @@ def main() -> None:
     """Run the command line."""
     # Tracing makes many small objects that stay: looking at them after every 700 takes an eighth of its time.
     gc.set_threshold(50_000)
+    # XLA asks whoever compiles for two minutes to file a bug. Its errors become exceptions; its log says no more.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # JAX, which reads it, is not imported yet
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("always", category=UserWarning, module="eslr_jax")
     warnings.showwarning = lambda message, category, *_: say(str(message))  # one line on stderr
