@@ -14,7 +14,21 @@ _PUBLIC = {
     "SimConfig": "eslr_jax.config",
     "TrainConfig": "eslr_jax.config",
     "Network": "eslr_jax.networks.network",
-    "EslrError": "eslr_jax.errors",
+    **dict.fromkeys(
+        (
+            "AssetError",
+            "CapacityError",
+            "CheckpointError",
+            "ConfigError",
+            "EslrError",
+            "MeshError",
+            "MissingExtraError",
+            "MotionError",
+            "NonFiniteError",
+            "Status",
+        ),
+        "eslr_jax.errors",
+    ),
     "Material": "eslr_jax.types",
     "Trajectory": "eslr_jax.types",
     "load_body": "eslr_jax.pipeline.assets",
@@ -26,7 +40,9 @@ _PUBLIC = {
     "prepare_garment": "eslr_jax.mesh.prepare",
     "plan_scene": "eslr_jax.simulation.plan",
     "prepare_scene": "eslr_jax.simulation.plan",
+    "prepare_scenes": "eslr_jax.simulation.plan",
     "rollout": "eslr_jax.simulation.rollout",
+    "rollout_scene": "eslr_jax.simulation.rollout",
     "scene_terms": "eslr_jax.terms",
     "score_trajectory": "eslr_jax.pipeline.report.score",
     "simulate": "eslr_jax.simulation.simulate",
@@ -40,7 +56,18 @@ __all__ = ["__version__", *_PUBLIC]
 
 if TYPE_CHECKING:
     from eslr_jax.config import SimConfig, TrainConfig
-    from eslr_jax.errors import EslrError
+    from eslr_jax.errors import (
+        AssetError,
+        CapacityError,
+        CheckpointError,
+        ConfigError,
+        EslrError,
+        MeshError,
+        MissingExtraError,
+        MotionError,
+        NonFiniteError,
+        Status,
+    )
     from eslr_jax.mesh.prepare import prepare_garment
     from eslr_jax.networks.network import Network
     from eslr_jax.pipeline.assets import load_body, load_garment, load_model, load_motion
@@ -49,8 +76,8 @@ if TYPE_CHECKING:
     from eslr_jax.pose.motion import pose_body
     from eslr_jax.simulation.archive import load_scene, save_scene
     from eslr_jax.simulation.batch import simulate_batch
-    from eslr_jax.simulation.plan import plan_scene, prepare_scene
-    from eslr_jax.simulation.rollout import rollout, step
+    from eslr_jax.simulation.plan import plan_scene, prepare_scene, prepare_scenes
+    from eslr_jax.simulation.rollout import rollout, rollout_scene, step
     from eslr_jax.simulation.simulate import simulate
     from eslr_jax.terms import scene_terms
     from eslr_jax.types import Material, Trajectory

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from eslr_jax.mesh.prepare import prepare_garment
-from eslr_jax.pose.motion import Motion, pose_body
+from eslr_jax import pose_body, prepare_garment
+from eslr_jax.pose.motion import Motion
 from eslr_jax.types import Body, BodyMotion, Garment
 
 LIMB_RADII = np.array([0.06, 0.15, 0.06])  # [m]

@@ -48,7 +48,7 @@ def small_poses():
 @pytest.fixture(scope="session")
 def small_config():
     """The solver alone."""
-    from eslr_jax.config import SimConfig
+    from eslr_jax import SimConfig
 
     return SimConfig(iterations=30)
 
@@ -56,8 +56,8 @@ def small_config():
 @pytest.fixture(scope="session")
 def small_scene(small_garment, small_poses):
     """The sleeve on the limb."""
-    from eslr_jax.simulation.plan import prepare_scene
-    from eslr_jax.terms import Ground, scene_terms
+    from eslr_jax import prepare_scene, scene_terms
+    from eslr_jax.terms import Ground
 
     return prepare_scene(small_garment, small_poses, terms=scene_terms(without=(Ground,)))
 
@@ -65,7 +65,7 @@ def small_scene(small_garment, small_poses):
 @pytest.fixture(scope="session")
 def small_trajectory(small_scene, small_config):
     """The scene, simulated by the solver."""
-    from eslr_jax.simulation.rollout import rollout_scene
+    from eslr_jax import rollout_scene
 
     return jax.jit(rollout_scene, static_argnames="config")(None, small_scene, small_config)
 
@@ -82,21 +82,20 @@ def small_problem(small_scene, small_trajectory):
 
 @pytest.fixture(scope="session")
 def body():
-    from eslr_jax.pipeline.assets import load_body
+    from eslr_jax import load_body
 
     return load_body()
 
 
 @pytest.fixture(scope="session")
 def tshirt():
-    from eslr_jax.pipeline.assets import load_garment
+    from eslr_jax import load_garment
 
     return load_garment("tshirt")
 
 
 @pytest.fixture(scope="session")
 def walk(body):
-    from eslr_jax.pipeline.assets import load_motion
-    from eslr_jax.pose.motion import pose_body
+    from eslr_jax import load_motion, pose_body
 
     return pose_body(body, load_motion("cmu_016_32"), num_frames=8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.types import BodyMotion, Garment
 

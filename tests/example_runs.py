@@ -2,13 +2,12 @@
 
 import numpy as np
 
+from eslr_jax import pose_body, prepare_scene, save_scene, scene_terms
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
 from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, write_trajectory
-from eslr_jax.pose.motion import pose_body, still_motion
-from eslr_jax.simulation.archive import save_scene
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.terms import Repulsion, scene_terms
+from eslr_jax.pose.motion import still_motion
+from eslr_jax.terms import Repulsion
 
 LAYERED = scene_terms(Repulsion(where="all"))
 

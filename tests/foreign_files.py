@@ -7,7 +7,7 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.pipeline.assets import load_motion
+from eslr_jax import load_motion
 from eslr_jax.pipeline.assets.catalog import find_asset
 from eslr_jax.pipeline.formats.garment import read_garment_npz
 from eslr_jax.pipeline.formats.obj import obj_text

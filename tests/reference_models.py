@@ -314,9 +314,9 @@ def tube(num_around: int, num_along: int):
 
 def make_scene(num_around: int, num_along: int, *, body: bool = True, pad: bool = False, seed: int = 0):
     """Return a tube, a fabric and random inputs; every tenth vertex is beyond the radius of world edges."""
-    from eslr_jax.mesh.prepare import prepare_garment
+    from eslr_jax import Material, prepare_garment
     from eslr_jax.networks.features import GraphInputs
-    from eslr_jax.types import Contacts, Material
+    from eslr_jax.types import Contacts
 
     positions, faces = tube(num_around, num_along)
     num_real = len(positions)

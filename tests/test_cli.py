@@ -16,9 +16,9 @@ from foreign_files import smpl_model, write_amass, write_bvh
 from garment_files import scanned_tshirt
 from own_term import Push
 
+from eslr_jax import ConfigError, load_body, load_motion
 from eslr_jax.config import from_dict
-from eslr_jax.errors import ConfigError
-from eslr_jax.pipeline.assets import load_body, load_garment_file, load_motion
+from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.cli.console import use_compile_cache
 from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options

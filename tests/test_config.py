@@ -5,8 +5,8 @@ import re
 import pytest
 from commands import eslr_here
 
-from eslr_jax.config import SimConfig, TrainConfig, apply_overrides, from_dict, parse_override
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, SimConfig, TrainConfig
+from eslr_jax.config import apply_overrides, from_dict, parse_override
 from eslr_jax.networks.eslr import Eslr
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.training.recipe import describe_train_config, load_recipe, read_train_config

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from garment_files import bundled
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, pose_body, prepare_scene, prepare_scenes
 from eslr_jax.fabric.materials import COTTON, FABRICS, WOVEN, fabric_material, fabric_names
 from eslr_jax.fabric.validate import validate_material
 from eslr_jax.numerics import gather_corners
 from eslr_jax.pipeline.assets import prepare_stored
 from eslr_jax.pipeline.fabrics import beyond_training, garment_material, parse_fabric
-from eslr_jax.pose.motion import pose_body, still_motion
-from eslr_jax.simulation.plan import prepare_scene, prepare_scenes
+from eslr_jax.pose.motion import still_motion
 from eslr_jax.terms import CLOTH
 from eslr_jax.terms.problem import vertex_masses
 from eslr_jax.terms.stretch import green_strains, stretch_energy, thread_strains

@@ -6,9 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from eslr_jax.config import SimConfig, TrainConfig
+from eslr_jax import SimConfig, TrainConfig, rollout_scene
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.step import init_train_state, make_train_step
 

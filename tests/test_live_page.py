@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from chromium import CHROMIUM, launch
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError
 from eslr_jax.fabric.materials import fabric_material
 from eslr_jax.pipeline.page.live import let_go, open_live, restart, run_live, take_hold
 from eslr_jax.pipeline.page.live_controls import Choice

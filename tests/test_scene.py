@@ -7,20 +7,29 @@ import pytest
 from cloth import make_garment
 from draped_ball import ball, drifting_ball, square
 
-from eslr_jax.config import SimConfig
+from eslr_jax import (
+    ConfigError,
+    MeshError,
+    SimConfig,
+    load_body,
+    load_garment,
+    load_motion,
+    plan_scene,
+    pose_body,
+    prepare_scene,
+    prepare_scenes,
+    rollout_scene,
+    scene_terms,
+)
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.fabric.materials import COTTON, fabric_material
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
 from eslr_jax.pipeline.report.gap import trajectory_states
-from eslr_jax.pose.motion import pose_body
 from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
-from eslr_jax.simulation.plan import first_frames, plan_scene, prepare_scene, prepare_scenes
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.solver.potential import evaluate
-from eslr_jax.terms import CLOTH, Collision, Repulsion, scene_terms
+from eslr_jax.terms import CLOTH, Collision, Repulsion
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.worn import REACH
 

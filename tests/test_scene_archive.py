@@ -10,8 +10,7 @@ import pytest
 from draped_ball import drifting_ball, square
 from own_term import Push
 
-from eslr_jax import load_scene, prepare_scene, save_scene, scene_terms
-from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax import AssetError, ConfigError, load_scene, prepare_scene, save_scene, scene_terms
 from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion
 from eslr_jax.terms.air import blowing
 

@@ -8,13 +8,13 @@ import pytest
 from chromium import CHROMIUM, launch
 from example_runs import write_run
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError, scene_terms
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.pipeline.page import go_to_worst, open_view, play, show
 from eslr_jax.pipeline.report.fields import FIELDS
 from eslr_jax.pipeline.report.run import read_run
-from eslr_jax.terms import Repulsion, scene_terms
+from eslr_jax.terms import Repulsion
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

@@ -6,8 +6,17 @@ import json
 import numpy as np
 import pytest
 
-from eslr_jax import load_body, load_garment, load_model, load_motion, pose_body
-from eslr_jax.errors import AssetError, CheckpointError, ConfigError, MotionError
+from eslr_jax import (
+    AssetError,
+    CheckpointError,
+    ConfigError,
+    MotionError,
+    load_body,
+    load_garment,
+    load_model,
+    load_motion,
+    pose_body,
+)
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.networks.weights import write_network
 from eslr_jax.pipeline.assets import asset_names, load_garment_file, load_splits

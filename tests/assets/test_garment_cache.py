@@ -13,7 +13,8 @@ import pytest
 from flax import struct
 from garment_files import bundled, scanned_tshirt
 
-from eslr_jax.pipeline.assets import cache, garments, load_garment, load_garment_file
+from eslr_jax import load_garment
+from eslr_jax.pipeline.assets import cache, garments, load_garment_file
 from eslr_jax.pipeline.assets.cache import (
     cache_folder,
     cached_arrays,

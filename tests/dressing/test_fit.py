@@ -8,8 +8,7 @@ import trimesh
 from garment_files import TO_Z_UP, bundled, dent, scanned_tshirt, source
 from garment_shapes import rings
 
-from eslr_jax import prepare_garment
-from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax import ConfigError, MeshError, prepare_garment
 from eslr_jax.mesh.topology import boundary_loops, unique_edges, vertex_components, vertex_normals
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions

@@ -7,7 +7,7 @@ import pytest
 from garment_shapes import rings
 from outfits import OUTFITS, count_pairs, load
 
-from eslr_jax.errors import MeshError
+from eslr_jax import MeshError
 from eslr_jax.fabric.materials import fabric_material
 from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.pipeline.assets import prepare_stored

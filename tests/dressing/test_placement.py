@@ -6,7 +6,7 @@ from cloth import stand_at, turn_about
 from garment_files import TO_Z_UP, bundled
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress
 
-from eslr_jax.errors import MeshError
+from eslr_jax import MeshError
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.placement import DOUBTFUL, find_placement
 from eslr_jax.pipeline.dressing.postures import arm_postures, rest_posture

@@ -8,7 +8,7 @@ from cloth import stand_at, turn_about
 from garment_files import TO_Z_UP, bundled, source
 from other_bodies import smpl_female
 
-from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax import ConfigError, MeshError
 from eslr_jax.mesh.topology import face_areas, unique_edges
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.dressing.clearance import body_heights

@@ -6,7 +6,7 @@ from cloth import stand_at
 from garment_files import bundled, source
 from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.pins import WAISTBAND, find_waist

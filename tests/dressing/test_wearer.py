@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from garment_files import bundled
 
-from eslr_jax.errors import AssetError, MeshError
+from eslr_jax import AssetError, MeshError
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.dressing.outfit import combine_garments
 from eslr_jax.pipeline.dressing.transfer import transfer_garment

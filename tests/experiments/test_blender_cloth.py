@@ -8,7 +8,7 @@ from hard_cases import CASES, drop_scene, run_case
 from hard_cases.build import hanging_sheet, make_cloth, make_scene, sheet
 from newton_cloth import prepare_cloth, strip_stiffness
 
-from eslr_jax.errors import EslrError
+from eslr_jax import EslrError
 from eslr_jax.fabric.materials import COTTON
 
 EFFORT = (10, 2)

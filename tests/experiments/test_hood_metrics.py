@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from paper.hood_metrics import hood_metrics
 
+from eslr_jax import prepare_garment
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.mesh.prepare import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.terms.hood import METRIC_PARAMETERS, BodyFrames, HoodProblem, hood_terms

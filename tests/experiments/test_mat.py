@@ -9,9 +9,7 @@ import pytest
 from paper import mat, mat_space
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.config import SimConfig
-from eslr_jax.networks.network import Network
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax import Network, SimConfig, rollout_scene
 from eslr_jax.types import Contacts
 
 

@@ -19,9 +19,8 @@ from newton_cloth import (
     strip_stiffness,
 )
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import Collision
 from eslr_jax.terms.bending import bending_energy
 from eslr_jax.terms.collision import contact_forces

@@ -6,8 +6,7 @@ import pytest
 from hard_cases import drop_scene
 from peers import our_method
 
-from eslr_jax.config import SimConfig
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax import SimConfig, rollout_scene
 
 
 @pytest.mark.slow

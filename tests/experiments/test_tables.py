@@ -24,7 +24,7 @@ from paper.tables import (
     with_totals,
 )
 
-from eslr_jax.errors import NonFiniteError, Status
+from eslr_jax import NonFiniteError, Status
 from eslr_jax.pipeline.assets.catalog import asset_names
 
 SETTING = Setting(("tshirt", "dress"), ("cmu_016_32",), 100, "1k")

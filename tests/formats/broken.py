@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from eslr_jax.errors import EslrError
+from eslr_jax import EslrError
 
 
 def refuses(read, path, *words):

@@ -6,7 +6,7 @@ from broken import refuses
 from foreign_files import write_bvh
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.pipeline.assets import load_motion
+from eslr_jax import load_motion
 from eslr_jax.pipeline.formats.asf import read_amc
 from eslr_jax.pipeline.formats.bvh import read_bvh
 from eslr_jax.pose.skeleton import MAX_FRAMES

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 
 

@@ -11,14 +11,12 @@ import pytest
 import trimesh
 from commands import eslr
 
-from eslr_jax.errors import AssetError
-from eslr_jax.pipeline.assets import load_motion
+from eslr_jax import AssetError, load_motion, pose_body
 from eslr_jax.pipeline.formats.animated import Skin
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import GarmentFile, in_vertex_order
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence
 from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, write_trajectory
-from eslr_jax.pose.motion import pose_body
 
 FRAMES, STEP = 4, 1 / 30
 SPHERE = trimesh.creation.icosphere(subdivisions=1)

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from whole_files import ACCLAIM, ARRAYS, BYTES, character, small_motion
 
-from eslr_jax.errors import EslrError
+from eslr_jax import EslrError
 from eslr_jax.pipeline.formats.asf import read_amc
 from eslr_jax.pipeline.formats.bvh import read_bvh
 from eslr_jax.pipeline.rigs.rig import make_motion

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from whole_files import FACES, POSITIONS, whole_garment
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError, load_motion
 from eslr_jax.files.parsing import split_name
-from eslr_jax.pipeline.assets import load_motion
 from eslr_jax.pipeline.dressing.outfit import garment_names
 from eslr_jax.pipeline.formats.garment import is_garment_file, read_garment_source
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import MeshError, MotionError
+from eslr_jax import MeshError, MotionError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin, principal_shapes, vertex_normals
 from eslr_jax.pipeline.formats.gltf import TOLERANCE as TARGET_TOLERANCE
 from eslr_jax.pipeline.formats.gltf import write_animated_glb

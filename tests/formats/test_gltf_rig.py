@@ -10,11 +10,11 @@ from broken import pack, refuses
 from foreign_files import GlbWriter, write_character
 from scipy.spatial.transform import Rotation
 
+from eslr_jax import pose_body
 from eslr_jax.pipeline.formats.gltf_document import GltfDocument, sample_keys
 from eslr_jax.pipeline.formats.gltf_rig import gltf_clip_names, read_gltf_body, read_gltf_motion
 from eslr_jax.pipeline.formats.mesh import read_mesh_file
 from eslr_jax.pipeline.rigs.rig import make_body, make_motion
-from eslr_jax.pose.motion import pose_body
 from eslr_jax.pose.skeleton import Skeleton, chain_positions
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"

@@ -12,7 +12,7 @@ from commands import eslr_here
 from reference_models import make_scene, quick_jit
 from test_torch_archive import Tensor, write_archive
 
-from eslr_jax.errors import CheckpointError
+from eslr_jax import CheckpointError
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.networks.apply import apply_model, scale_output
 from eslr_jax.networks.build import build_graph

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eslr_jax.errors import AssetError, MeshError
+from eslr_jax import AssetError, MeshError
 from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.pipeline.formats.mesh import read_mesh, read_mesh_file
 

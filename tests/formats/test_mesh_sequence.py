@@ -9,7 +9,7 @@ import trimesh
 from broken import refuses
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax import AssetError, MeshError, MotionError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
 from eslr_jax.pipeline.formats.garment import GarmentFile, in_outfit_order, in_vertex_order
 from eslr_jax.pipeline.formats.gltf import TOLERANCE, write_animated_glb

@@ -5,8 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from eslr_jax.errors import AssetError
-from eslr_jax.pipeline.assets import load_body, load_motion
+from eslr_jax import AssetError, load_body, load_motion
 from eslr_jax.pipeline.cli import app
 from eslr_jax.pipeline.cli.runs import Export
 from eslr_jax.pipeline.formats.garment import read_garment_source

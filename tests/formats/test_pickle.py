@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError
 from eslr_jax.pipeline.formats.pickle import read_pickle
 
 

@@ -20,10 +20,10 @@ from foreign_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError, pose_body
 from eslr_jax.pipeline.formats.smpl import read_amass, read_smpl_body, read_smpl_pickle
 from eslr_jax.pipeline.rigs.rig import UnitsWarning, make_body, make_motion
-from eslr_jax.pose.motion import Motion, pose_body, shape_body
+from eslr_jax.pose.motion import Motion, shape_body
 from eslr_jax.pose.retarget import local_rotations
 from eslr_jax.types import Body
 

@@ -12,7 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError
 from eslr_jax.pipeline.formats.torch_archive import read_torch
 
 STORAGES = {"f4": "FloatStorage", "f8": "DoubleStorage", "i8": "LongStorage", "b1": "BoolStorage"}

@@ -6,13 +6,12 @@ import os
 import numpy as np
 import pytest
 
-from eslr_jax.errors import AssetError
+from eslr_jax import AssetError, load_trajectory, pose_body, prepare_scene
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
 from eslr_jax.pipeline.formats.animated import Skin
 from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.pipeline.report.run import ClothTrack, load_trajectory, read_run, run_trajectory, write_run
-from eslr_jax.pose.motion import pose_body, still_motion
-from eslr_jax.simulation.plan import prepare_scene
+from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_trajectory, write_run
+from eslr_jax.pose.motion import still_motion
 
 RNG = np.random.default_rng(0)
 FRAMES = 3

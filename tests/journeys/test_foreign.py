@@ -11,7 +11,7 @@ from foreign_files import smpl_parameters, write_amass, write_hood
 from garment_shapes import cape, poncho, shorts, skirt, trousers, tube_dress, write_obj
 from PIL import Image
 
-from eslr_jax.pipeline.assets import load_motion
+from eslr_jax import load_motion
 from eslr_jax.pipeline.report.fields import run_field
 from eslr_jax.pipeline.report.run import read_run
 from eslr_jax.pipeline.rigs.rig import skeleton_motion

@@ -8,8 +8,9 @@ import trimesh
 from garment_files import TO_Z_UP, bundled, scanned_tshirt
 from garment_shapes import cape, poncho, rings, shorts, skirt, trousers, tube_dress, write_obj
 
+from eslr_jax import load_garment
 from eslr_jax.mesh.topology import boundary_loops
-from eslr_jax.pipeline.assets import load_garment, load_garment_file
+from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.repair import largest_component
 

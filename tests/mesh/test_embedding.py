@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError
 from eslr_jax.mesh.closest import closest_points
 from eslr_jax.mesh.embedding import geodesic_embedding
 from eslr_jax.mesh.geodesic import geodesic_distances, geodesic_graph

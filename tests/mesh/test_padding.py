@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eslr_jax import prepare_garment
-from eslr_jax.errors import CapacityError, MeshError
+from eslr_jax import CapacityError, MeshError, prepare_garment
 from eslr_jax.mesh.padding import choose_bucket, common_bucket, garment_bucket, pad_garment, round_up
 from eslr_jax.numerics import gather_corners
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eslr_jax.errors import MeshError
+from eslr_jax import MeshError
 from eslr_jax.mesh.validate import validate_mesh, validate_orientation
 from eslr_jax.pipeline.assets import asset_names, load_garment_file
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from reference_models import make_scene, plain_hood, quick_jit, to_float64
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.networks.apply import (
     apply_model,

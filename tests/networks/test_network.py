@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reference_models import make_scene, plain_network, quick_jit, to_float64
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError
 from eslr_jax.networks.apply import (
     apply_model,
     apply_refinement,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from reference_models import make_scene, quick_jit
 
-from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax import CheckpointError, ConfigError
 from eslr_jax.networks import weights
 from eslr_jax.networks.apply import apply_model, measure_statistics, merge_statistics, scale_output
 from eslr_jax.networks.build import build_graph

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eslr_jax.errors import AssetError, ConfigError, MeshError, MissingExtraError, NonFiniteError
+from eslr_jax import AssetError, ConfigError, MeshError, MissingExtraError, NonFiniteError
 from eslr_jax.pipeline.pictures import (
     add_color_bar,
     color_scale,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eslr_jax.errors import AssetError, ConfigError
+from eslr_jax import AssetError, ConfigError
 from eslr_jax.pipeline.assets.budget import (
     SOLVER,
     Calibration,

@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, Network, SimConfig, prepare_scene, rollout_scene
 from eslr_jax.mesh.padding import choose_bucket, pad_garment
-from eslr_jax.networks.network import Network
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.controls import Control, control_garment, control_network
 from eslr_jax.pipeline.report.gap import stepped_potentials, trajectory_gap
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import CLOTH
 
 SIZES = {"message_passing_steps": 1, "latent_size": 8, "attention_size": 4, "attention_features": 8}

@@ -11,22 +11,26 @@ from draped_ball import drifting_ball, square
 from example_runs import write_run as write_run_by_hand
 from own_term import Push
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import AssetError
-from eslr_jax.mesh.prepare import prepare_garment
+from eslr_jax import (
+    AssetError,
+    SimConfig,
+    prepare_garment,
+    prepare_scene,
+    rollout_scene,
+    save_scene,
+    scene_terms,
+    score_trajectory,
+)
 from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.fields import energy_shares, gap_shares, run_field
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
-from eslr_jax.pipeline.report.score import score_trajectory
-from eslr_jax.simulation.archive import save_scene
 from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
-from eslr_jax.simulation.plan import first_frames, prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential, potential_terms
 from eslr_jax.solver.solve import Start, solve
-from eslr_jax.terms import CLOTH, Collision, Gravity, Repulsion, scene_terms
+from eslr_jax.terms import CLOTH, Collision, Gravity, Repulsion
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import pytest
 
+from eslr_jax import prepare_scene
 from eslr_jax.pipeline.report.scene_parts import describe_scene, take_turns, time_parts
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.terms import CLOTH, Air, Damping, Repulsion
 from eslr_jax.types import Threads
 

@@ -5,14 +5,22 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax import SimConfig, prepare_scene, score_trajectory, simulate
-from eslr_jax.errors import ConfigError, MotionError, NonFiniteError
+from eslr_jax import (
+    ConfigError,
+    MotionError,
+    NonFiniteError,
+    SimConfig,
+    prepare_scene,
+    scene_terms,
+    score_trajectory,
+    simulate,
+)
 from eslr_jax.networks.eslr import Eslr
 from eslr_jax.pipeline.report.evaluate import EvaluationOptions, evaluate
 from eslr_jax.pipeline.report.foreign import foreign_trajectory, with_energies
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.pipeline.report.report import trajectory_report
-from eslr_jax.terms import Repulsion, scene_terms
+from eslr_jax.terms import Repulsion
 from eslr_jax.terms.air import blowing
 
 FRAMES = 7
@@ -104,8 +112,7 @@ def test_a_trajectory_is_plain_arrays_by_name(tmp_path, small_trajectory):
 
 @pytest.mark.slow
 def test_a_network_s_rollout_scores_as_evaluate_says():
-    from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
-    from eslr_jax.pose.motion import pose_body
+    from eslr_jax import load_body, load_garment, load_motion, pose_body
     from eslr_jax.simulation.plan import shared_surface
 
     network = Eslr(message_passing_steps=1, attention_blocks=0, latent_size=8).new_network()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import MotionError
+from eslr_jax import MotionError
 from eslr_jax.pose import retarget
 
 NAMES = ("Hips", "LeftArm", "LeftForeArm", "LeftHand", "RightArm")

@@ -10,8 +10,7 @@ import pytest
 from cloth import turn_about
 from scipy.spatial.transform import Rotation
 
-from eslr_jax import load_motion, pose_body
-from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax import AssetError, MeshError, MotionError, load_motion, pose_body
 from eslr_jax.pipeline.assets.motions import read_joint_map
 from eslr_jax.pipeline.rigs.procedural import PROCEDURAL
 from eslr_jax.pipeline.rigs.rig import body_skeleton, hips_first, make_body, make_motion, skeleton_motion

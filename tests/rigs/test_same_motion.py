@@ -15,8 +15,8 @@ from foreign_files import (
 )
 from scipy.spatial.transform import Rotation
 
+from eslr_jax import load_motion
 from eslr_jax.files.npz import write_arrays
-from eslr_jax.pipeline.assets import load_motion
 from eslr_jax.pipeline.formats.bvh import read_bvh
 from eslr_jax.pipeline.rigs.rig import skeleton_motion
 from eslr_jax.pose.timing import skip_start_pose

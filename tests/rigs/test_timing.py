@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from foreign_files import write_bvh
 
-from eslr_jax.errors import MotionError
-from eslr_jax.pipeline.assets import load_motion
+from eslr_jax import MotionError, load_motion, pose_body
 from eslr_jax.pipeline.rigs.rig import skeleton_motion
-from eslr_jax.pose.motion import pose_body, still_motion
+from eslr_jax.pose.motion import still_motion
 from eslr_jax.pose.retarget import count_resampled
 from eslr_jax.pose.timing import check_speed, cut_start, loop_motion, skip_start_pose, with_settling
 

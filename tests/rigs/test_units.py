@@ -7,8 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.pipeline.assets import load_body, load_motion
+from eslr_jax import AssetError, ConfigError, load_body, load_motion
 from eslr_jax.pipeline.rigs.rig import (
     UnitsWarning,
     body_skeleton,

@@ -37,7 +37,7 @@ def cheap_model():
 @pytest.fixture(scope="session")
 def config(cheap_model):
     """Six steps."""
-    from eslr_jax.config import TrainConfig
+    from eslr_jax import TrainConfig
 
     return TrainConfig(
         model=cheap_model, steps=6, warmup=2, slots_per_garment=2, log_every=2, checkpoint_every=2

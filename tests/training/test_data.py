@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eslr_jax import ConfigError, pose_body
 from eslr_jax.contact.nearest import find_contacts
-from eslr_jax.errors import ConfigError
 from eslr_jax.pipeline.assets import split_clips
-from eslr_jax.pose.motion import pose_body, shape_body
+from eslr_jax.pose.motion import shape_body
 from eslr_jax.terms import Collision
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
-from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CapacityError, NonFiniteError, Status
+from eslr_jax import CapacityError, NonFiniteError, Status, TrainConfig
 from eslr_jax.networks.normalizer import WARMUP_UPDATES
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.assets.models import load_model

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax import SimConfig, prepare_scene, rollout
-from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax import CheckpointError, ConfigError, SimConfig, TrainConfig, load_model, prepare_scene, rollout
 from eslr_jax.networks.registry import read_system
-from eslr_jax.pipeline.assets import load_model
 from eslr_jax.training.checkpoint import read_run_config
 from eslr_jax.training.loop import train
 

@@ -15,11 +15,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CheckpointError, ConfigError
+from eslr_jax import CheckpointError, ConfigError, TrainConfig, load_model
 from eslr_jax.networks.normalizer import WARMUP_UPDATES
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.assets import load_model
 from eslr_jax.pipeline.assets.models import model_record
 from eslr_jax.pipeline.assets.training import load_training_data
 from eslr_jax.simulation.scene import initial_state
