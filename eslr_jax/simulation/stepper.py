@@ -88,8 +88,7 @@ def make_stepper(
             point, _, status = _begin(network, problem, state)
             unknown = jnp.full_like(point.value, jnp.inf)
             minimum = Minimum(*point, iterations=jnp.int32(0), gap_bound=unknown)
-        problem = problem.on_course(minimum.course)
-        position = pin(problem, minimum.position)
+        position, problem = corrected(problem, pin(problem, minimum.position))
         residual = safe_norm(minimum.gradient.reshape(-1)) / weight_norm(problem)
         report = FrameReport(
             energies=potential_terms(position, problem),
@@ -101,6 +100,17 @@ def make_stepper(
         return next_state(position, problem, state, status | minimum.status, residual), report
 
     return step
+
+
+def corrected(
+    problem: FrameProblem, position: Float[Array, "vertices 3"]
+) -> tuple[Float[Array, "vertices 3"], FrameProblem]:
+    """Return positions at t + 1 [m] as the terms let the frame end, and the problem with what came of it."""
+    data = []
+    for term, own in problem.parts:
+        position, own = term.correct(position, problem, own)
+        data.append(own)
+    return position, problem.replace(data=tuple(data))
 
 
 def find_start(

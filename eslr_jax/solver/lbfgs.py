@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.numerics import product
 from eslr_jax.solver.potential import Point
 from eslr_jax.solver.preconditioner import Stiffness, stiffness_inverse
-from eslr_jax.terms.term import Domain
 
 _ARMIJO = 1e-4  # sufficient decrease (Nocedal and Wright 2006, section 3.1)
 _MAX_HALVINGS = 10
@@ -30,7 +29,6 @@ class Minimum(NamedTuple):
     iterations: Int[Array, ""]
     gap_bound: Float[Array, ""]  # share of the initial gap that is left at most, see `Stop.tolerance`
     status: Int[Array, ""] | int = 0  # errors.Status bits
-    course: Any = ()  # of the domain, at the end
 
 
 class Stop(NamedTuple):
@@ -60,11 +58,6 @@ class _State(NamedTuple):
     decrement: Float[Array, ""]  # gap [J] that the last point was estimated to have
     iterations: Int[Array, ""]  # -1 before the start is evaluated
     is_stuck: Bool[Array, ""]  # not even the preconditioned gradient leads down
-    is_plain: Bool[Array, ""]  # the next direction is the gradient's, vertex by vertex
-    reference: Float[Array, ""]  # energy [J] from which the gain counts
-
-
-_APPROACHES = 2  # cut steps towards the start of a minimisation in a domain
 
 
 Inverse = Callable[[Float[Array, " n"]], Float[Array, " n"]]
@@ -101,14 +94,13 @@ def _direction(state: _State) -> Float[Array, " n"]:
 
 
 def minimize(
-    function: Callable[..., Float[Array, ""]],
+    function: Callable[[Float[Array, "vertices 3"]], Float[Array, ""]],
     start: Float[Array, "vertices 3"],
-    stiffness: Stiffness | Callable[..., Stiffness],
+    stiffness: Stiffness,
     stop: Stop,
     *,
     memory: int = 8,
     previous: Point | None = None,
-    domain: Domain | None = None,
 ) -> Minimum:
     """Minimise `function` from `start` by L-BFGS.
 
@@ -116,137 +108,66 @@ def minimize(
     most of a frame's program, is compiled only once.
 
     Args:
-        function: Differentiable energy [J] of positions [m], shape [vertices, 3]; in a domain, and of its course.
-        start: Where to begin [m]; in a domain, where to begin if nothing is in the way.
-        stiffness: Initial Hessian of the recursion, up to a scale; in a domain, as a function of the same.
+        function: Differentiable energy [J] of positions [m], shape [vertices, 3].
+        start: Where to begin [m].
+        stiffness: Initial Hessian of the recursion, up to a scale.
         stop: When to end.
         memory: Number of pairs of steps and gradient changes kept; static.
-        previous: A point from which something else came to `start`; the step between is the first pair. Not in a
-            domain, which begins elsewhere.
-        domain: What cuts the steps.
+        previous: A point from which something else came to `start`; the step between is the first pair.
 
     Returns:
         The lowest point that was reached, and the iterations it took.
 
     Source: Nocedal and Wright 2006, algorithm 7.4, with backtracking from the unit step.
     """
-    if domain is None:
-        before = unknown_point(start) if previous is None else previous
-        state = _first_state(before, stop, memory, passes=1)
-        if previous is not None:
-            state = state._replace(smoothed=_flat_inverse(cast(Stiffness, stiffness))(state.gradient))
-        steps = _Steps(function, stiffness, start, None, has_previous=previous is not None)  # type: ignore[arg-type]
-        final = jax.lax.while_loop(lambda state: _is_running(state, stop), steps.iterate, state)
-        return _minimum(final, ())
-    state = _first_state(unknown_point(_vectors(domain.begin)), stop, memory, passes=_APPROACHES)
+    balance = stiffness_inverse(stiffness)
 
-    def matrix_at(state: _State, course: Any) -> Stiffness:
-        return stiffness(_vectors(state.x), course)  # type: ignore[operator]
+    def inverse(force: Float[Array, " n"]) -> Float[Array, " n"]:
+        return _flat(balance(_vectors(force)))
 
-    def go_on(carry):
-        state, course, matrix = carry
-        x, course = domain.follow(state.x, course)
-        state = state._replace(x=x)
-        # The preconditioner is that of the place where the minimisation begins: the history was made with it.
-        is_new = state.iterations <= 0
-
-        def begin() -> tuple[Stiffness, Array]:
-            matrix = matrix_at(state, course)
-            return matrix, _flat_inverse(matrix)(state.gradient)
-
-        matrix, smoothed = jax.lax.cond(is_new, begin, lambda: (matrix, state.smoothed))
-        steps = _Steps(
-            lambda x: function(x, course), matrix, start, lambda x, step: domain.limit(x, step, course)
-        )
-        state = state._replace(smoothed=smoothed, is_kept=state.is_kept & ~is_new)
-
-        def is_running(state: _State) -> Array:
-            return _is_running(state, stop) & domain.is_open(course) & ~domain.is_spent(state.x, course)
-
-        return jax.lax.while_loop(is_running, steps.iterate, state), course, matrix
-
-    first = state, domain.course, jax.eval_shape(matrix_at, state, domain.course)
-    first = (*first[:2], jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first[2]))
-    final, course, _ = jax.lax.while_loop(lambda carry: _is_running(carry[0], stop), go_on, first)
-    return _minimum(final, course)
-
-
-class _Steps:
-    """Iterations of one energy, with one preconditioner."""
-
-    def __init__(
-        self,
-        function: Callable,
-        stiffness: Stiffness,
-        goal: Array,
-        limit: Callable | None,
-        *,
-        has_previous: bool = False,
-    ):
-        self.function, self.goal, self.limit, self.has_previous = function, _flat(goal), limit, has_previous
-        self.inverse, self.diagonal = _flat_inverse(stiffness), jnp.tile(stiffness.diagonal, 3)
-
-    def value_and_gradient(self, x: Float[Array, " n"]):
+    def value_and_gradient(x: Float[Array, " n"]):
         split = tuple(jax.lax.split(x, (x.size // 3,) * 3))
-        value, parts = jax.value_and_grad(lambda parts: self.function(jnp.stack(parts, axis=1)))(split)
+        value, parts = jax.value_and_grad(lambda parts: function(jnp.stack(parts, axis=1)))(split)
         # Written over x one by one: joined at once, XLA computes them in a loop that it can't vectorise.
         gradient = x
         for axis, part in enumerate(parts):
             gradient = jax.lax.dynamic_update_slice(gradient, part, (axis * part.size,))
         return value, gradient
 
-    def iterate(self, state: _State) -> _State:
+    def is_at_rest(state: _State) -> Array:
+        # Cloth that does not move gains less than the rounding of its energy, with either sign.
+        most = jnp.maximum(jnp.abs(stop.reference - state.value), _CAUTION * state.decrement)
+        return jnp.isfinite(state.value) & (most <= _rounding(state.value))
+
+    def is_running(state: _State) -> Array:
+        is_above = product(state.gradient, state.gradient) > jnp.square(stop.force)
+        is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
+        is_far = is_far & ~((stop.tolerance > 0) & is_at_rest(state))
+        is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
+        return is_going | (state.iterations < 0)
+
+    def iterate(state: _State) -> _State:
         is_first = state.iterations < 0
-        full = jnp.where(state.is_plain, -state.gradient / self.diagonal, _direction(state))
-        full = jnp.where(is_first, self.goal - state.x, full)
-        direction = full if self.limit is None else self.limit(state.x, full)
+        direction = jnp.where(is_first, _flat(start) - state.x, _direction(state))
         slope = product(direction, state.gradient)
-        point, is_lower = _backtrack(self.value_and_gradient, state, direction, slope)
-        # If no step along the direction lowers the energy, the next iteration goes without the history, and the
-        # one after it along the gradient. The decrement of a direction that rounding has turned uphill tells
-        # nothing about the gap.
+        x, value, gradient, is_lower = _backtrack(value_and_gradient, state, direction, slope)
+        # If no step along the direction lowers the energy, the next iteration goes without the history. The
+        # decrement of a direction that rounding has turned uphill tells nothing about the gap.
         kept = state._replace(is_kept=state.is_kept & is_lower)
-        moved = _advance(kept, point, self.inverse)
-        has_history = jnp.any(state.is_kept)
-        decrement = product(full, state.gradient)
-        starts_here = (state.iterations == -1) & (self.limit is not None)
+        moved = _advance(kept, Point(x, value, gradient), inverse)
         return moved._replace(
-            decrement=jnp.where(is_first | (decrement >= 0), jnp.inf, -0.5 * decrement),
+            decrement=jnp.where(is_first | (slope >= 0), jnp.inf, -0.5 * slope),
             iterations=state.iterations + 1,
-            is_plain=~is_lower & ~has_history & ~state.is_plain,
-            is_stuck=~is_lower & state.is_plain,
-            is_kept=moved.is_kept & (self.has_previous | ~is_first),
-            reference=jnp.where(starts_here, jnp.maximum(state.reference, point.value), state.reference),
+            is_stuck=~is_lower & ~jnp.any(state.is_kept),
         )
 
-
-def _flat_inverse(stiffness: Stiffness) -> Inverse:
-    balance = stiffness_inverse(stiffness)
-    return lambda force: _flat(balance(_vectors(force)))
-
-
-def _is_at_rest(state: _State) -> Array:
-    # Cloth that does not move gains less than the rounding of its energy, with either sign.
-    most = jnp.maximum(jnp.abs(state.reference - state.value), _CAUTION * state.decrement)
-    return jnp.isfinite(state.value) & (most <= _rounding(state.value))
-
-
-def _is_running(state: _State, stop: Stop) -> Array:
-    is_above = product(state.gradient, state.gradient) > jnp.square(stop.force)
-    is_far = _CAUTION * state.decrement > stop.tolerance**2 * (state.reference - state.value)
-    is_far = is_far & ~((stop.tolerance > 0) & _is_at_rest(state))
-    is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
-    return is_going | (state.iterations < 0)
-
-
-def _first_state(before: Point, stop: Stop, memory: int, *, passes: int) -> _State:
-    """Return the state before anything is evaluated, and before so many passes that don't count."""
+    before = unknown_point(start) if previous is None else previous
     x, gradient = _flat(before.position), _flat(before.gradient)
-    return _State(
+    initial = _State(
         x=x,
         value=jnp.full((), jnp.inf, x.dtype),
         gradient=gradient,
-        smoothed=gradient,  # zero, or not used
+        smoothed=gradient if previous is None else inverse(gradient),  # of zero it is zero
         pairs=jnp.zeros((2 * memory, x.size), x.dtype),
         by_gradient=jnp.zeros(2 * memory, x.dtype),
         by_change=jnp.zeros((2 * memory, memory), x.dtype),
@@ -254,20 +175,16 @@ def _first_state(before: Point, stop: Stop, memory: int, *, passes: int) -> _Sta
         head=jnp.zeros((), jnp.int32),
         scale=jnp.ones((), x.dtype),
         decrement=jnp.full((), jnp.inf, x.dtype),
-        iterations=jnp.full((), -passes, jnp.int32),
+        iterations=jnp.full((), -1, jnp.int32),
         is_stuck=jnp.zeros((), bool),
-        is_plain=jnp.zeros((), bool),
-        reference=jnp.asarray(stop.reference, x.dtype),
     )
-
-
-def _minimum(final: _State, course: Any) -> Minimum:
-    gain = final.reference - final.value
+    final = jax.lax.while_loop(is_running, iterate, initial)
+    gain = stop.reference - final.value
     share = _CAUTION * final.decrement / jnp.where(gain > 0, gain, 1.0)
     gap_bound = jnp.where(gain > 0, jnp.sqrt(share), jnp.inf)
-    gap_bound = jnp.where(_is_at_rest(final), 0.0, gap_bound)
+    gap_bound = jnp.where(is_at_rest(final), 0.0, gap_bound)
     position, gradient = _vectors(final.x), _vectors(final.gradient)
-    return Minimum(position, final.value, gradient, final.iterations, gap_bound, jnp.int32(0), course)
+    return Minimum(position, final.value, gradient, final.iterations, gap_bound, jnp.int32(0))
 
 
 def unknown_point(position: Float[Array, "vertices 3"]) -> Point:
@@ -346,9 +263,9 @@ def _backtrack(value_and_gradient: Callable, state: _State, direction: Array, sl
     untried = (jnp.zeros((), state.x.dtype), jnp.int32(0), state.x, state.value, state.gradient)
     *_, x, value, gradient = jax.lax.while_loop(is_wanting, trial, untried)
     is_kept = ((value <= state.value + slack) & (slope < 0)) | is_first
-    point = Point(
+    return (
         jnp.where(is_kept, x, state.x),
         jnp.where(is_kept, value, state.value),
         jnp.where(is_kept, gradient, state.gradient),
+        is_kept,
     )
-    return point, is_kept

@@ -95,22 +95,13 @@ def _solve(
 
 
 def _minimum(problem: FrameProblem, start: Start, stop: Stop, memory: int) -> Minimum:
-    if (domain := problem.domain(start.position)) is None:
-        return minimize(
-            lambda position: potential(position, problem),
-            start.position,
-            stretched_stiffness(problem, start.position),
-            stop,
-            memory=memory,
-            previous=start.previous,
-        )
     return minimize(
-        lambda position, course: potential(position, problem.on_course(course)),
+        lambda position: potential(position, problem),
         start.position,
-        lambda position, course: stretched_stiffness(problem.on_course(course), position),
+        stretched_stiffness(problem, start.position),
         stop,
         memory=memory,
-        domain=domain,
+        previous=start.previous,
     )
 
 
@@ -134,23 +125,15 @@ def _solve_jvp(memory: int, primals: tuple, tangents: tuple) -> tuple[Minimum, A
     minimum = minimum._replace(position=position, status=status)
 
     def at_minimum(problem: FrameProblem) -> tuple[Array, Array]:
-        return jax.value_and_grad(potential)(position, problem.on_course(minimum.course))
+        return jax.value_and_grad(potential)(position, problem)
 
     _, (value_change, force_change) = jax.jvp(at_minimum, (problem,), tangents[:1])
-    move = -_solve_hessian_linear(problem.on_course(minimum.course), position, force_change)
+    move = -_solve_hessian_linear(problem, position, force_change)
     move = jnp.where(is_refused, jnp.nan, 1.0) * move
     value_change = value_change + jnp.sum(minimum.gradient * move)
-    zeros = jax.tree.map(_no_tangent, minimum)
-    return minimum, zeros._replace(position=move, value=value_change)
-
-
-def _no_tangent(leaf: Array) -> Any:
-    """Return the tangent of what has no derivative."""
-    return (
-        jnp.zeros_like(leaf)
-        if jnp.issubdtype(leaf.dtype, jnp.floating)
-        else np.zeros(leaf.shape, jax.dtypes.float0)
-    )
+    fixed = np.zeros((), jax.dtypes.float0)
+    zeros = jax.tree.map(jnp.zeros_like, (minimum.gradient, minimum.gap_bound))
+    return minimum, Minimum(move, value_change, zeros[0], fixed, zeros[1], fixed)  # type: ignore[arg-type]
 
 
 def _solve_hessian_linear(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from eslr_jax.numerics import safe_norm
 from eslr_jax.ranges import Range
-from eslr_jax.terms.term import Domain, Term
+from eslr_jax.terms.term import Term
 from eslr_jax.types import BodySurface, Garment, Material
 
 _LIMB_RADIUS = 0.05  # [m], of an upper arm or a shoulder: the sharpest that cloth rests on
@@ -75,17 +75,6 @@ class FrameProblem:
     def data_of(self, kind: type[Term]) -> Any:
         """Return what the first term of a kind has prepared; None without one."""
         return next((data for term, data in self.parts if isinstance(term, kind)), None)
-
-    def domain(self, goal: Float[Array, "vertices 3"]) -> Domain | None:
-        """Return what cuts the solver's steps on the way to where it would begin [m]; None: nothing does."""
-        domains = (term.domain(self, data, goal) for term, data in self.parts)
-        return next((domain for domain in domains if domain is not None), None)
-
-    def on_course(self, course: Any) -> FrameProblem:
-        """Return the problem at a place of its `domain`'s course."""
-        if isinstance(course, tuple) and not course:
-            return self
-        return self.replace(data=tuple(term.on_course(data, course) for term, data in self.parts))
 
     @property
     def gravity(self) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError, Status
@@ -26,17 +26,6 @@ class Elements(NamedTuple):
 
     energies: Float[Array, " elements"]  # [J]
     vertices: Int[Array, "elements corners"]
-
-
-class Domain(NamedTuple):
-    """What cuts the steps of a minimisation, and changes on the way; positions are flat, all x, all y, all z."""
-
-    begin: Float[Array, " n"]  # [m]; from here the minimisation goes towards its start, as far as it can
-    course: Any
-    follow: Callable[[Float[Array, " n"], Any], tuple[Float[Array, " n"], Any]]  # position and course go on
-    is_open: Callable[[Any], Bool[Array, ""]]  # steps may be taken
-    is_spent: Callable[[Float[Array, " n"], Any], Bool[Array, ""]]  # it has to go on before the next step
-    limit: Callable[[Float[Array, " n"], Float[Array, " n"], Any], Float[Array, " n"]]  # a step, cut
 
 
 class Term:
@@ -111,13 +100,11 @@ class Term:
         """Return positions at t + 1 [m] with elements moved apart, after `push_out`; None: nothing moves."""
         return None
 
-    def domain(self, problem: FrameProblem, data: Any, goal: Float[Array, "vertices 3"]) -> Domain | None:
-        """Return what cuts the solver's steps on the way to a goal [m]; None: nothing does."""
-        return None
-
-    def on_course(self, data: Any, course: Any) -> Any:
-        """Return its data at a place of the course of `domain`."""
-        return data
+    def correct(
+        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
+    ) -> tuple[Float[Array, "vertices 3"], Any]:
+        """Return positions at t + 1 [m] as the frame ends with, in the place of those found, and its data."""
+        return position, data
 
     def touched(self, problem: FrameProblem, data: Any) -> tuple[Contacts, Float[Array, " vertices"]] | None:
         """Return the points that vertices rub on, and the normal forces at t [N]; None: nothing rubs."""

@@ -44,6 +44,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
     parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
     parser.add_argument("--skin", action="store_true", help="physics: keep faces off the body too")
+    parser.add_argument("--strict", action="store_true", help="physics: let nothing pass through cloth")
     parser.add_argument("--substeps", type=int, default=1, help="physics: of every frame")
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
@@ -71,6 +72,7 @@ def find_simulator(arguments: argparse.Namespace):
     stepping = {
         "--integrator": arguments.integrator != "euler",
         "--skin": arguments.skin,
+        "--strict": arguments.strict,
         "--substeps": arguments.substeps > 1,
     }
     if name != "physics" and any(stepping.values()):
@@ -80,7 +82,11 @@ def find_simulator(arguments: argparse.Namespace):
         raise ConfigError(f"--model is for networks; leave it out for {name}")
     if name == "physics":
         return solver_simulator(
-            arguments.iterations, arguments.integrator, has_skin=arguments.skin, substeps=arguments.substeps
+            arguments.iterations,
+            arguments.integrator,
+            has_skin=arguments.skin,
+            is_strict=arguments.strict,
+            substeps=arguments.substeps,
         )
     if name in ITERATIONS:
         return network_simulator(arguments.model, load_model(arguments.model), arguments.iterations)
@@ -119,6 +125,7 @@ def run(arguments: argparse.Namespace) -> None:
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
     other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
     other += "_skin" if arguments.skin else ""
+    other += "_strict" if arguments.strict else ""
     other += f"_{arguments.substeps}_substeps" if arguments.substeps > 1 else ""
     path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
     outcomes = []

@@ -122,8 +122,6 @@ SIMULATE = {
     "--start 99s": "start", "--start -1": "", "--start later": "--start", "--start nans": "--start",
     "--loop 0s": "", "--loop ever": "--loop", "--settle -1": "--settle",
     "--self-contact --no-self-contact": "exclude each other",
-    "--contact strict --no-self-contact": "keeps all layers apart",
-    "--contact strict --model eslr-small": "leave out the network",
     "--budget 20": "--budget", "--budget -5ms": "--budget", "--budget fast": "20ms", "--budget nanms": "20ms",
     "--budget 0.001ms": "the fastest frame here takes",
     "--tolerance 150%": "--tolerance", "--tolerance small": "1%", "--tolerance 0": "1%",

@@ -83,9 +83,9 @@ class Options:
     # Number of shorter steps per frame; 2 keeps layers apart that swing fast against each other. The
     # iterations are those of each substep.
     substeps: int = 1
-    # How contact is kept. fast pushes cloth out of what it has passed into, where it is found. strict lets
-    # nothing pass through anything: it takes several times as long, and the body yields by some millimetres
-    # where its own parts pass through each other. It needs the solver.
+    # How contact is kept. fast pushes cloth out of what it has passed into, where it is found. With strict,
+    # nothing passes through cloth in the first place: a frame takes half as long again. The body yields by
+    # some millimetres where its own parts pass through each other, which takes a while to prepare.
     contact: Literal["fast", "strict"] = "fast"
     # Keep all layers of cloth apart, also within each garment of an outfit. By default layers of a garment of
     # one piece are kept apart where they can meet, and pieces and garments from each other.
@@ -123,29 +123,23 @@ class Options:
                 raise ConfigError(f"--{name} {value}: give a number, 0 or more")
         if self.self_contact and self.no_self_contact:
             raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
-        if self.contact == "strict" and self.no_self_contact:
-            raise ConfigError("--contact strict keeps all layers apart; leave out --no-self-contact")
-        if self.contact == "strict" and (self.model is not None or self.simulator == "network"):
-            raise ConfigError(
-                "--contact strict is the solver's: networks cross what they like; leave out the network"
-            )
 
     def terms(self, *, has_solver: bool) -> tuple[Term, ...]:
         """Return what is modelled where it is needed; networks alone know no skin and no folds."""
         from eslr_jax.terms import Collision, Contact, Damping, Ground, Repulsion, scene_terms
         from eslr_jax.terms.air import blowing
 
-        is_strict = self.contact == "strict"
         layers = Repulsion(where="all" if self.self_contact else "folds" if has_solver else "pieces")
         ground = Ground(is_always=self.ground == "on")
-        changed = [Contact(), ground] if is_strict else [Collision(has_skin=has_solver), ground, layers]
+        changed = [Collision(has_skin=has_solver), ground, layers]
+        if self.contact == "strict":
+            changed.append(Contact())
         if (air := blowing(self.wind, self.gust)) is not None:
             changed.append(air)
         if self.damping is not None:
             changed.append(Damping(self.damping))
         changed += map(read_term, self.term)
-        left_out = (Ground,) * (self.ground == "off")
-        left_out += (Collision, Repulsion) if is_strict else (Repulsion,) * self.no_self_contact
+        left_out = (Ground,) * (self.ground == "off") + (Repulsion,) * self.no_self_contact
         return scene_terms(*changed, without=left_out)
 
     def record(self) -> dict[str, Any]:
