@@ -8,18 +8,27 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax import (
+    ConfigError,
+    SimConfig,
+    load_body,
+    load_garment,
+    load_motion,
+    pose_body,
+    prepare_scene,
+    prepare_scenes,
+    rollout_scene,
+    scene_terms,
+    simulate,
+    simulate_batch,
+)
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.rest_shape import with_rest_positions
-from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
-from eslr_jax.pose.motion import pose_body
-from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_batch, stack_scenes
-from eslr_jax.simulation.plan import prepare_scene, prepare_scenes, shared_surface
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.simulation.simulate import raise_for_status, simulate
-from eslr_jax.terms import CLOTH, Collision, Damping, Ground, Repulsion, scene_terms
+from eslr_jax.simulation.batch import _group_alike, rollout_scenes, stack_scenes
+from eslr_jax.simulation.plan import shared_surface
+from eslr_jax.simulation.simulate import raise_for_status
+from eslr_jax.terms import CLOTH, Collision, Damping, Ground, Repulsion
 
 QUICK = SimConfig(iterations=5)
 CLIPS = (

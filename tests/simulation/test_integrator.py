@@ -7,14 +7,11 @@ from draped_ball import drifting_ball, square
 from jax.tree_util import Partial
 from known_answers.strip import LENGTH, kept_per_period, strip
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, SimConfig, prepare_scene, rollout_scene, scene_terms
 from eslr_jax.networks.eslr import Eslr
 from eslr_jax.pipeline.report.gap import trajectory_gap
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.stepper import MOST_RESIDUAL
-from eslr_jax.terms import Air, scene_terms
+from eslr_jax.terms import Air
 
 GRAVITY = 9.81  # [m/s^2]
 

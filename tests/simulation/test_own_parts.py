@@ -8,8 +8,7 @@ from draped_ball import drifting_ball, square
 from flax import linen as nn
 from flax import struct
 
-from eslr_jax import Network, SimConfig, plan_scene, prepare_scene, rollout, simulate
-from eslr_jax.errors import NonFiniteError
+from eslr_jax import Network, NonFiniteError, SimConfig, plan_scene, prepare_scene, rollout, simulate
 from eslr_jax.networks.network import System
 from eslr_jax.pipeline.report.report import trajectory_report
 from eslr_jax.simulation.frame import first_problem

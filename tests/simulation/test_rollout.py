@@ -9,14 +9,24 @@ import numpy as np
 import pytest
 from draped_ball import TIMESTEP, drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
+from eslr_jax import (
+    CheckpointError,
+    ConfigError,
+    MotionError,
+    NonFiniteError,
+    SimConfig,
+    Status,
+    plan_scene,
+    prepare_scene,
+    rollout,
+    rollout_scene,
+    simulate,
+    step,
+)
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.gap import trajectory_gap
-from eslr_jax.simulation.plan import plan_scene, prepare_scene
-from eslr_jax.simulation.rollout import rollout, rollout_scene, step
-from eslr_jax.simulation.simulate import raise_for_status, simulate
+from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
 from eslr_jax.terms import CLOTH, Gravity
 

@@ -10,17 +10,25 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
+from eslr_jax import (
+    CapacityError,
+    ConfigError,
+    MotionError,
+    SimConfig,
+    Status,
+    prepare_scene,
+    rollout_scene,
+    scene_terms,
+    simulate,
+)
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.cli.actor import Actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.cli.simulate import Unfinished
 from eslr_jax.pipeline.report.gap import GapOptions, measure_gap
 from eslr_jax.simulation.archive import read_tree, write_tree
-from eslr_jax.simulation.plan import first_frames, prepare_scene
+from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.program import _program, find_program
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.simulation.simulate import (
     begin_compiling,
@@ -28,9 +36,8 @@ from eslr_jax.simulation.simulate import (
     good_frames,
     hold_last,
     raise_for_status,
-    simulate,
 )
-from eslr_jax.terms import CLOTH, Friction, Repulsion, scene_terms
+from eslr_jax.terms import CLOTH, Friction, Repulsion
 
 SOLVER = SimConfig(iterations=12)
 
@@ -80,7 +87,7 @@ def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
 def crossing_sheets(num_frames=3):
     """Two squares a few millimetres apart: every vertex has pairs."""
     lower, upper = square(), square()
-    from eslr_jax.mesh.prepare import prepare_garment
+    from eslr_jax import prepare_garment
 
     rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
     faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])

@@ -11,10 +11,9 @@ from cloth import make_garment, make_sheet
 from draped_ball import drifting_ball
 from physics_cases import make_case, pad_case, to_numpy
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, prepare_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.solver.potential import contact_load, potential, potential_terms
 from eslr_jax.terms import CLOTH, Collision, Friction, Gravity
 from eslr_jax.terms.bending import bending_energy, dihedral_angles

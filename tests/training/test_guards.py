@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
-from eslr_jax import CapacityError, NonFiniteError, Status, TrainConfig
+from eslr_jax import CapacityError, NonFiniteError, Status, TrainConfig, load_model
 from eslr_jax.networks.normalizer import WARMUP_UPDATES
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.assets.models import load_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train, window_metrics
