@@ -22,7 +22,10 @@ def test_bdf2_keeps_a_strip_swinging_in_substeps_more_and_euler_does_not():
     assert kept_per_period("euler") < 0.5
 
 
-@pytest.mark.parametrize(("integrator", "substeps"), [("euler", 1), ("bdf2", 1), ("bdf2", 3)])
+@pytest.mark.parametrize(
+    ("integrator", "substeps"),
+    [("euler", 1), pytest.param("bdf2", 1, marks=pytest.mark.slow), ("bdf2", 3)],
+)
 def test_a_free_fall_is_off_by_as_much_as_the_integrator_says(integrator, substeps):
     """Euler falls g dt t / 2 too far; BDF2 3/4 g dt^2, which is what its first step by Euler becomes."""
     frames, dt = 31, 1 / 30
