@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from draped_ball import TIMESTEP, drifting_ball, square
+from draped_ball import drifting_ball, square
 
 from eslr_jax import (
     CheckpointError,

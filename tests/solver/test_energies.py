@@ -407,16 +407,6 @@ def test_collision_without_a_body_is_refused(case32):
         with_terms(case32.problem, (Collision(),))
 
 
-def test_energies_under_vmap_equal_a_loop(case32):
-    positions = np.stack([case32.position, case32.position * np.float32(1.01)])
-    function = jax.value_and_grad(potential)
-    batched, alone = jax.jit(jax.vmap(function, (0, None)))(positions, case32.problem), jax.jit(function)
-    for k, position in enumerate(positions):
-        value, gradient = alone(position, case32.problem)
-        np.testing.assert_allclose(batched[0][k], value, rtol=1e-6)
-        np.testing.assert_allclose(batched[1][k], gradient, atol=1e-6 * np.abs(gradient).max())
-
-
 def test_cloth_without_hinges_has_forces():
     """One triangle bends nowhere; the tables of its hinges are empty."""
     triangle = make_garment(

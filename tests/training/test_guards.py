@@ -20,13 +20,6 @@ from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import _advance, init_train_state, make_train_step, slot_problem
 
 
-@pytest.fixture(scope="module")
-def config(cheap_model):
-    return TrainConfig(
-        model=cheap_model, steps=6, warmup=1, slots_per_garment=1, log_every=2, horizon_growth=1
-    )
-
-
 def with_a_broken_vertex(state):
     """Return a training's state whose living trajectories have lost a vertex."""
     cloth = state.pools[0].state
@@ -89,7 +82,7 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
 ):
     new = cheap_model.new_network()
     bad = new.replace(params=jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), new.params))
-    patient = dataclasses.replace(config, max_skipped=3)
+    patient = dataclasses.replace(config, max_skipped=3, checkpoint_every=1000)
     with pytest.raises(
         NonFiniteError, match=r"^the last 4 updates were not finite at step 4; .* --start-from "
     ):
