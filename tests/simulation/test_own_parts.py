@@ -83,6 +83,7 @@ def test_an_own_energy_without_a_finite_gradient_is_refused():
         simulate(None, scene, config=SimConfig(iterations=5))
 
 
+@pytest.mark.slow  # training/test_own_network.py rolls one out, and the guide to extensions simulates one
 def test_an_own_network_goes_through_both_doors():
     garment, poses, module = square(), drifting_ball(4), Nudge()
     scene = prepare_scene(garment, poses, terms=CLOTH)
