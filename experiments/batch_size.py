@@ -52,13 +52,14 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
 
 
 def main() -> None:
-    options = parser(__doc__, "two frames, one turn")
+    options = parser(__doc__, "batches of 1 and 2, two frames, one turn")
     options.add_argument("--vertices", choices=get_args(Resolution), default="1k")
     options.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64])
     chosen = options.parse_args()
     path = chosen.out / "batch_size.json"
     result = kept(path)
-    rows = measure(chosen.vertices, chosen.batches, *((2, 1) if chosen.smoke else (20, 3)))
+    batches, frames, turns = ([1, 2], 2, 1) if chosen.smoke else (chosen.batches, 20, 3)
+    rows = measure(chosen.vertices, batches, frames, turns)
     result[f"{device_name()}, {chosen.vertices}"] = {"rows": rows, **machine()}
     keep(path, result)
 

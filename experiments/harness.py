@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fast_compilation import compile_fast
 
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.assets.budget import device_name
@@ -23,6 +24,8 @@ from eslr_jax.pipeline.report.report import environment
 EXPERIMENTS = Path(__file__).parent
 RESULTS = EXPERIMENTS / "results"
 os.environ.setdefault("MPLBACKEND", "Agg")  # figures are files
+if "--smoke" in sys.argv:  # before a script compiles anything
+    compile_fast()
 
 
 def parser(description: str | None, smoke: str, out: str | Path = RESULTS) -> argparse.ArgumentParser:

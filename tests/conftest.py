@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from fast_compilation import compile_fast
 from shapes import check_kernels
 
 cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eslr-jax" / "tests"
@@ -14,19 +15,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 check_kernels()
 
-# Small cloth spends its time in the compiler: without optimisation a rollout compiles in a third of the time. The
-# two passes take an eighth of what is left.
-_FAST_COMPILATION = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    "--xla_disable_hlo_passes=simplify-while-loops,while-loop-invariant-code-motion"
-)
-
 
 def pytest_configure(config):
     """Compile the quick tier fast; the slow tier runs what users run."""
-    is_quick = "not slow" in config.getoption("markexpr", "")
-    if is_quick and jax.__version__.startswith("0.10."):  # other releases may not know these flags, and abort
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FAST_COMPILATION}".strip()
+    if "not slow" in config.getoption("markexpr", ""):
+        compile_fast()
 
 
 @pytest.fixture(scope="session")

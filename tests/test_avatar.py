@@ -1,11 +1,10 @@
 """A new character with a garment of its own, in one command; and a body that is a mesh in motion."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from commands import eslr
 from foreign_files import write_smpl, write_walker
 from other_bodies import smpl_female
 
@@ -13,11 +12,6 @@ from eslr_jax import load_garment, load_motion, pose_body
 from eslr_jax.pipeline.formats.obj import obj_text
 from eslr_jax.pipeline.formats.trajectory import read_trajectory
 from eslr_jax.pose.lbs import skin_garment
-
-
-def eslr(*arguments):
-    command = [sys.executable, "-m", "eslr_jax.pipeline.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def done(*arguments):

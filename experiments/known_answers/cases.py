@@ -246,5 +246,5 @@ def answer(is_smoke: bool) -> Iterator[Answer]:
     for case in STATIC:
         yield from case(is_smoke)
     for case in MOVING:
-        for simulator in OURS:
+        for simulator in OURS[:1] if is_smoke else OURS:  # the others run the same code
             yield from case(simulator)

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax import SimConfig, prepare_scene
+from eslr_jax import SimConfig, prepare_scene, rollout_scene, scene_terms
 from eslr_jax.pipeline.report.referee import intersecting_pairs
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import Contact, Damping, scene_terms
+from eslr_jax.terms import Contact, Damping
 
 TERMS = scene_terms(Contact())
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from cloth import grid_faces, make_garment
 
+from eslr_jax import prepare_garment
 from eslr_jax.contact.edges import clearance_over
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, skin_heights
-from eslr_jax.mesh.prepare import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.terms.collision import skin_energies
 

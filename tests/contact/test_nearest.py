@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, load_body, load_garment, load_motion, pose_body, prepare_scene, rollout_scene
 from eslr_jax.contact.nearest import (
     CONTACT_RADIUS,
     are_pinched,
@@ -14,10 +14,7 @@ from eslr_jax.contact.nearest import (
 )
 from eslr_jax.mesh.closest import closest_points
 from eslr_jax.mesh.surface import prepare_surface
-from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, load_splits
-from eslr_jax.pose.motion import pose_body
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.pipeline.assets import load_splits
 
 find = jax.jit(find_contacts)
 

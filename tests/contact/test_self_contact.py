@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_sheet
 
+from eslr_jax import Status
 from eslr_jax.contact import self_contact
 from eslr_jax.contact.layer_edges import LayerPairs, without_edges
 from eslr_jax.contact.self_contact import TipPairs
-from eslr_jax.errors import Status
 from eslr_jax.mesh.padding import pad_garment
 from eslr_jax.mesh.prepare import to_device
 from eslr_jax.terms.repulsion import pair_heights, push_apart, repulsion_diagonal, repulsion_energies

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from draped_ball import RADIUS, ball, drifting_ball, square
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, prepare_scene, rollout_scene, scene_terms
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.contact.skin import find_skin_contacts, lift_off_skin, skin_heights
 from eslr_jax.mesh.closest import closest_points
@@ -14,9 +14,7 @@ from eslr_jax.mesh.padding import choose_bucket, pad_garment
 from eslr_jax.mesh.prepare import to_device
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import Collision, scene_terms
+from eslr_jax.terms import Collision
 from eslr_jax.terms.collision import skin_diagonal, skin_energies
 
 STIFFNESS, THICKNESS = 3.5e7, 2e-3  # [J/m^5], [m]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hard_cases.build import capsule, icosphere, join_meshes, make_cloth, make_scene, plane, sheet
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, rollout_scene
 from eslr_jax.contact.nearest import CONTACT_RADIUS, find_both_sides
 from eslr_jax.mesh.surface import prepare_surface
-from eslr_jax.simulation.rollout import rollout_scene
 
 SPEED = 13.0  # [m/s], 43 cm in a frame
 BALL, LIMB = 0.15, 0.05  # radii [m]

@@ -10,8 +10,7 @@ from eslr_jax.pipeline.report.referee import intersecting_pairs
 @pytest.fixture(scope="module")
 def walking(body, tshirt):
     """What a T-shirt reaches of a walking body: arms touch the trunk, and a crease crosses itself."""
-    from eslr_jax.pipeline.assets import load_motion
-    from eslr_jax.pose.motion import pose_body
+    from eslr_jax import load_motion, pose_body
     from eslr_jax.terms.worn import Worn
 
     poses = pose_body(body, load_motion("cmu_016_32"))

@@ -164,7 +164,7 @@ def test_a_change_spreads_layers_times_one_plus_smoothings_hops(sizes, scene):
     np.testing.assert_array_equal(reached, hops <= layers * (1 + smoothings))
 
 
-@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "paper", "smoothing"))
+@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "smoothing"))
 def test_messages_follow_the_graphs_senders(name, scene):
     network, graph, _ = run(trained(VARIANTS[name]), *scene)
     expected = apply(network, graph, scene[0])
@@ -221,7 +221,7 @@ def test_network_is_equivariant_to_vertex_order(name, scene):
     assert_close(actual, expected)
 
 
-@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "paper"))
+@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "smoothing"))
 def test_padding_does_not_change_the_answer(name, scene):
     network = trained(VARIANTS[name])
     expected = run(network, *scene)[2]
@@ -230,7 +230,7 @@ def test_padding_does_not_change_the_answer(name, scene):
     assert_close(actual[: len(expected)], expected, 2e-6)
 
 
-@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "paper"))
+@pytest.mark.parametrize("name", quick(["paper", "gradient", "smoothing"], "smoothing"))
 def test_masked_world_rows_contribute_exactly_nothing(name, scene):
     network, graph, _ = run(trained(VARIANTS[name]), *scene)
     unused = ~np.asarray(graph.globals["world_mask"])[:, None]

@@ -9,7 +9,8 @@ from cloth import make_sheet
 from draped_ball import RADIUS, ball, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 
-from eslr_jax import SimConfig, load_garment, load_motion, pose_body, prepare_scene, rollout_scene
+from eslr_jax import load_garment, load_motion, pose_body, prepare_scene
+from eslr_jax.pipeline.report.foreign import foreign_trajectory
 from eslr_jax.pipeline.report.referee import judge
 from eslr_jax.pipeline.report.report import describe_report, describe_start, start_crossing, trajectory_report
 from eslr_jax.pipeline.report.wear import wear_report
@@ -19,11 +20,14 @@ from eslr_jax.terms import Repulsion
 
 @pytest.fixture(scope="module")
 def worn():
-    """A square that covers the top of the ball, its scene and its place when it is skinned."""
+    """A square that covers the top of the ball, its scene, a trajectory at rest and its skinned place."""
     garment, poses = square(), drifting_ball(3)
-    scene = prepare_scene(garment, poses)
-    trajectory = rollout_scene(None, scene, SimConfig(iterations=15))
-    return garment, poses, scene, trajectory, np.asarray(skin_garment(garment, poses.joint_transforms))
+    scene, still = prepare_scene(garment, poses), np.zeros(3)
+    skinned = np.asarray(skin_garment(garment, poses.joint_transforms))
+    trajectory = foreign_trajectory(
+        skinned, scene, velocities=0 * skinned, friction_loads=0 * skinned[..., 0]
+    ).replace(energies={term.name: still for term in scene.terms}, residuals=still)
+    return garment, poses, scene, trajectory, skinned
 
 
 def report_of(worn, positions):

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from draped_ball import ball, square
 
-from eslr_jax.config import SimConfig, from_dict
-from eslr_jax.errors import ConfigError, MeshError
+from eslr_jax import ConfigError, MeshError, SimConfig, load_body
+from eslr_jax.config import from_dict
 from eslr_jax.mesh.validate import validate_body
-from eslr_jax.pipeline.assets import load_body
 
 
 def test_pins_are_a_mask_or_indices_of_vertices_that_exist():

@@ -12,31 +12,25 @@ import pytest
 from draped_ball import drifting_ball, square
 from flax import struct
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError, Status
-from eslr_jax.fabric.materials import COTTON
-from eslr_jax.mesh.prepare import prepare_garment
-from eslr_jax.mesh.rest_shape import with_rest_positions
-from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.assets import load_motion
-from eslr_jax.pose.motion import pose_body
-from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout, rollout_scene
-from eslr_jax.simulation.simulate import raise_for_status
-from eslr_jax.solver.solve import Start, solve, solve_hessian
-from eslr_jax.terms import (
-    CLOTH,
-    Air,
-    Collision,
-    Damping,
-    Friction,
-    Gravity,
-    Ground,
-    Repulsion,
-    Term,
+from eslr_jax import (
+    ConfigError,
+    SimConfig,
+    Status,
+    load_motion,
+    pose_body,
+    prepare_garment,
+    prepare_scene,
+    rollout,
+    rollout_scene,
     scene_terms,
 )
+from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.rest_shape import with_rest_positions
+from eslr_jax.networks.registry import MODELS
+from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.simulation.simulate import raise_for_status
+from eslr_jax.solver.solve import Start, solve, solve_hessian
+from eslr_jax.terms import CLOTH, Air, Collision, Damping, Friction, Gravity, Ground, Repulsion, Term
 from eslr_jax.types import tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends

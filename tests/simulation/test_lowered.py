@@ -4,11 +4,10 @@ import jax
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig, prepare_scene, scene_terms
 from eslr_jax.simulation import frame
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion, scene_terms
+from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion
 
 
 @pytest.mark.slow

@@ -8,8 +8,7 @@ from draped_ball import drifting_ball, square
 from flax import linen as nn
 from flax import struct
 
-from eslr_jax import Network, SimConfig, plan_scene, prepare_scene, rollout, simulate
-from eslr_jax.errors import NonFiniteError
+from eslr_jax import Network, NonFiniteError, SimConfig, plan_scene, prepare_scene, rollout, simulate
 from eslr_jax.networks.network import System
 from eslr_jax.pipeline.report.report import trajectory_report
 from eslr_jax.simulation.frame import first_problem
@@ -84,6 +83,7 @@ def test_an_own_energy_without_a_finite_gradient_is_refused():
         simulate(None, scene, config=SimConfig(iterations=5))
 
 
+@pytest.mark.slow  # training/test_own_network.py rolls one out, and the guide to extensions simulates one
 def test_an_own_network_goes_through_both_doors():
     garment, poses, module = square(), drifting_ball(4), Nudge()
     scene = prepare_scene(garment, poses, terms=CLOTH)

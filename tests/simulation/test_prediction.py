@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import Status
+from eslr_jax import SimConfig, Status, prepare_scene
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.stepper import make_stepper
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import potential

@@ -7,7 +7,7 @@ import pytest
 from jax import export
 from own_term import Push
 
-from eslr_jax.config import SimConfig
+from eslr_jax import SimConfig
 from eslr_jax.numerics import masked_sum
 from eslr_jax.simulation import program
 from eslr_jax.simulation.program import find_program

@@ -7,16 +7,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from draped_ball import TIMESTEP, drifting_ball, square
+from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import CheckpointError, ConfigError, MotionError, NonFiniteError, Status
+from eslr_jax import (
+    CheckpointError,
+    ConfigError,
+    MotionError,
+    NonFiniteError,
+    SimConfig,
+    Status,
+    plan_scene,
+    prepare_scene,
+    rollout,
+    rollout_scene,
+    simulate,
+    step,
+)
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.gap import trajectory_gap
-from eslr_jax.simulation.plan import plan_scene, prepare_scene
-from eslr_jax.simulation.rollout import rollout, rollout_scene, step
-from eslr_jax.simulation.simulate import raise_for_status, simulate
+from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
 from eslr_jax.terms import CLOTH, Gravity
 
@@ -81,6 +91,7 @@ def test_steps_one_by_one_are_the_rollout(cloth, poses, solved):
         assert int(report.iterations) == int(solved.iterations[frame + 1])
 
 
+@pytest.mark.slow  # a batch maps its scenes too, see test_batch.py
 def test_vmap_over_fabrics_and_motions_equals_one_by_one(cloth):
     motions = [drifting_ball(3, speed=speed) for speed in (0.3, 0.3, 0.2)]
 
@@ -111,25 +122,6 @@ def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
     assert near.surface.faces.shape[0] < poses.surface.faces.shape[0]
     planned = rollout(None, cloth, near, config=SOLVER, terms=terms)
     np.testing.assert_allclose(planned.positions, solved.positions, atol=1e-4)
-
-
-def test_pins_follow_the_body(poses):
-    pinned = square(is_pinned=np.array([0, 7]))
-    trajectory = rollout(None, pinned, poses, config=SOLVER)
-    corner = np.asarray(pinned.rest_positions)[0] + np.asarray(poses.joint_transforms)[:, 0, :, 3]
-    np.testing.assert_allclose(trajectory.positions[:, 0], corner, atol=1e-6)
-
-
-def test_scene_without_a_body_falls_like_implicit_euler(cloth, poses):
-    options = {"terms": CLOTH, "starts_at_rest": True}
-    scene = prepare_scene(cloth, poses, **options)
-    assert scene.body is None
-    trajectory = rollout_scene(None, scene, SOLVER)
-    frames = np.arange(3)
-    # Backward Euler: velocity after n steps is -g n dt, so the fall is g dt^2 n (n + 1) / 2.
-    fall = 9.81 * TIMESTEP**2 * frames * (frames + 1) / 2
-    height = np.asarray(trajectory.positions)[..., 1].mean(axis=1)
-    np.testing.assert_allclose(height[0] - height, fall, rtol=2e-3, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -171,7 +163,7 @@ def test_single_frame_is_refused(cloth, poses):
 
 
 def test_other_values_compile_nothing_anew(cloth, poses):
-    scene = prepare_scene(cloth, poses)
+    scene = prepare_scene(cloth, poses, terms=CLOTH)
     rollout_scene(None, scene, SOLVER)
     before = rollout_scene._cache_size()
     gravity = scene.term(Gravity)

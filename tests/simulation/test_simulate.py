@@ -10,17 +10,25 @@ import numpy as np
 import pytest
 from draped_ball import drifting_ball, square
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import CapacityError, ConfigError, MotionError, Status
+from eslr_jax import (
+    CapacityError,
+    ConfigError,
+    MotionError,
+    SimConfig,
+    Status,
+    prepare_scene,
+    rollout_scene,
+    scene_terms,
+    simulate,
+)
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.cli.actor import Actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.cli.simulate import Unfinished
 from eslr_jax.pipeline.report.gap import GapOptions, measure_gap
 from eslr_jax.simulation.archive import read_tree, write_tree
-from eslr_jax.simulation.plan import first_frames, prepare_scene
+from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.program import _program, find_program
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.simulation.simulate import (
     begin_compiling,
@@ -28,9 +36,8 @@ from eslr_jax.simulation.simulate import (
     good_frames,
     hold_last,
     raise_for_status,
-    simulate,
 )
-from eslr_jax.terms import CLOTH, Friction, Repulsion, scene_terms
+from eslr_jax.terms import CLOTH, Friction, Repulsion
 
 SOLVER = SimConfig(iterations=12)
 
@@ -77,10 +84,10 @@ def test_a_simulation_that_was_stopped_goes_on_to_the_same_end(scene):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def crossing_sheets(num_frames=3):
+def crossing_sheets(num_frames=3, **options):
     """Two squares a few millimetres apart: every vertex has pairs."""
     lower, upper = square(), square()
-    from eslr_jax.mesh.prepare import prepare_garment
+    from eslr_jax import prepare_garment
 
     rest = np.concatenate([lower.rest_positions, np.add(upper.rest_positions, [0, 0.02, 0])])
     faces = np.concatenate([lower.faces, np.asarray(upper.faces) + 64])
@@ -89,7 +96,11 @@ def crossing_sheets(num_frames=3):
         rest, faces, skin_weights=ones, skin_indices=0 * ones.astype(int), allow_components=True
     )
     scene = prepare_scene(
-        garment, drifting_ball(num_frames), terms=scene_terms(Repulsion(where="all")), starts_at_rest=True
+        garment,
+        drifting_ball(num_frames),
+        terms=scene_terms(Repulsion(where="all")),
+        starts_at_rest=True,
+        **options,
     )
     close = rest.copy()
     close[64:, 1] -= 0.016
@@ -105,10 +116,9 @@ def simulated(kind):
         "euler": {},
         "bdf2": {"integrator": "bdf2"},
         "substeps": {"substeps": 2},
-        "substeps of bdf2": {"integrator": "bdf2", "substeps": 2},
     }
-    if kind == "self-contact":
-        scene = crossing_sheets(14)
+    if kind == "self-contact in substeps of bdf2":
+        scene = crossing_sheets(14, integrator="bdf2", substeps=2)
         scene = scene.with_term(scene.term(Repulsion).replace(num_rows=1000))
     else:
         scene = prepare_scene(square(), drifting_ball(14), **options[kind])
@@ -121,8 +131,7 @@ def simulated(kind):
         "euler",
         pytest.param("bdf2", marks=pytest.mark.slow),
         pytest.param("substeps", marks=pytest.mark.slow),
-        "substeps of bdf2",
-        "self-contact",
+        "self-contact in substeps of bdf2",
     ],
 )
 def test_from_any_frame_on_it_goes_on_bit_by_bit_though_all_chunks_begin_elsewhere(kind):
@@ -153,7 +162,7 @@ def kept(path, trajectory, scene):
 
 
 def test_an_unfinished_simulation_with_self_contact_is_read_as_it_was_written(tmp_path):
-    part, _, scene = simulated("self-contact")
+    part, _, scene = simulated("self-contact in substeps of bdf2")
     demand = np.asarray(part.demands["repulsion"])
     assert demand.shape == (14,)
     assert demand[1:].min() > 0

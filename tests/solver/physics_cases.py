@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from cloth import make_garment, make_sheet
 
+from eslr_jax import Material
 from eslr_jax.mesh import topology
 from eslr_jax.mesh.padding import pad_garment
 from eslr_jax.mesh.prepare import to_device
@@ -16,7 +17,7 @@ from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Stret
 from eslr_jax.terms.collision import BodyContact
 from eslr_jax.terms.friction import Rubbing
 from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.types import Contacts, Garment, Material
+from eslr_jax.types import Contacts, Garment
 
 TIMESTEP = 1 / 30
 BODY_MOTION = np.array([0.003, 0.002, -0.001])  # [m] in the frame

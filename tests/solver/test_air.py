@@ -11,13 +11,10 @@ from jax.tree_util import Partial
 from known_answers.strip import LENGTH, strip
 from scipy.optimize import brentq
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, SimConfig, prepare_scene, rollout_scene, scene_terms
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
-from eslr_jax.simulation.rollout import rollout_scene
-from eslr_jax.terms import Air, scene_terms
+from eslr_jax.terms import Air
 from eslr_jax.terms.air import blowing, gusts
 
 GRAVITY = 9.81  # [m/s^2]

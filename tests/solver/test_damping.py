@@ -6,9 +6,7 @@ import pytest
 from known_answers.strip import LENGTH, strip
 from scipy.signal import find_peaks
 
-from eslr_jax.config import SimConfig
-from eslr_jax.errors import ConfigError
-from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax import ConfigError, SimConfig, rollout_scene
 from eslr_jax.terms import Damping
 
 

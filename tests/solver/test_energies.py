@@ -11,10 +11,9 @@ from cloth import make_garment, make_sheet
 from draped_ball import drifting_ball
 from physics_cases import make_case, pad_case, to_numpy
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, prepare_scene
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.solver.potential import contact_load, potential, potential_terms
 from eslr_jax.terms import CLOTH, Collision, Friction, Gravity
 from eslr_jax.terms.bending import bending_energy, dihedral_angles
@@ -406,16 +405,6 @@ def test_the_potential_is_the_sum_of_its_terms(case32):
 def test_collision_without_a_body_is_refused(case32):
     with pytest.raises(ConfigError, match="needs a body"):
         with_terms(case32.problem, (Collision(),))
-
-
-def test_energies_under_vmap_equal_a_loop(case32):
-    positions = np.stack([case32.position, case32.position * np.float32(1.01)])
-    function = jax.value_and_grad(potential)
-    batched, alone = jax.jit(jax.vmap(function, (0, None)))(positions, case32.problem), jax.jit(function)
-    for k, position in enumerate(positions):
-        value, gradient = alone(position, case32.problem)
-        np.testing.assert_allclose(batched[0][k], value, rtol=1e-6)
-        np.testing.assert_allclose(batched[1][k], gradient, atol=1e-6 * np.abs(gradient).max())
 
 
 def test_cloth_without_hinges_has_forces():

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_sheet
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, Material, scene_terms
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.fabric.validate import MATERIAL_RANGES, validate_material, validate_timestep
-from eslr_jax.terms import Air, Collision, Damping, Gravity, scene_terms
-from eslr_jax.types import Material
+from eslr_jax.terms import Air, Collision, Damping, Gravity
 
 TERMS = (*scene_terms(), Air((0.0, 0.0, 0.0)), Damping(0.01))
 CONSTANTS = [(term, field) for term in TERMS for field in term.ranges]

@@ -9,13 +9,12 @@ from draped_ball import drifting_ball, square
 from known_answers.sheets import irregular
 from newton_oracle import minimize_newton, potential_float64
 
-from eslr_jax.errors import ConfigError
+from eslr_jax import ConfigError, prepare_scene
 from eslr_jax.fabric.materials import COTTON, Weave
 from eslr_jax.mesh.plate import warp_directions
 from eslr_jax.mesh.rest_shape import with_rest_positions
 from eslr_jax.pipeline.fabrics import Described, describe_fabric, on_threads
 from eslr_jax.simulation.frame import first_problem
-from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.solver.lbfgs import Stop, minimize
 from eslr_jax.solver.potential import evaluate, potential
 from eslr_jax.solver.preconditioner import stiffness

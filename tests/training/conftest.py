@@ -36,9 +36,15 @@ def cheap_model():
 
 @pytest.fixture(scope="session")
 def config(cheap_model):
-    """Six steps."""
+    """Six steps, one program for all that take them."""
     from eslr_jax import TrainConfig
 
     return TrainConfig(
-        model=cheap_model, steps=6, warmup=2, slots_per_garment=2, log_every=2, checkpoint_every=2
+        model=cheap_model,
+        steps=6,
+        warmup=1,
+        slots_per_garment=1,
+        log_every=2,
+        checkpoint_every=2,
+        horizon_growth=1,
     )

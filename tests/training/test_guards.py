@@ -9,23 +9,15 @@ import numpy as np
 import pytest
 from cloth import make_garment, make_limb, make_sheet, swing_motion
 
-from eslr_jax import CapacityError, NonFiniteError, Status, TrainConfig
+from eslr_jax import CapacityError, NonFiniteError, Status, TrainConfig, load_model
 from eslr_jax.networks.normalizer import WARMUP_UPDATES
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.assets.models import load_model
 from eslr_jax.training.checkpoint import Checkpoints
 from eslr_jax.training.data import build_training_data
 from eslr_jax.training.loop import train, window_metrics
 from eslr_jax.training.loss import LossReport
 from eslr_jax.training.pool import start_trajectory
 from eslr_jax.training.step import _advance, init_train_state, make_train_step, slot_problem
-
-
-@pytest.fixture(scope="module")
-def config(cheap_model):
-    return TrainConfig(
-        model=cheap_model, steps=6, warmup=1, slots_per_garment=1, log_every=2, horizon_growth=1
-    )
 
 
 def with_a_broken_vertex(state):
@@ -90,7 +82,7 @@ def test_a_run_whose_updates_are_not_finite_ends_and_leaves_its_trajectories(
 ):
     new = cheap_model.new_network()
     bad = new.replace(params=jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), new.params))
-    patient = dataclasses.replace(config, max_skipped=3)
+    patient = dataclasses.replace(config, max_skipped=3, checkpoint_every=1000)
     with pytest.raises(
         NonFiniteError, match=r"^the last 4 updates were not finite at step 4; .* --start-from "
     ):

@@ -11,6 +11,7 @@ from draped_ball import drifting_ball, square
 
 from eslr_jax import CheckpointError, ConfigError, SimConfig, TrainConfig, load_model, rollout
 from eslr_jax.networks.registry import read_system
+from eslr_jax.terms import CLOTH
 from eslr_jax.training.checkpoint import read_run_config
 from eslr_jax.training.loop import train
 
@@ -50,7 +51,9 @@ def test_it_is_trained_and_its_file_simulates(own, small_data, tmp_path):
     assert loaded.config == own
     jax.tree.map(np.testing.assert_array_equal, loaded, state.network)
     simulate = jax.jit(
-        lambda network: rollout(network, square(), drifting_ball(3), config=SimConfig(iterations=0))
+        lambda network: rollout(
+            network, square(), drifting_ball(3), config=SimConfig(iterations=0), terms=CLOTH
+        )
     )
     still = jax.tree.map(jnp.zeros_like, loaded)  # predicts the solver's guess
     moved, guessed = (simulate(network).positions for network in (loaded, still))

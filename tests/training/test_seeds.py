@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from eslr_jax import TrainConfig
-from eslr_jax.pipeline.assets.models import load_model, model_record
+from eslr_jax import TrainConfig, load_model
+from eslr_jax.pipeline.assets.models import model_record
 from eslr_jax.training.loop import make_seeds_step, stack_seeds, take_seed, train
 from eslr_jax.training.step import init_train_state, make_train_step
 

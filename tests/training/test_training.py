@@ -287,7 +287,9 @@ def test_contraction_weighs_each_refinement_step_by_what_it_leaves(config, small
 def test_a_network_for_the_solver_trains_from_optima(config, small_data, tmp_path):
     """Gap and distance to where the solver ends shrink."""
     model = dataclasses.replace(MODELS["smooth-small"], latent_size=16)
-    config = dataclasses.replace(config, model=model, steps=60, iterations=10, log_every=10)
+    config = dataclasses.replace(
+        config, model=model, steps=60, iterations=10, log_every=10, slots_per_garment=2, horizon_growth=60
+    )
     state = train(config, tmp_path, datasets=(small_data,))
     losses = [json.loads(line)["loss"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert int(state.skipped) == 0
