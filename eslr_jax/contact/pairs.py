@@ -18,10 +18,13 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, dot3, sub3
 
-GAP = 1e-4  # [m] that pushed pairs are left at most: 500 times the rounding of positions in float32
+GAP = 1e-4  # [m] that pushed pairs are left
+# [m] that pairs may end with, so that gaps do not shrink from frame to frame: in float32 the normal across a gap
+# of a micrometre is off by 1e-2, which is more than the gap over the length of a face.
+FLOOR = 0.5 * GAP
 CHUNK = 512  # rows that are looked at together, and of which tables hold a multiple
 _SECTIONS = 4  # of a straight way, each with separating directions of its own
-_LEAST = 0.25  # of the gap that is asked for, with which a pair still counts as parted
+_LEAST = 0.1  # of the distance at the start, of the gap with which a pair still counts as parted
 _OVERSHOOT = 1.05  # of a push, so that sweeps end
 _SHORT = 1e-9  # [m] below which two primitives touch, and have no direction
 
@@ -107,7 +110,7 @@ class _Course(NamedTuple):
 
     corners: tuple[Vector3, ...]  # at the end of the last section [m]
     normal: Vector3  # which separated them there
-    wanted: Float[Array, " rows"]  # gap [m]
+    least: Float[Array, " rows"]  # gap that a direction has to show [m]
     is_parted: Bool[Array, " rows"]  # nothing has met so far
     last: Vector3  # the normal where the first section begins that no direction separates
 
@@ -130,14 +133,15 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
         near = closest(corners, is_edge)
         normal: Vector3 = tuple(part / near.distance for part in near.offset)  # type: ignore[assignment]
         is_first = number == 0
-        wanted = jnp.where(is_first, 0.5 * jnp.minimum(near.distance, 2.0 * GAP), course.wanted)
+        least = jnp.where(is_first, _LEAST * jnp.minimum(near.distance, GAP), course.least)
         is_parted = is_first
         for along in (course.normal, normal):
             gaps = [_gap(_heights(along, places), side) for places in (course.corners, corners)]
-            is_parted = is_parted | (jnp.minimum(*gaps) >= _LEAST * wanted)
+            is_parted = is_parted | (jnp.minimum(*gaps) >= least)
+        is_parted = is_parted & ((number < _SECTIONS) | (near.distance >= FLOOR))
         before = _where(is_first, normal, course.normal)
         last = _where(course.is_parted & ~is_parted, before, course.last)
-        return _Course(corners, normal, wanted, course.is_parted & is_parted, _where(is_first, normal, last))
+        return _Course(corners, normal, least, course.is_parted & is_parted, _where(is_first, normal, last))
 
     nothing = jnp.zeros_like(start[0][0])
     nowhere = (nothing, nothing, nothing)
@@ -170,8 +174,8 @@ def pushed_apart(
 ) -> tuple[Vector3, Float[Array, ""]]:
     """Return ends of straight ways, pushed so that no pair meets, and what gap is lacking.
 
-    A pair that may meet is pushed apart along the direction that separated it last: to half of the distance that
-    it starts with, or to `GAP` where it starts farther apart. Vertices take the mean of their pushes.
+    A pair that may meet, or ends nearer than `FLOOR`, is pushed apart to `GAP` along the direction that separated
+    it last. Vertices take the mean of their pushes.
 
     Args:
         start: Vertices before, by components [m]; no pair crosses.
@@ -223,9 +227,9 @@ def _pushes(
     along = _heights(course.last, p)
     lowest, highest = _between(along, side)
     is_lacking = is_used & (can_first | can_second) & ~course.is_parted
-    middle, half = 0.5 * (lowest + highest), 0.5 * course.wanted
-    upper = jnp.where(can_first & can_second, middle + half, highest + course.wanted)
-    lower = jnp.where(can_first & can_second, middle - half, lowest - course.wanted)
+    middle = 0.5 * (lowest + highest)
+    upper = jnp.where(can_first & can_second, middle + 0.5 * GAP, highest + GAP)
+    lower = jnp.where(can_first & can_second, middle - 0.5 * GAP, lowest - GAP)
     entries = []
     for k in range(4):
         up = jnp.maximum(upper - along[k], 0.0) if side[k] > 0 else jnp.minimum(lower - along[k], 0.0)
@@ -233,7 +237,7 @@ def _pushes(
         is_pushed = (up != 0).astype(up.dtype)
         entries.append(jnp.stack([*(part * up for part in course.last), is_pushed], axis=1))
     # A pair that is apart at the end, but not for certain on the way, lacks something too.
-    lack = jnp.where(is_lacking, jnp.maximum(course.wanted - (lowest - highest), _SHORT), 0.0)
+    lack = jnp.where(is_lacking, jnp.maximum(GAP - (lowest - highest), _SHORT), 0.0)
     return jnp.max(lack), jnp.concatenate(entries)
 
 

@@ -74,6 +74,21 @@ def test_pushed_ends_are_reached_without_crossing_and_those_that_meet_nothing_st
     assert is_pushed[~does_meet].mean() < 0.1
 
 
+@KINDS
+def test_gaps_do_not_shrink_below_the_floor(is_edge):
+    table, ids, x = random_rows(is_edge, scale=0.005)
+    near = pairs.closest(pairs.corners_of(columns(x), jnp.asarray(ids)), is_edge)
+    # The first primitive of every pair goes to 20 micrometres before the second.
+    toward = np.stack(near.offset, axis=1) * np.asarray(1 - 2e-5 / near.distance)[:, None]
+    first = ids[: 2 if is_edge else 1]
+    x[first] -= toward.astype(np.float32)
+    is_free = jnp.asarray(np.isin(np.arange(len(x)), first))
+    ends, lack = pairs.pushed_apart(columns(x), columns(x), table, is_free, 60)
+    distance = pairs.closest(pairs.corners_of(ends, jnp.asarray(ids)), is_edge).distance
+    assert float(lack) == 0
+    assert float(distance.min()) >= pairs.FLOOR
+
+
 def sheet_in_ball():
     """Return meshes and places of a sheet whose middle lies in a ball: there both are near each other."""
     garment, poses = square(side=12), drifting_ball(2)
