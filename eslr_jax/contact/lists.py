@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.pairs import GAP, Pairs, Rows, closest, corners_of, signs
+from eslr_jax.contact.pairs import GAP, Pairs, Rows, closest, corners_of, gap_along, signs
 from eslr_jax.contact.search import Candidates, append, test_candidates
-from eslr_jax.numerics import Vector3, dot3, in_memory, sub3, true_entries
+from eslr_jax.numerics import Vector3, in_memory, true_entries
 from eslr_jax.types import BodySurface, Garment
 
 
@@ -208,18 +208,12 @@ def _may_meet(ids: Int[Array, "corners rows"], is_edge: bool, motion: Motion) ->
     """Return which pairs the normal half way does not part all the way; those that share a vertex don't count."""
     p, half, side = corners_of(motion.middle, ids), corners_of(motion.half, ids), signs(is_edge)
     near = closest(p, is_edge)
-    normal = tuple(part / near.distance for part in near.offset)
-    ends = []
-    for sign in (1.0, -1.0):
-        along = [
-            s * (dot3(normal, sub3(corner, p[0])) + sign * dot3(normal, way))  # type: ignore[arg-type]
-            for s, corner, way in zip(side, p, half, strict=True)
-        ]
-        lows = [
-            functools.reduce(jnp.minimum, [a for a, t in zip(along, side, strict=True) if t == s])
-            for s in (1, -1)
-        ]
-        ends.append(lows[0] + lows[1])
+    normal: Vector3 = tuple(part / near.distance for part in near.offset)  # type: ignore[assignment]
+    ends = [
+        tuple(tuple(a + sign * b for a, b in zip(*one, strict=True)) for one in zip(p, half, strict=True))
+        for sign in (-1.0, 1.0)
+    ]
+    gap = jnp.minimum(*(gap_along(normal, corners, side) for corners in ends))  # type: ignore[arg-type]
     shares_one = functools.reduce(
         jnp.logical_or, [ids[a] == ids[b] for a in range(4) for b in range(a) if side[a] != side[b]]
     )
@@ -227,4 +221,4 @@ def _may_meet(ids: Int[Array, "corners rows"], is_edge: bool, motion: Motion) ->
         functools.reduce(jnp.maximum, [motion.radius[ids[k]] for k in range(4) if side[k] == s])
         for s in (1, -1)
     ]
-    return ~shares_one & (jnp.minimum(*ends) < GAP + balls[0] + balls[1])
+    return ~shares_one & (gap < GAP + balls[0] + balls[1])

@@ -136,7 +136,7 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
         least = jnp.where(is_first, _LEAST * jnp.minimum(near.distance, GAP), course.least)
         is_parted = is_first
         for along in (course.normal, normal):
-            gaps = [_gap(_heights(along, places), side) for places in (course.corners, corners)]
+            gaps = [gap_along(along, places, side) for places in (course.corners, corners)]
             is_parted = is_parted | (jnp.minimum(*gaps) >= least)
         is_parted = is_parted & ((number < _SECTIONS) | (near.distance >= FLOOR))
         before = _where(is_first, normal, course.normal)
@@ -154,8 +154,9 @@ def _heights(normal: Vector3, p: tuple[Vector3, ...]) -> list[Array]:
     return [dot3(normal, sub3(corner, p[0])) for corner in p]  # type: ignore[arg-type]
 
 
-def _gap(heights: Sequence[Array], side: Sequence[int]) -> Array:
-    lowest, highest = _between(heights, side)
+def gap_along(normal: Vector3, p: tuple[Vector3, ...], side: Sequence[int]) -> Float[Array, " rows"]:
+    """Return by how much the first primitives are higher than the second along a normal [m]."""
+    lowest, highest = _between(_heights(normal, p), side)
     return lowest - highest
 
 

@@ -61,7 +61,7 @@ class Contact(Term):
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Contact:
         """Return itself with sizes of its tables; it keeps layers where a term before it pushes them apart."""
-        rows = CHUNK * math.ceil(_ROWS * len(worn.pieces) / CHUNK) if self.rows is None else self.rows
+        rows = self._num_rows(len(worn.pieces))
         has_layers = any(isinstance(term, Repulsion) for term in others)
         unfolding = jnp.asarray(worn.unfolding) if has_layers else 0.0
         return self.replace(rows=rows, has_layers=has_layers, unfolding=unfolding)
@@ -94,12 +94,12 @@ class Contact(Term):
             -inwards.T,
             joint_meshes(garment, body.surface, has_layers=self.has_layers),
             garment.vertex_mask & ~garment.is_pinned,
-            self._num_rows(position),
+            self._num_rows(len(position)),
         )
         return grown.position.T
 
-    def _num_rows(self, position: Float[Array, "vertices 3"]) -> int:
-        return CHUNK * math.ceil(_ROWS * len(position) / CHUNK) if self.rows is None else self.rows
+    def _num_rows(self, num_vertices: int) -> int:
+        return CHUNK * math.ceil(_ROWS * num_vertices / CHUNK) if self.rows is None else self.rows
 
     def correct(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: None
@@ -116,7 +116,9 @@ class Contact(Term):
             ways = (nothing, nothing) if body is None else (body.start.T, (body.end - body.start).T)
             surface = None if body is None else body.surface
             meshes = joint_meshes(garment, surface, has_layers=self.has_layers)
-            return move_clear(start, position.T - start, *ways, meshes, is_free, self._num_rows(position))
+            return move_clear(
+                start, position.T - start, *ways, meshes, is_free, self._num_rows(len(position))
+            )
 
         ended = moved(*jax.lax.stop_gradient((position, problem)))
         pushed = ended.position.T - jax.lax.stop_gradient(position)
@@ -130,7 +132,7 @@ class Contact(Term):
         """Return whether something was let through, or a table too small."""
         if data is None:
             return jnp.int32(Status.OK)
-        is_full = data.most > self._num_rows(problem.position)
+        is_full = data.most > self._num_rows(len(problem.position))
         passed = jnp.where(data.is_passed & ~is_full, int(Status.BODY_TOO_FAST), int(Status.OK))
         return passed | jnp.where(is_full, int(Status.SELF_CONTACT_OVERFLOW), int(Status.OK))
 
