@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.pairs import GAP, Pairs, Rows, closest, corners_of, gap_along, signs
 from eslr_jax.contact.search import Candidates, append, test_candidates
-from eslr_jax.numerics import Vector3, in_memory, true_entries
+from eslr_jax.numerics import Vector3, true_entries
 from eslr_jax.types import BodySurface, Garment
 
 
@@ -161,9 +161,9 @@ def _are_close(
     # A couple of groups of edges is looked at once; the cloth's come first.
     rows = first.blocks[: first.num_cloth] if is_edge else first.blocks
     is_close = jnp.ones((rows.shape[0], second.blocks.shape[0]), bool)
-    for axis in range(3):
-        low, high = _range(rows, own, axis)
-        other_low, other_high = _range(second.blocks, others, axis)
+    for (low, high), (other_low, other_high) in zip(
+        _ranges(rows, own), _ranges(second.blocks, others), strict=True
+    ):
         is_close = is_close & (low[:, None] <= other_high[None]) & (other_low[None] <= high[:, None])
     group, other = (jnp.arange(count) for count in is_close.shape)
     is_first, is_second = (group < first.num_cloth)[:, None], (other < second.num_cloth)[None]
@@ -171,11 +171,14 @@ def _are_close(
     return is_close & (group[:, None] <= other[None]) if is_edge else is_close
 
 
-def _range(blocks: Int[Array, "blocks members"], boxes: _Boxes, axis: int) -> tuple[Array, Array]:
-    """Return from where to where the boxes of every group reach, all the way [m]."""
-    middle, spread = boxes.middle[axis], boxes.size[axis] + jnp.abs(boxes.half[axis])
-    low, high = in_memory(middle - spread, middle + spread)
-    return jnp.min(low[blocks], axis=1), jnp.max(high[blocks], axis=1)
+def _ranges(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> list[tuple[Array, Array]]:
+    """Return from where to where the boxes of every group reach, all the way [m], axis by axis."""
+    spread = [size + jnp.abs(half) for half, size in zip(boxes.half, boxes.size, strict=True)]
+    ends = [sign * x + away for sign in (-1, 1) for x, away in zip(boxes.middle, spread, strict=True)]
+    # All in one: XLA computes minima anew for every couple of groups where each has its own array, in 60 times
+    # the time.
+    x, y, z, *highest = jnp.max(jnp.stack(ends)[:, blocks], axis=2)
+    return [(-low, high) for low, high in zip((x, y, z), highest, strict=True)]
 
 
 def _table(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "blocks numbers members"]:

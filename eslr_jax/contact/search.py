@@ -25,7 +25,7 @@ from eslr_jax.types import BodySurface
 
 _INFINITY = 0x7F800000  # bits of the float32 infinity
 _COLUMNS = 32  # patches are padded to a multiple: XLA packs bits four times as fast without a rest
-_BLOCK_PAIRS = 2048  # of groups looked at together; what is read of them then stays in the cache
+_BLOCK_PAIRS = 512  # of groups looked at together; what is read of them then stays in the cache
 _CANDIDATES = 1024  # that are tested exactly at a time
 _FIRST = 2  # patches that every block looks into; what they hold bounds the distance to the others
 _PAIRS = 4  # pairs of a block and a patch that are looked at together, times the number of blocks

@@ -21,14 +21,14 @@ from scipy.spatial import cKDTree
 from eslr_jax.mesh.piercing import piercing_edges
 from eslr_jax.mesh.topology import unique_edges
 
-_GAP = 8e-3  # [m] between two parts: cloth on both sides, each within its reach of contact
+_GAP = 3e-3  # [m] between two parts: two layers of cloth, and a millimetre around each
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
-_AROUND = 0.04  # [m] in which faces are looked for
+_AROUND = 0.025  # [m] in which faces are looked for
 # [m] apart at rest, below which places belong to one crease; and the gap over what is beyond `_CREASE_START`
 _CREASE = (0.04, 0.2)
 _CREASE_START = 0.03  # [m]
 _TURNED = -0.2  # cosine between normals, below which two places face each other
-_FOLDED = 0.7  # cosine between normals, below which faces may cross
+_FOLDED = 0.2  # cosine between normals, below which faces may cross
 _SWEEPS = 40  # of pushes; ten are enough for most frames
 _SHARE = 0.8  # of a push that is done at a time
 _SMOOTHING = 0.3  # share of the way to the neighbours' mean, at a time
@@ -40,6 +40,7 @@ def parted(
     positions: Float[np.ndarray, "frames vertices 3"],
     rest: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
+    every: int = 1,
 ) -> Float[np.ndarray, "frames vertices 3"]:
     """Return the positions of a body whose parts have been pushed apart [m].
 
@@ -47,13 +48,18 @@ def parted(
         positions: Of the moving body [m].
         rest: In a pose in which nothing crosses [m].
         faces: Counter-clockwise seen from outside.
+        every: Frames from one to the next that are searched whole; between them only what came near in any.
     """
-    body = _Body(np.asarray(rest, float), np.asarray(faces))
-    yielded, out = np.zeros(rest.shape), np.empty(positions.shape)
-    for frame, posed in enumerate(np.asarray(positions, float)):
-        yielded = body.yielding(posed, _KEPT * yielded)
-        out[frame] = posed + yielded
-    return out.astype(positions.dtype)
+    positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
+    is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
+    # With the faces around them: these bound how far the others give way.
+    is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
+    ids, corners = np.unique(faces[is_near], return_inverse=True)
+    part, yielded = _Body(rest[ids], corners.reshape(-1, 3)), np.zeros((len(ids), 3))
+    for frame in range(len(positions)):
+        yielded = part.yielding(positions[frame, ids], _KEPT * yielded)
+        out[frame, ids] += yielded.astype(out.dtype)
+    return out
 
 
 def uncrossed(
@@ -109,12 +115,16 @@ class _Body(_Mesh):
         super().__init__(faces, len(rest))
         self.rest = rest
         self.middles, self.normals, _ = _middles_and_normals(rest, faces)
+        corners = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+        self.incidence = scipy.sparse.coo_matrix(
+            (np.ones(faces.size), corners), (len(rest), len(faces))
+        ).tocsr()
 
     def yielding(
         self, posed: Float[np.ndarray, "vertices 3"], yielded: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices 3"]:
         """Return how far every vertex yields [m], from a first guess."""
-        opposed, folded = self._looked_for(posed)
+        opposed, folded = self.looked_for(posed)
         for _ in range(_SWEEPS):
             push = _pushes(posed + yielded, opposed)
             if push is not None:
@@ -126,13 +136,12 @@ class _Body(_Mesh):
             yielded = yielded + self.smoothing(posed + yielded, self.faces[folded][crossing])
         return yielded
 
-    def _looked_for(
+    def looked_for(
         self, posed: Float[np.ndarray, "vertices 3"]
     ) -> tuple[_Opposed, Bool[np.ndarray, " faces"]]:
         """Return opposed places, and faces that may cross others."""
         middles, normals, sizes = _middles_and_normals(posed, self.faces)
-        facing = np.zeros_like(posed)
-        np.add.at(facing, self.faces, normals[:, None])
+        facing = self.incidence @ normals
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
         found = cKDTree(posed).sparse_distance_matrix(cKDTree(middles), _AROUND, output_type="ndarray")
         vertex, face = found["i"], found["j"]

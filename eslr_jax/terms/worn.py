@@ -149,7 +149,8 @@ def parted_body(poses: BodyMotion) -> BodyMotion:
         return poses
     ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
     positions = np.array(poses.positions)
-    positions[:, ids] = parted(positions[:, ids], np.asarray(poses.rest_positions)[ids], faces)
+    every = max(round(_SPACING / float(poses.timestep)), 1)
+    positions[:, ids] = parted(positions[:, ids], np.asarray(poses.rest_positions)[ids], faces, every)
     return poses.replace(positions=positions)
 
 
