@@ -59,7 +59,7 @@ class Status(enum.IntFlag):
             Status.TIP_OVERFLOW: "more cloth bunches around fine points of the body than a buffer holds; "
             "smooth the body there, or take a coarser garment",
             Status.SELF_CONTACT_OVERFLOW: "more self-contact than its buffers hold; "
-            "give the term Repulsion more num_rows",
+            "give the term Contact more rows, or Repulsion more num_rows",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
             "slow the motion down, or pose it with more frames a second",
             Status.DERIVATIVE_REFUSED: "the frame did not come to rest in a minimum, so its derivative is NaN; "

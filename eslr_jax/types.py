@@ -257,6 +257,8 @@ class Trajectory:
     first_bad_frame: Int[Array, ""]  # row of the first frame with a status; -1 while status is OK
     # Rows that frames asked the terms' buffers for, by their names.
     demands: dict[str, Int[Array, " frames"]] = struct.field(default_factory=dict)
+    # Frames in which something may have passed through cloth; None where no term watches that.
+    is_passed: Bool[Array, " frames"] | None = None
 
     @property
     def num_frames(self) -> int:

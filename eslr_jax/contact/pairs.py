@@ -18,7 +18,10 @@ from jaxtyping import Array, Bool, Float, Int
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, dot3, sub3
 
-GAP = 1e-4  # [m] that pushed pairs are left
+GAP = 1e-4  # [m] within which pairs are looked for
+_PUSHED = (
+    5e-4  # [m] that pushed pairs are left: far more than they need, since pushes of many pairs are averaged
+)
 # [m] that pairs may end with, so that gaps do not shrink from frame to frame: in float32 the normal across a gap
 # of a micrometre is off by 1e-2, which is more than the gap over the length of a face.
 FLOOR = 0.5 * GAP
@@ -229,8 +232,8 @@ def _pushes(
     lowest, highest = _between(along, side)
     is_lacking = is_used & (can_first | can_second) & ~course.is_parted
     middle = 0.5 * (lowest + highest)
-    upper = jnp.where(can_first & can_second, middle + 0.5 * GAP, highest + GAP)
-    lower = jnp.where(can_first & can_second, middle - 0.5 * GAP, lowest - GAP)
+    upper = jnp.where(can_first & can_second, middle + 0.5 * _PUSHED, highest + _PUSHED)
+    lower = jnp.where(can_first & can_second, middle - 0.5 * _PUSHED, lowest - _PUSHED)
     entries = []
     for k in range(4):
         up = jnp.maximum(upper - along[k], 0.0) if side[k] > 0 else jnp.minimum(lower - along[k], 0.0)

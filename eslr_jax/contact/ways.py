@@ -78,8 +78,9 @@ def move_clear(
         farthest = jnp.max(safe_norm(reached - part.end, axis=0))
         is_full = found.most > rows
         is_clear = (lack == 0) & (farthest <= _MARGIN) & ~is_full
-        is_tried = (part.tries + 1 >= _TRIES) | is_full
-        is_done = is_clear | (is_tried & (part.length <= _LEAST_PART))
+        is_tried = part.tries + 1 >= _TRIES
+        # With too small a table the frame is done anew.
+        is_done = is_clear | is_full | (is_tried & (part.length <= _LEAST_PART))
         is_halved = is_tried & ~is_done
         share = jnp.where(is_done, share, part.share)
         longer = jnp.minimum(2.0 * part.length, 1.0 - share)

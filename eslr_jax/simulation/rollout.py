@@ -15,7 +15,7 @@ from eslr_jax.simulation.frame import FrameInput, frame_inputs, frame_problem, p
 from eslr_jax.simulation.scene import Integrator, build_scene, worn_material
 from eslr_jax.simulation.stepper import FrameReport, Stepper, make_stepper, past_state
 from eslr_jax.solver.solve import SOLUTION
-from eslr_jax.terms import Ground, Repulsion, Term, scene_terms
+from eslr_jax.terms import Contact, Ground, Term, scene_terms
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene, Trajectory
 
 
@@ -57,7 +57,7 @@ def rollout(
     config = config or SimConfig()
     check_network(params)
     if terms is None:
-        terms = scene_terms(without=(Ground, Repulsion))
+        terms = scene_terms(without=(Ground, Contact))
     worn = garment, poses, worn_material(garment, material)
     scene = build_scene(*worn, terms, integrator=integrator, substeps=substeps)
     return rollout_scene(params, scene, config)
@@ -178,6 +178,7 @@ def step_frame(
         iterations=jnp.max(reports.iterations),
         gap_bound=jnp.max(reports.gap_bound),
         demands=jax.tree.map(jnp.max, reports.demands),
+        is_passed=jax.tree.map(jnp.any, reports.is_passed),
     )
 
 
@@ -200,6 +201,7 @@ def join_frames(start: ClothState, frames: Frames, end: ClothState) -> Trajector
         gap_bounds=reports.gap_bound,
         iterations=reports.iterations,
         demands=reports.demands,
+        is_passed=reports.is_passed,
         status=end.status,
         first_bad_frame=jnp.where(is_good, -1, end.first_bad_frame - start.frame),
     )

@@ -115,13 +115,15 @@ def _in_chunks(
         The trajectory; the seconds that it compiled and ran; the frames that ran, also those beyond the end.
     """
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
-    inputs = frame_inputs(jax.device_get(scene))  # cut on the host, where it compiles nothing
+    # The last chunk goes on beyond the last frame, and what it simulates there is dropped: all stands still.
+    held = np.minimum(np.arange(scene.num_frames + chunk), total)
+    inputs = frame_inputs(
+        slice_tracks(jax.device_get(scene), held)
+    )  # cut on the host, where it compiles nothing
     constant = jax.tree.map(jnp.asarray, _without_frames(scene))
 
     def part(first: int) -> FrameInput:
-        # The last chunk repeats its last frame; what it simulates beyond the end is dropped.
-        frames = np.minimum(np.arange(first, first + chunk), total - 1)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[frames]), inputs)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[first : first + chunk]), inputs)
 
     iterations = config.iterations
     start = jax.tree.map(jnp.asarray, scene.initial_state if before is None else state_at(before, scene))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,6 +30,7 @@ class FrameReport(NamedTuple):
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
     demands: dict[str, Int[Array, ""]]  # see Trajectory
+    is_passed: Bool[Array, ""] | None  # likewise
     # Share of the initial gap that the solver left at most; infinite without one.
     gap_bound: Float[Array, ""] | float = math.inf
 
@@ -96,6 +98,7 @@ def make_stepper(
             iterations=minimum.iterations,
             gap_bound=minimum.gap_bound,
             demands=buffer_demands(problem),
+            is_passed=any_passed(problem),
         )
         return next_state(position, problem, state, status | minimum.status, residual), report
 
@@ -204,6 +207,13 @@ def past_state(
     """
     is_known = jnp.asarray(residual) <= MOST_RESIDUAL
     return PastState(before.position, before.velocity, timestep, is_known)
+
+
+def any_passed(problem: FrameProblem) -> Bool[Array, ""] | None:
+    """Return whether something may have passed through the cloth; None where no term watches that."""
+    found = [term.is_passed(data) for term, data in problem.parts]
+    watched = [one for one in found if one is not None]
+    return functools.reduce(jnp.logical_or, watched) if watched else None
 
 
 def buffer_demands(problem: FrameProblem) -> dict[str, Int[Array, ""]]:

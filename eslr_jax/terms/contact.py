@@ -18,7 +18,6 @@ from eslr_jax.contact.ways import Moved, move_clear
 from eslr_jax.errors import Status
 from eslr_jax.numerics import Vector3, vertex_normals
 from eslr_jax.terms.problem import FrameProblem
-from eslr_jax.terms.repulsion import Repulsion
 from eslr_jax.terms.term import Elements, Term
 from eslr_jax.terms.worn import Worn, parted_body
 from eslr_jax.types import BodyMotion, Garment, Obstacle
@@ -43,7 +42,7 @@ class Contact(Term):
     the positions that a frame would end with, and pushes them until no vertex has met a face, and no edge an
     edge, on the straight ways from the frame's start. So cloth that starts uncrossed stays so. The body yields
     where its own parts pass through each other (`mesh.parting`). Where that does not make room, something is let
-    through, and the status says so.
+    through, and the trajectory says in which frame.
 
     A derivative takes no notice of the pushes.
 
@@ -53,18 +52,20 @@ class Contact(Term):
 
     name = "contact"
     reads_body = True
+    unless_needed = "no body in reach, and no layers that can meet"
 
     rows: int | None = struct.field(pytree_node=False, default=None)  # of either table; None: to be planned
     has_layers: bool = struct.field(pytree_node=False, default=True)  # cloth does not pass through cloth
     # [m] by which cloth that the first pose folds through itself is moved, see `mesh.parting.uncrossed`
     unfolding: Float[Array, "vertices 3"] | float = 0.0
 
-    def plan(self, worn: Worn, others: Sequence[Term]) -> Contact:
-        """Return itself with sizes of its tables; it keeps layers where a term before it pushes them apart."""
-        rows = self._num_rows(len(worn.pieces))
-        has_layers = any(isinstance(term, Repulsion) for term in others)
+    def plan(self, worn: Worn, others: Sequence[Term]) -> Contact | None:
+        """Return itself with sizes of its tables; None where cloth can meet neither the body nor cloth."""
+        has_layers = worn.num_pieces > 1 or worn.meets_itself()
+        if worn.surface is None and not has_layers:
+            return None
         unfolding = jnp.asarray(worn.unfolding) if has_layers else 0.0
-        return self.replace(rows=rows, has_layers=has_layers, unfolding=unfolding)
+        return self.replace(rows=self._num_rows(len(worn.pieces)), has_layers=has_layers, unfolding=unfolding)
 
     def alike(self, worn: Worn, planned: Sequence[Contact]) -> Contact:
         """Return itself, with the largest of the tables and the folds of this scene's cloth."""
@@ -129,12 +130,15 @@ class Contact(Term):
         return ()
 
     def status(self, problem: FrameProblem, data: Ends | None) -> Int[Array, ""]:
-        """Return whether something was let through, or a table too small."""
+        """Return whether a table was too small."""
         if data is None:
             return jnp.int32(Status.OK)
         is_full = data.most > self._num_rows(len(problem.position))
-        passed = jnp.where(data.is_passed & ~is_full, int(Status.BODY_TOO_FAST), int(Status.OK))
-        return passed | jnp.where(is_full, int(Status.SELF_CONTACT_OVERFLOW), int(Status.OK))
+        return jnp.where(is_full, jnp.int32(Status.SELF_CONTACT_OVERFLOW), jnp.int32(Status.OK))
+
+    def is_passed(self, data: Ends | None) -> Bool[Array, ""] | None:
+        """Return whether something was let through."""
+        return None if data is None else data.is_passed
 
     def demand(self, data: Ends | None) -> Int[Array, ""] | None:
         """Return the rows that the fullest search asked for."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from eslr_jax.terms.bending import Bending
 from eslr_jax.terms.collision import Collision
+from eslr_jax.terms.contact import Contact
 from eslr_jax.terms.friction import Friction
 from eslr_jax.terms.gravity import Gravity
 from eslr_jax.terms.ground import Ground
 from eslr_jax.terms.inertia import Inertia
-from eslr_jax.terms.repulsion import Repulsion
 from eslr_jax.terms.stretch import Stretch
 from eslr_jax.terms.term import Term
 
@@ -17,7 +17,7 @@ CLOTH: tuple[Term, ...] = (Stretch(), Bending(), Inertia(), Gravity())
 
 
 def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[Term, ...]:
-    """Return what a scene models by default, with changes: cloth, body, ground, friction and layers.
+    """Return what a scene models by default, with changes: cloth, body, ground, friction, strict contact.
 
     A scene leaves out those of them that it does not need, see `simulation.plan.plan_scene`.
 
@@ -26,7 +26,7 @@ def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[T
             friction where cloth rubs on them.
         without: Types of default terms to leave out.
     """
-    usual = (*CLOTH, Collision(), Ground(), Friction(), Repulsion())
+    usual = (*CLOTH, Collision(), Ground(), Friction(), Contact())
     given = {type(term): term for term in changed}
     kinds = {type(term) for term in usual}
     kept = tuple(given.get(type(term), term) for term in usual if not isinstance(term, without))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.config import import_own
 from eslr_jax.errors import ConfigError, Status
@@ -119,6 +119,10 @@ class Term:
     def status(self, problem: FrameProblem, data: Any) -> Int[Array, ""]:
         """Return bits of `errors.Status`: what went wrong in `prepare`."""
         return jnp.int32(Status.OK)
+
+    def is_passed(self, data: Any) -> Bool[Array, ""] | None:
+        """Return whether something may have passed through the cloth; None where the term does not watch that."""
+        return None
 
     def demand(self, data: Any) -> Int[Array, ""] | None:
         """Return the rows that a frame asks its buffer for; None without a buffer."""

@@ -23,7 +23,7 @@ from eslr_jax.networks.normalizer import is_warming_up
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.potential import potential_terms
-from eslr_jax.terms import Collision, Ground, Repulsion, scene_terms
+from eslr_jax.terms import Collision, Contact, Ground, Repulsion, scene_terms
 from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
@@ -294,7 +294,7 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
     transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
     searched = Obstacle(data.surface, body.start[None, :0])
-    left_out = (Ground,) if config.self_contact else (Ground, Repulsion)
+    layers = (Repulsion(),) if config.self_contact else ()
     scene = Scene(
         garment=garment,
         material=slot.material,
@@ -303,7 +303,9 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
         body=searched,
         pin_targets=None,
         num_frames=0,
-        terms=scene_terms(Collision(stiffness=config.collision_stiffness), without=left_out),
+        terms=scene_terms(
+            Collision(stiffness=config.collision_stiffness), *layers, without=(Ground, Contact)
+        ),
     )
     inputs = FrameInput(body, data.skinned(index, later, slot.shape))
     return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))

@@ -153,8 +153,8 @@ class Info:
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k"
     # Simulator of the scene; the network is the default one.
     simulator: Literal["network", "physics"] = "physics"
-    # Keep all layers of cloth apart, also where they don't seem to meet.
-    self_contact: bool = False
+    # How contact is kept, as of eslr simulate.
+    contact: Literal["strict", "fast"] = "strict"
     # Print as JSON.
     json: bool = False
 
@@ -169,7 +169,7 @@ class Info:
             return
         refuse_given("only a --scene takes these", {
             "--motion": self.motion is not None, "--vertices": self.vertices != "1k",
-            "--simulator": self.simulator != "physics", "--self-contact": self.self_contact,
+            "--simulator": self.simulator != "physics", "--contact": self.contact != "strict",
         })  # fmt: skip
         self._show_network(self.model or _ARCHITECTURE)
 
@@ -209,7 +209,7 @@ class Info:
 
         use_compile_cache()
         check_resolution([garment], self.vertices)
-        options = Options(simulator=self.simulator, self_contact=self.self_contact)
+        options = Options(simulator=self.simulator, contact=self.contact)
         method = choose_method(options)
         with waiting("measuring"):
             rig = load_body()

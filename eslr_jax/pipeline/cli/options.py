@@ -83,15 +83,10 @@ class Options:
     # Number of shorter steps per frame; 2 keeps layers apart that swing fast against each other. The
     # iterations are those of each substep.
     substeps: int = 1
-    # How contact is kept. fast pushes cloth out of what it has passed into, where it is found. With strict,
-    # nothing passes through cloth in the first place: a frame takes half as long again. The body yields by
-    # some millimetres where its own parts pass through each other, which takes a while to prepare.
-    contact: Literal["fast", "strict"] = "fast"
-    # Keep all layers of cloth apart, also within each garment of an outfit. By default layers of a garment of
-    # one piece are kept apart where they can meet, and pieces and garments from each other.
-    self_contact: tyro.conf.FlagCreatePairsOff[bool] = False
-    # Let layers of cloth pass through each other.
-    no_self_contact: tyro.conf.FlagCreatePairsOff[bool] = False
+    # How contact is kept. With strict nothing passes through cloth, neither the body nor other cloth. With fast,
+    # in half the time, vertices of the cloth keep off the body; skin may show between them, and layers of one
+    # garment pass through each other. The default is strict, or fast for a network alone.
+    contact: Literal["strict", "fast"] | None = None
     # Model a level ground under the body's lowest point; auto does where cloth could reach it.
     ground: Literal["auto", "on", "off"] = "auto"
     # Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
@@ -121,25 +116,22 @@ class Options:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise ConfigError(f"--{name} {value}: give a number, 0 or more")
-        if self.self_contact and self.no_self_contact:
-            raise ConfigError("--self-contact and --no-self-contact exclude each other; give one of them")
 
     def terms(self, *, has_solver: bool) -> tuple[Term, ...]:
-        """Return what is modelled where it is needed; networks alone know no skin and no folds."""
-        from eslr_jax.terms import Collision, Contact, Damping, Ground, Repulsion, scene_terms
+        """Return what is modelled where it is needed."""
+        from eslr_jax.terms import Contact, Damping, Ground, Repulsion, scene_terms
         from eslr_jax.terms.air import blowing
 
-        layers = Repulsion(where="all" if self.self_contact else "folds" if has_solver else "pieces")
-        ground = Ground(is_always=self.ground == "on")
-        changed = [Collision(has_skin=has_solver), ground, layers]
-        if self.contact == "strict":
-            changed.append(Contact())
+        is_strict = has_solver if self.contact is None else self.contact == "strict"
+        changed: list[Term] = [Ground(is_always=self.ground == "on")]
+        if not is_strict:
+            changed.append(Repulsion())
         if (air := blowing(self.wind, self.gust)) is not None:
             changed.append(air)
         if self.damping is not None:
             changed.append(Damping(self.damping))
         changed += map(read_term, self.term)
-        left_out = (Ground,) * (self.ground == "off") + (Repulsion,) * self.no_self_contact
+        left_out = (Ground,) * (self.ground == "off") + (Contact,) * (not is_strict)
         return scene_terms(*changed, without=left_out)
 
     def record(self) -> dict[str, Any]:

@@ -11,14 +11,13 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import SimConfig
-from eslr_jax.contact.self_contact import default_rows
 from eslr_jax.numerics import Vector3
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import step_frame
 from eslr_jax.simulation.stepper import FrameReport, make_stepper
-from eslr_jax.terms import Air, Collision, Elements, Repulsion, Term, scene_terms
+from eslr_jax.terms import Air, Elements, Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Scene
 
@@ -77,9 +76,7 @@ def set_stage(garment: Garment, poses: BodyMotion, material: Material) -> Stage:
     Raises:
         MotionError: The motion has fewer than two frames.
     """
-    # Nobody enlarges its buffers here.
-    layers = Repulsion(num_rows=default_rows(garment.vertex_mask.shape[0]))
-    terms = scene_terms(Collision(has_skin=True), layers, Air((0.0, 0.0, 0.0)), no_hand())
+    terms = scene_terms(Air((0.0, 0.0, 0.0)), no_hand())
 
     def first_step(scene: Scene) -> tuple:
         stage = _staged(scene, material)

@@ -16,7 +16,7 @@ from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.formats.garment import split_outfit
 from eslr_jax.pipeline.report.crossing import find_crossings
 from eslr_jax.pipeline.report.metrics import face_stretches, measure_frames, penetration_p999_mm
-from eslr_jax.terms import Ground, Repulsion
+from eslr_jax.terms import Contact, Ground, Repulsion
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _EVERY = 10  # frames between those whose crossings are counted
@@ -60,7 +60,8 @@ def trajectory_report(
         `worst_penetration` hold frame, time [s], vertex and part of the largest values. `garments` holds stretch
         and penetration of every garment of an outfit by name; None for a single garment. `crossing_pairs` are the
         most pairs of faces of cloth that intersect in a frame, `crossing_share` the share of frames that have
-        any, of every tenth simulated frame and the last; None where self-contact is not modelled.
+        any, of every tenth simulated frame and the last; None where self-contact is not modelled. `let_through`
+        are the frames in which something may have passed through cloth; None where contact is not strict.
     """
     measures = jax.device_get(measure_frames(trajectory.positions, scene))
     trajectory = jax.device_get(trajectory)  # to be cut on the host, where it compiles nothing
@@ -98,6 +99,7 @@ def trajectory_report(
         "iterations_mean": float(np.mean(trajectory.iterations[1:])),
         "garments": None if several is None else _garments(trajectory, scene, depth, several),
         **_crossings(trajectory, scene, parts),
+        "let_through": None if trajectory.is_passed is None else int(np.sum(trajectory.is_passed)),
     }
 
 
@@ -126,7 +128,7 @@ def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
 
 def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
     """Return where cloth passes through cloth in spite of self-contact."""
-    if scene.term(Repulsion) is None:
+    if not _keeps_layers(scene):
         return {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
     faces = _real_faces(scene)
     last = trajectory.num_frames - 1
@@ -142,6 +144,12 @@ def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, 
     }
 
 
+def _keeps_layers(scene: Scene) -> bool:
+    """Tell whether a term keeps cloth from passing through cloth."""
+    contact = scene.term(Contact)
+    return scene.term(Repulsion) is not None or (contact is not None and contact.has_layers)
+
+
 def _real_faces(scene: Scene) -> np.ndarray:
     """Return the faces of the garment that are no padding."""
     return np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
@@ -154,7 +162,7 @@ def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any]
     its place, with its part. None where nothing is behind a layer that it passed, or self-contact is not
     modelled.
     """
-    if scene.term(Repulsion) is None:
+    if not _keeps_layers(scene):
         return None
     positions = np.asarray(scene.initial_state.position)
     crossings = find_crossings(positions, _real_faces(scene))
@@ -284,6 +292,14 @@ def describe_report(report: dict[str, Any]) -> Words:
         warnings.append(f"cloth passes through cloth: {pairs} pairs of faces intersect, {place}; {share}")
     elif pairs is not None:
         good.append("no cloth passes through cloth")
+
+    if report["let_through"]:
+        warnings.append(
+            f"in {report['let_through']} frames parts of the body left cloth no room: something may have passed "
+            "through it"
+        )
+    elif report["let_through"] == 0:
+        good.append("nothing passed through cloth on the way from frame to frame")
 
     slide, frame, coverage = report["slide_m"], report["below_feet_at"], report["coverage"]
     if frame is not None:

@@ -56,8 +56,8 @@ class GarmentSettings(bpy.types.PropertyGroup):
     )
     self_contact: bpy.props.BoolProperty(
         name="Self-contact",
-        description="Keep the cloth off itself; takes several times as long",
-        default=False,
+        description="Let nothing pass through cloth; takes twice as long as to keep its vertices off the body",
+        default=True,
     )
     folder: bpy.props.StringProperty(
         name="Cache",

@@ -147,7 +147,7 @@ def simulation_steps(python: str, folder: Path, fabric: str, tolerance: str, has
     # The garment is where it belongs, so nothing about it has to be recognised.
     place = ("--units", "m", "--up", "y", "--front", "z", "--keep-place", "--arms", "rest")
     fit = ("fit", folder / "garment.obj", "--out", garment, "--body", body, *place, "--no-picture", "--json")
-    layers = ("--self-contact",) if has_layers else ()
+    layers = () if has_layers else ("--contact", "fast")
     simulate = ("simulate", "--garment", garment, "--body", body, "--fabric", *fabric.split())
     simulate += ("--tolerance", tolerance, *layers, "--no-pictures", "--out", run)
     export = ("export", run, "--out", folder / "motion.npz", "--content", "garment")
