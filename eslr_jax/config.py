@@ -105,7 +105,6 @@ class TrainConfig:
     # With energy_set "hood": which of the three variants of HOOD's losses, see terms.hood. "metric" has the
     # constants of HOOD's tables.
     criterion: Criterion = "postcvpr"
-    self_contact: bool = False  # layers of cloth keep apart
     schedule: Literal["cosine", "hood"] = "cosine"  # of the learning rate; "hood" also of the horizon
     learning_rate: float = 1e-3  # peak; 3e-4 measured worse
     final_learning_rate: float = 1e-5  # end of the cosine
@@ -166,8 +165,6 @@ class TrainConfig:
             raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
         if self.criterion != "postcvpr" and self.energy_set != "hood":
             raise ValueError(f'criterion = "{self.criterion}" needs energy_set = "hood"')
-        if self.self_contact and self.energy_set == "hood":
-            raise ValueError('self_contact = true needs energy_set = "consistent": HOOD has no energy for it')
         if self.refinement_weights != "equal" and self.iterations:
             raise ValueError(f'refinement_weights = "{self.refinement_weights}" needs iterations = 0')
         if self.refinement_weights == "contraction" and self.model.refinement_steps == 1:

@@ -46,7 +46,6 @@ class Status(enum.IntFlag):
 
     OK = 0
     NON_FINITE = 1
-    TIP_OVERFLOW = 2
     SELF_CONTACT_OVERFLOW = 4
     BODY_TOO_FAST = 8
     DERIVATIVE_REFUSED = 16
@@ -56,10 +55,8 @@ class Status(enum.IntFlag):
         texts = {
             Status.NON_FINITE: "positions or forces became NaN or infinite; use the solver, more iterations, "
             "or a smaller timestep",
-            Status.TIP_OVERFLOW: "more cloth bunches around fine points of the body than a buffer holds; "
-            "smooth the body there, or take a coarser garment",
             Status.SELF_CONTACT_OVERFLOW: "more self-contact than its buffers hold; "
-            "give the term Contact more rows, or Repulsion more num_rows",
+            "give the term Contact more rows",
             Status.BODY_TOO_FAST: "the body moved farther in one frame than contacts can follow; "
             "slow the motion down, or pose it with more frames a second",
             Status.DERIVATIVE_REFUSED: "the frame did not come to rest in a minimum, so its derivative is NaN; "

@@ -22,7 +22,6 @@ from eslr_jax.pose.motion import pose_body
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import simulate
-from eslr_jax.terms import Collision, scene_terms
 
 CLIP = "cmu_069_23"
 # Garment, fabric, and colour in sRGB.
@@ -46,7 +45,7 @@ def main() -> None:
     moving, strips = with_settling(poses, SETTLE_FRAMES, body), []
     look = {"rest_positions": np.asarray(poses.rest_positions), "rig": body, "camera": _CAMERA, "size": _SIZE}
     for name, fabric, color in worn:
-        options = {"terms": scene_terms(Collision(has_skin=True)), "integrator": "bdf2"}
+        options = {"integrator": "bdf2"}
         scene = prepare_scene(
             load_garment(name, vertices=vertices), moving, material=fabric_material(fabric), **options
         )

@@ -23,7 +23,7 @@ from eslr_jax.pipeline.assets.garments import Resolution
 from eslr_jax.pipeline.report.scene_parts import time_in_turns
 from eslr_jax.simulation.batch import rollout_scenes, stack_scenes
 from eslr_jax.simulation.plan import prepare_scenes
-from eslr_jax.terms import Repulsion, scene_terms
+from eslr_jax.terms import FAST
 
 CONFIG = SimConfig(iterations=20)
 
@@ -33,9 +33,7 @@ def measure(vertices: Resolution, batches: list[int], frames: int, turns: int) -
     body, clips = load_body(), split_clips("test")
     poses = [pose_body(body, load_motion(clip), num_frames=frames + 1) for clip in clips]
     garments = [load_garment("tshirt", vertices=vertices)] * len(clips)
-    scenes = stack_scenes(
-        prepare_scenes(garments, poses, [COTTON] * len(clips), terms=scene_terms(without=(Repulsion,)))
-    )
+    scenes = stack_scenes(prepare_scenes(garments, poses, [COTTON] * len(clips), terms=FAST))
     calls = {}
     for batch in batches:
         places = jnp.arange(batch, dtype=jnp.int32) % len(clips)

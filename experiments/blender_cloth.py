@@ -28,13 +28,13 @@ from pathlib import Path
 import numpy as np
 from hard_cases import Simulator
 from jaxtyping import Float
-from newton_cloth import prepare_cloth, springs, strip_stiffness
+from newton_cloth import LAYER_THICKNESS, prepare_cloth, springs, strip_stiffness
 
 from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.point_cache import write_pc2
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
+from eslr_jax.terms import Collision, Contact, Friction, Gravity
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
@@ -89,8 +89,8 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
         "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE), "body_distance": _BODY_DISTANCE,
         "friction": 100.0 * float(friction.coefficient),
     }  # fmt: skip
-    if (layers := scene.term(Repulsion)) is not None:
-        arrays["layer_distance"] = float(contact_thickness(scene.garment, layers.thickness))
+    if (kept := scene.term(Contact)) is not None and kept.has_layers:
+        arrays["layer_distance"] = float(contact_thickness(scene.garment, LAYER_THICKNESS))
     if cloth.is_pinned.any():
         below = np.repeat(start[None], scene.num_frames, axis=0)
         below[:, cloth.is_pinned] = np.asarray(scene.pin_targets)[:, rows[cloth.is_pinned]]

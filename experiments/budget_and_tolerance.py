@@ -27,6 +27,7 @@ from eslr_jax.pipeline.assets.budget import Calibration, first_iterations, keep_
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import FAST
 from eslr_jax.types import Scene
 
 GARMENTS = ("tshirt", "dress", "pants")
@@ -95,13 +96,13 @@ def main() -> None:
         tasks = tolerances if "tolerance" in chosen.parts else ()
         scenes = []
         for cloth in cloths.values() if tasks else ():  # one body surface for all clips, so one compilation
-            scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips))
+            scenes += prepare_scenes([cloth] * len(clips), motions, [COTTON] * len(clips), terms=FAST)
         for tolerance in tasks:
             row = {"size": size, **measure_tolerance(scenes, tolerance, every)}
             put(path, "tolerance", row, ("size", "tolerance"), about)
             print(f"{size}: {tolerance:.1%} kept by {row['kept']:.2%} of {row['frames']} frames", flush=True)
         for garment, cloth in cloths.items() if "budget" in chosen.parts else ():
-            scene = prepare_scene(cloth, motions[0])  # not padded to a common size
+            scene = prepare_scene(cloth, motions[0], terms=FAST)  # not padded to a common size
             for factor in budgets:
                 row = {"size": size, "garment": garment, "factor": factor}
                 row |= measure_budget(calibration, scene, factor)

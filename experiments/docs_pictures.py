@@ -45,7 +45,7 @@ from eslr_jax.pipeline.rigs.rig import make_body
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.simulate import last_frames
-from eslr_jax.terms import Collision, Repulsion, Term, scene_terms
+from eslr_jax.terms import Term, scene_terms
 from eslr_jax.terms.problem import FrameProblem
 
 COPIED = {
@@ -112,7 +112,7 @@ def shoot(
     poses = pose_body(body, load_motion(_CLIP), num_frames=frames)
     stored = wear_together([load_garment_file(name, vertices=vertices) for name in garments], garments)
     cloth = prepare_stored(stored, name="+".join(garments))
-    terms = scene_terms(Collision(has_skin=True), Repulsion(where="folds"), *others)
+    terms = scene_terms(*others)
     moving = with_settling(poses, SETTLE_FRAMES, body)
     scene = prepare_scene(
         cloth, moving, material=garment_material(fabric, cloth, stored), terms=terms, integrator="bdf2"

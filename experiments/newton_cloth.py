@@ -37,10 +37,11 @@ from jaxtyping import Float, Int
 from eslr_jax.errors import EslrError
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.terms import Collision, Friction, Gravity, Repulsion
+from eslr_jax.terms import Collision, Contact, Friction, Gravity
 from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
+LAYER_THICKNESS = 3e-3  # [m] that layers keep from each other (ContourCraft)
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other
 _LEAST_GAP = 0.01  # [m]; Newton's default
 _FAR = 1e3  # [m], bounds of a mesh that moves: Newton culls by those of its first frame
@@ -317,8 +318,8 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
     friction_speed = float((scene.term(Friction) or Friction()).speed)
     if setting.solver == "vbd":
         layers = {}
-        if (kept := scene.term(Repulsion)) is not None:
-            distance = float(contact_thickness(scene.garment, kept.thickness))
+        if (kept := scene.term(Contact)) is not None and kept.has_layers:
+            distance = float(contact_thickness(scene.garment, LAYER_THICKNESS))
             layers = {
                 "particle_enable_self_contact": True,
                 "particle_self_contact_margin": distance,
@@ -328,7 +329,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
     if setting.solver == "xpbd":
         return solvers.SolverXPBD(model, iterations=iterations)
     solver = solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=iterations))
-    if scene.term(Repulsion) is None:
+    if (kept := scene.term(Contact)) is None or not kept.has_layers:
         solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
     solver.collision.friction_epsilon = friction_speed
     return solver

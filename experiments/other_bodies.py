@@ -34,7 +34,7 @@ from eslr_jax.pose.skeleton import RiggedMesh, Skeleton
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.plan import prepare_scene
 from eslr_jax.simulation.simulate import last_frames, simulate
-from eslr_jax.terms import Collision, Ground, scene_terms
+from eslr_jax.terms import Ground, scene_terms
 from eslr_jax.types import Body
 
 _SMPL = {
@@ -278,7 +278,7 @@ def measure(body: Body, garments: tuple[str, ...] = GARMENTS, vertices: str = "1
     took = (time.perf_counter() - began) / len(own)
     cloths = pad_alike(own, common_bucket([choose_bucket(cloth) for cloth in own]))
     surface = obstacle_surface(body)  # bodies of one topology then share a program
-    options = {"terms": scene_terms(Collision(has_skin=True), without=(Ground,)), "integrator": "bdf2"}
+    options = {"terms": scene_terms(without=(Ground,)), "integrator": "bdf2"}
     still = pose_body(body, standing_motion(body, SETTLE_FRAMES + frames))
     walk = pose_body(body, load_motion(CLIP, body=body), num_frames=frames)
     for name, cloth in zip(garments, cloths, strict=True):

@@ -21,7 +21,6 @@ from eslr_jax.pipeline.dressing.outfit import combine_garments
 from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.referee import intersecting_pairs
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
-from eslr_jax.terms import Collision, scene_terms
 
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))
 CLIP = "cmu_016_32"  # of the test split
@@ -53,7 +52,7 @@ def count_pairs(names: tuple[str, ...], frames: int = FRAMES, substeps: int = 1)
     outfit = combine_garments([load(name) for name in names], names)
     body = load_body()
     poses = with_settling(pose_body(body, load_motion(CLIP), num_frames=frames), SETTLE_FRAMES, body)
-    options = {"terms": scene_terms(Collision(has_skin=True)), "integrator": "bdf2", "substeps": substeps}
+    options = {"integrator": "bdf2", "substeps": substeps}
     run = simulate(None, prepare_scene(prepare_stored(outfit), poses, **options), config=CONFIG)
     garment = np.repeat([0, 1], list(outfit.metadata["outfit"].values()))[outfit.faces[:, 0]]
     positions = np.asarray(run.trajectory.positions)[SETTLE_FRAMES:][::EVERY]

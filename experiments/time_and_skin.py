@@ -35,7 +35,6 @@ from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.plan import prepare_scenes
 from eslr_jax.simulation.scene import Integrator, start_integrator
-from eslr_jax.terms import Collision, Repulsion, scene_terms
 from eslr_jax.types import Scene
 
 PARTS = ("skin", "time")
@@ -58,8 +57,7 @@ def make_scenes(garments: list[Any], motions: list[Any]) -> list[Scene]:
     """Return every garment on every motion: scenes of one shape, which share a program, garment by garment."""
     count = len(motions)
     cloths = [garment for garment in garments for _ in range(count)]
-    options = {"terms": scene_terms(Collision(has_skin=True), Repulsion(where="folds"))}
-    return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths), **options)
+    return prepare_scenes(cloths, motions * len(garments), [COTTON] * len(cloths))
 
 
 def begun(scene: Scene, integrator: Integrator) -> Scene:

@@ -24,7 +24,7 @@ from eslr_jax.pipeline.cli.method import choose_method
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.garment import read_garment_npz
 from eslr_jax.pipeline.rigs.rig import skeleton_motion
-from eslr_jax.terms import Repulsion
+from eslr_jax.terms import Contact
 
 
 @pytest.mark.slow
@@ -48,11 +48,9 @@ def test_simulate_writes_everything(tmp_path):
 
 
 def test_a_term_of_ones_own_takes_its_constants_and_choices_from_the_command_line():
-    terms = Options(term=("own_term:Push,pressure=2", "eslr_jax.terms:Repulsion,where='all'")).terms(
-        has_solver=True
-    )
+    terms = Options(term=("own_term:Push,pressure=2", "eslr_jax.terms:Contact,rows=512")).terms()
     assert terms[-1] == Push(np.float32(2.0))
-    assert [term.where for term in terms if isinstance(term, Repulsion)] == ["all"]
+    assert [term.rows for term in terms if isinstance(term, Contact)] == [512]
 
 
 @pytest.mark.parametrize(
@@ -300,7 +298,7 @@ def test_options_survive_the_record_that_a_run_goes_on_from():
         wind=(3.0, 0.0, 0.0),
         joint_map=Path("map.json"),
         iterations=30,
-        no_self_contact=True,
+        contact="fast",
     )
     assert from_dict(Options, json.loads(json.dumps(options.record()))) == options
 

@@ -73,7 +73,6 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('[model]\nbase = "mgn-5"\nrefinement_steps = 3', "unknown option model.refinement_steps"),
         ("[model]\nlatent_size = 64", "the model has no base"),
         ("model = 3", "the model is 3"),
-        ('model = "mgn-5"\nenergy_set = "hood"\nself_contact = true', 'needs energy_set = "consistent"'),
         ('model = "smooth-small"\niterations = 9\nrefinement_weights = "last"', "needs iterations = 0"),
         ('model = "mgn-5"\nrefinement_weights = "contraction"', "refinement_steps > 1"),
         ('model = "mgn-5"\nschedule = "hood"\nwarmup = 5', 'warmup needs schedule = "cosine"'),

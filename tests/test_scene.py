@@ -19,7 +19,6 @@ from eslr_jax import (
     prepare_scene,
     prepare_scenes,
     rollout_scene,
-    scene_terms,
 )
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.fabric.materials import COTTON, fabric_material
@@ -29,7 +28,7 @@ from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
 from eslr_jax.simulation.plan import first_frames
 from eslr_jax.simulation.scene import build_scene
 from eslr_jax.solver.potential import evaluate
-from eslr_jax.terms import CLOTH, Collision, Repulsion
+from eslr_jax.terms import CLOTH, Collision, Contact, Gravity
 from eslr_jax.terms.stretch import contact_excess
 from eslr_jax.terms.worn import REACH
 
@@ -45,11 +44,11 @@ def test_frame_zero_is_clear_of_the_body(small_scene):
 def test_what_is_not_asked_for_is_absent(small_garment, small_poses):
     scene = prepare_scene(small_garment, small_poses)
     assert scene.pin_targets is None
-    assert scene.term(Repulsion) is None
-    options = {"terms": (*CLOTH, Repulsion(where="all")), "starts_at_rest": True}
+    assert not scene.term(Contact).has_layers
+    options = {"terms": (*CLOTH, Gravity(1.62)), "starts_at_rest": True}
     other = prepare_scene(small_garment, small_poses, **options)
     assert other.body is None
-    assert other.term(Repulsion) is not None
+    assert other.term(Contact) is None
     np.testing.assert_array_equal(other.initial_state.velocity, 0.0)
     np.testing.assert_allclose(
         scene.initial_state.velocity * scene.timestep,
@@ -68,10 +67,9 @@ def test_a_garment_that_hangs_on_joints_of_another_body_is_refused(small_garment
         prepare_scene(stranger, small_poses)
 
 
-@pytest.mark.parametrize("options", [{"integrator": "Euler"}, {"terms": (Repulsion(where="none"),)}])
-def test_a_misspelt_option_is_refused(small_garment, small_poses, options):
+def test_a_misspelt_option_is_refused(small_garment, small_poses):
     with pytest.raises(ConfigError, match="give one of"):
-        prepare_scene(small_garment, small_poses, **options)
+        prepare_scene(small_garment, small_poses, integrator="Euler")
 
 
 def test_contacts_are_as_stiff_as_the_fabric_asks_for(small_garment, small_poses):
@@ -83,12 +81,6 @@ def test_contacts_are_as_stiff_as_the_fabric_asks_for(small_garment, small_poses
     assert found[0] > 5 * stiffness
 
 
-def test_a_body_with_tips_keeps_faces_off_them(small_garment, small_poses):
-    scene = prepare_scene(small_garment, small_poses, terms=scene_terms(Collision(has_tips=True)))
-    tips = jax.jit(first_problem)(scene).data_of(Collision).tips
-    assert float(jnp.sum(jnp.abs(tips.side))) > 0
-
-
 def test_scenes_with_and_without_pieces_can_be_stacked():
     layer = square()
     positions, faces = np.asarray(layer.rest_positions), np.asarray(layer.faces)
@@ -96,11 +88,8 @@ def test_scenes_with_and_without_pieces_can_be_stacked():
     above = positions + np.array([0, 0.01, 0])
     two = make_garment(np.concatenate([positions, above]), np.concatenate([faces, faces + len(positions)]))
     motion = drifting_ball(4)
-    scenes = prepare_scenes(
-        [one, two], [motion, motion], [COTTON, COTTON], terms=scene_terms(Repulsion(where="folds"))
-    )
-    assert [scene.term(Repulsion).pieces for scene in scenes] == [None, None]
-    assert all(scene.term(Repulsion) is not None for scene in scenes)
+    scenes = prepare_scenes([one, two], [motion, motion], [COTTON, COTTON])
+    assert len({(scene.term(Contact).rows, scene.term(Contact).has_layers) for scene in scenes}) == 1
 
 
 def test_what_a_plan_leaves_out_changes_no_force(
@@ -179,38 +168,23 @@ def test_cloth_touches_nothing_else_than_what_was_searched(body, name):
         np.testing.assert_array_less(-0.005, np.where(contacts.is_near, contacts.distances, 0.0))
 
 
-def layers(garment, poses, terms):
-    """Return the self-contact that is planned for a scene, or None."""
-    planned, _ = plan_scene(garment, poses, terms)
-    return next((term for term in planned if isinstance(term, Repulsion)), None)
+def has_layers(garment, poses):
+    """Tell whether cloth is kept from passing through cloth."""
+    planned, _ = plan_scene(garment, poses)
+    return next(term.has_layers for term in planned if isinstance(term, Contact))
 
 
-def test_two_pieces_that_meet_are_kept_apart(small_poses):
-    from cloth import make_garment, make_sheet
-
-    positions, faces = make_sheet(6, 6, 0.02, jitter=0)
-    both = np.concatenate([faces, faces + len(positions)])
-    for gap, meets in ((0.02, True), (0.3, False)):
-        rest = np.concatenate([positions, positions + np.array([0.0, gap, 0.0])])
-        garment = make_garment(rest, both)
-        assert (layers(garment, small_poses, (*CLOTH, Repulsion())) is not None) == meets
-
-
-def test_one_piece_that_can_fold_is_kept_apart_where_it_is_asked_for(small_garment, small_poses):
+def test_one_piece_that_can_fold_is_kept_from_passing_through_itself(small_garment, small_poses):
     """A tight sleeve has no room to fold; a sheet that hangs ten centimetres off the limb has."""
     from cloth import make_garment, make_sheet
 
     positions, faces = make_sheet(6, 6, 0.02, jitter=0)
     loose = make_garment(positions + np.array([0.16, 0.0, 0.0]), faces)
-    folds = scene_terms(Repulsion(where="folds"))
-    assert layers(small_garment, small_poses, folds) is None
-    assert layers(loose, small_poses, scene_terms()) is None
-    assert layers(loose, small_poses, folds).pieces is None
+    assert not has_layers(small_garment, small_poses)
+    assert has_layers(loose, small_poses)
 
 
 def test_a_sleeve_that_meets_its_trunk_can_meet_itself():
     """Arms that hang bring a sleeve to the trunk, half a garment away at rest."""
     body = load_body()
-    poses = pose_body(body, load_motion("cmu_016_29"), num_frames=6)
-    shirt = load_garment("tshirt")
-    assert layers(shirt, poses, (*CLOTH, Repulsion(where="folds"))) is not None
+    assert has_layers(load_garment("tshirt"), pose_body(body, load_motion("cmu_016_29"), num_frames=6))

@@ -11,13 +11,13 @@ from draped_ball import drifting_ball, square
 from own_term import Push
 
 from eslr_jax import AssetError, ConfigError, load_scene, prepare_scene, save_scene, scene_terms
-from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion
+from eslr_jax.terms import Air, Damping, Ground
 from eslr_jax.terms.air import blowing
 
 
 def all_of_a_scene(*others, substeps=1):
     garment = square(5, 0.12, is_pinned=np.array([0, 3]))
-    terms = scene_terms(Collision(has_skin=True), Ground(is_always=True), Repulsion(where="all"), *others)
+    terms = scene_terms(Ground(is_always=True), *others)
     return prepare_scene(garment, drifting_ball(3), terms=terms, integrator="bdf2", substeps=substeps)
 
 

@@ -8,13 +8,12 @@ import pytest
 from chromium import CHROMIUM, launch
 from example_runs import write_run
 
-from eslr_jax import AssetError, scene_terms
+from eslr_jax import AssetError
 from eslr_jax.pipeline.assets import load_garment_file
 from eslr_jax.pipeline.formats.garment import write_garment_npz
 from eslr_jax.pipeline.page import go_to_worst, open_view, play, show
 from eslr_jax.pipeline.report.fields import FIELDS
 from eslr_jax.pipeline.report.run import read_run
-from eslr_jax.terms import Repulsion
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
@@ -107,19 +106,6 @@ def test_a_field_is_plotted_over_time_and_leads_to_its_worst_frame(view):
     assert curves[1][1] > curves[0][1] > 1.05
     go_to_worst(view)
     assert view.controls["frame"].value == 1
-
-
-def test_a_field_that_a_run_lacks_is_told(tmp_path, body):
-    pytest.importorskip("viser")
-    view = open_view(
-        [read_run(write_run(tmp_path, body, "run", terms=scene_terms(without=(Repulsion,))))], port=8792
-    )
-    try:
-        view.controls["color"].value = "repulsion-energy"
-        show(view)
-        assert "without self-contact" in view.controls["legend"].content
-    finally:
-        view.server.stop()
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ CONTACT_RADIUS = 0.1  # [m] beyond which a tangent plane no longer stands for th
 _ON_BOUNDARY = 0.999  # share of a point's weights on boundary vertices above which it lies on the boundary
 _PUSH_OUT_STEPS = 8  # tangent-plane projections that take skinned cloth out of the body
 CLEARANCE = 2e-3  # [m] at which skinned cloth leaves the body and the ground; the collision thickness
-_ROOM = 0.01  # [m] that cloth needs between two parts of the body: a clearance to either side, and slack
 MAX_APPROACH = 0.3  # [m] by which a body may come towards cloth in a frame; hard case fast_limb tries 0.27
 _IMPACT = 0.02  # [m] before the body, where the path of thrown cloth ends
 _SEARCHES = 8  # along such a path, at most; straight at a wall, two
@@ -146,21 +145,6 @@ def find_both_sides(
     is_facing = jnp.sum(opposing.normals * contacts.normals, axis=-1) < _OPPOSED
     is_outside = opposing.distances > -_TOUCHING
     return contacts, opposing.replace(is_near=opposing.is_near & is_found & is_facing & is_outside)
-
-
-def are_pinched(nearest: Contacts, opposing: Contacts) -> Bool[Array, " vertices"]:
-    """Return which vertices are where two parts of the body leave no room for cloth, at t or at t + 1.
-
-    Args:
-        nearest: Contacts with the nearest part.
-        opposing: Contacts with the part that faces it, see `find_both_sides`.
-    """
-    ends = (
-        (nearest.points, opposing.points, nearest.normals),
-        (nearest.next_points, opposing.next_points, nearest.next_normals),
-    )
-    rooms = [jnp.sum((across - near) * normals, axis=1) for near, across, normals in ends]
-    return opposing.is_near & (jnp.minimum(*rooms) < _ROOM)
 
 
 class _SurfaceStep(NamedTuple):

@@ -17,7 +17,6 @@ from eslr_jax.numerics import (
     dot3,
     entries_of_words,
     sub3,
-    take3,
     true_entries,
     true_rows,
 )
@@ -394,36 +393,6 @@ def nearest_face_around(
     # In a loop, so that all candidates are not in memory at once.
     best = jax.lax.fori_loop(0, count, try_face, jnp.full(points[0].shape, _INFINITY, jnp.int32))
     return _chosen(faces, best)
-
-
-def following_vertices(slots: Int[Array, "*shape"], faces: Int[Array, "faces 3"]) -> Int[Array, "*shape"]:
-    """Return the vertex that follows one in each of its faces: around an inner vertex, every neighbour once.
-
-    Args:
-        slots: Rows of `face_incidence`, see `numerics.gather_corners`; what pads them gets some vertex.
-        faces: Of the mesh.
-    """
-    flat = faces.T.ravel()
-    return flat[(slots + faces.shape[0]) % flat.size]
-
-
-def nearest_candidates(
-    points: Vector3, candidates: Int[Array, "candidates rows"], places: Vector3
-) -> Int[Array, " rows"]:
-    """Return for every point the nearest of its candidates, which are numbers of places.
-
-    Args:
-        points: By components, each of shape [rows].
-        candidates: One that names no place, being past the end, is farther than any that does.
-        places: By components.
-    """
-    count, nobody = candidates.shape[0], places[0].shape[0]
-    best = jnp.full(points[0].shape, _INFINITY, jnp.int32)
-    for slot, candidate in enumerate(candidates):
-        offset = sub3(points, take3(places, jnp.minimum(candidate, nobody - 1)))
-        key = _with_index(dot3(offset, offset), jnp.int32(slot), count)
-        best = jnp.minimum(best, jnp.where(candidate < nobody, key, _INFINITY))
-    return _chosen(candidates, best)
 
 
 def _chosen(candidates: Int[Array, "candidates ..."], best: Int[Array, "*shape"]) -> Int[Array, "*shape"]:

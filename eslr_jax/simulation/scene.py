@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pose.lbs import skin_garment
@@ -71,7 +71,7 @@ def worn_material(garment: Garment, material: Material | None) -> Material:
     return COTTON if garment.material is None else garment.material
 
 
-def slice_tracks(scene: Scene, frames: slice | Int[Array, " frames"]) -> Scene:
+def slice_tracks(scene: Scene, frames: slice | Int[ArrayLike, " frames"]) -> Scene:
     """Return a scene with some frames of what moves: body and pins; the number of frames is left as it is."""
     body, pins = scene.body, scene.pin_targets
     return scene.replace(

@@ -15,7 +15,7 @@ from eslr_jax.config import SimConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.networks.network import Network, Prediction
 from eslr_jax.numerics import safe_norm
-from eslr_jax.solver.guess import initial_guess, separate
+from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.lbfgs import Minimum
 from eslr_jax.solver.potential import Point, contact_load, evaluate, potential_terms
 from eslr_jax.solver.solve import Start, lower_point, solve
@@ -145,7 +145,7 @@ def _begin(
         guess = initial_guess(problem)
         return evaluate(guess.position, problem), Prediction(guess.position, guess), jnp.int32(Status.OK)
     prediction = network.predict(problem, state)
-    point = evaluate(separate(problem, prediction.position), problem)
+    point = evaluate(prediction.position, problem)
     if prediction.previous is not None:
         point = lower_point(point, prediction.previous)
     # A solver that starts elsewhere would hide a prediction that is not a number.

@@ -55,23 +55,12 @@ def push_out(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Flo
     return pin(problem, position)
 
 
-def separate(problem: FrameProblem, position: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-    """Return positions [m], shape [vertices, 3], with elements moved apart, see `Term.separate`.
-
-    Barriers have no curvature at first touch: from deep inside, an iteration of the solver only halves the depth.
-    """
-    for term, data in problem.parts:
-        if (moved := term.separate(position, problem, data)) is not None:
-            position = push_out(problem, moved)
-    return position
-
-
 def pushed_out_guess(problem: FrameProblem) -> Float[Array, "vertices 3"]:
-    """Return the inertial guess [m], pushed out of the body and its layers apart, shape [vertices, 3].
+    """Return the inertial guess [m], pushed out of the body, shape [vertices, 3].
 
     The initial gap of a frame counts from its energy.
     """
-    return separate(problem, push_out(problem, problem.inertial_guess))
+    return push_out(problem, problem.inertial_guess)
 
 
 def spread_collapsed(

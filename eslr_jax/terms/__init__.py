@@ -17,11 +17,9 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 | friction  | mu N (sqrt(u^2 + s^2) - s), N contact force   | mu m g s abs(u) within 5.5 cm, whatever the |
 |           | at t, u in the tangent plane                  | contact force; s a slope against the z axis |
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
-| repulsion | between layers of cloth, where they can meet  | none                                        |
 | ground    | collision and friction as with the body       | none                                        |
-| contact   | in the place of collision and repulsion:      | none                                        |
-|           | pairs of vertices and faces, and of edges,    |                                             |
-|           | with steps that nothing crosses               |                                             |
+| contact   | no energy: ends of a frame are pushed until   | none                                        |
+|           | nothing has passed through cloth on the way   |                                             |
 | air       | drag and lift of faces, `terms.air`           | none                                        |
 | damping   | of the fabric's strain, `terms.damping`       | none                                        |
 | your own  | a subclass of `terms.term.Term`               | none                                        |
@@ -32,16 +30,15 @@ from eslr_jax.terms.bending import Bending
 from eslr_jax.terms.collision import Collision
 from eslr_jax.terms.contact import Contact
 from eslr_jax.terms.damping import Damping
-from eslr_jax.terms.defaults import CLOTH, scene_terms
+from eslr_jax.terms.defaults import CLOTH, FAST, scene_terms
 from eslr_jax.terms.friction import Friction
 from eslr_jax.terms.gravity import Gravity
 from eslr_jax.terms.ground import Ground
 from eslr_jax.terms.inertia import Inertia
-from eslr_jax.terms.repulsion import Repulsion
 from eslr_jax.terms.stretch import Stretch
 from eslr_jax.terms.term import Elements, Term
 
 __all__ = [
-    "CLOTH", "Air", "Bending", "Collision", "Contact", "Damping", "Elements", "Friction", "Gravity", "Ground",
-    "Inertia", "Repulsion", "Stretch", "Term", "scene_terms",
+    "CLOTH", "FAST", "Air", "Bending", "Collision", "Contact", "Damping", "Elements", "Friction", "Gravity",
+    "Ground", "Inertia", "Stretch", "Term", "scene_terms",
 ]  # fmt: skip

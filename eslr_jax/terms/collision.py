@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from eslr_jax.contact.nearest import MAX_APPROACH, approach, are_pinched, clear_of_body, find_both_sides
-from eslr_jax.contact.self_contact import TipPairs, find_tip_contacts
-from eslr_jax.contact.skin import SkinContacts, find_skin_contacts, lift_off_skin, skin_heights
+from eslr_jax.contact.nearest import MAX_APPROACH, approach, clear_of_body, find_both_sides
 from eslr_jax.errors import ConfigError, Status
-from eslr_jax.numerics import Vector3, components, dot3, in_memory, segment_sum, sub3
+from eslr_jax.numerics import Vector3, components, dot3, in_memory, sub3
 from eslr_jax.terms.problem import (
     CONTACT_STIFFNESS,
     CONTACT_THICKNESS,
@@ -23,9 +21,8 @@ from eslr_jax.terms.problem import (
     FrameProblem,
     contact_thickness,
 )
-from eslr_jax.terms.repulsion import push_apart, repulsion_diagonal, repulsion_energies
 from eslr_jax.terms.stretch import contact_excess
-from eslr_jax.terms.term import Elements, Term, sum_elements
+from eslr_jax.terms.term import Term
 from eslr_jax.terms.worn import Worn
 from eslr_jax.types import Contacts, Garment, Obstacle
 
@@ -37,17 +34,13 @@ class BodyContact(NamedTuple):
     opposing: Contacts  # with the body part on the other side of the cloth
     thickness: Float[Array, ""]  # distance that vertices keep [m], of `contact_thickness`
     stiffness: Float[Array, ""]  # [J/m^5]
-    skin: SkinContacts | None = None  # None: skin may show between vertices
-    tips: TipPairs | None = None  # None: a tip may pass between vertices
 
 
 @struct.dataclass
 class Collision(Term):
-    """The body's contact with the cloth.
+    """Vertices of the cloth keep off the tangent planes of the body's nearest points, on both sides.
 
-    Vertices keep off the tangent planes of the body's nearest points, on both sides. With `has_skin` faces of
-    cloth also keep off the places of the body under them, so that no skin shows between vertices; with `has_tips`
-    they keep off tips that are finer than the cloth's mesh.
+    What comes between vertices is kept out by `Contact`.
     """
 
     name = "collision"
@@ -58,8 +51,6 @@ class Collision(Term):
 
     stiffness: Float[Array, ""] | float = CONTACT_STIFFNESS  # [J/m^5]
     thickness: Float[Array, ""] | float = CONTACT_THICKNESS  # [m], see `problem.contact_thickness`
-    has_skin: bool = struct.field(pytree_node=False, default=False)
-    has_tips: bool = struct.field(pytree_node=False, default=False)
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Collision | None:
         """Return itself, or None where no face of the body is in reach."""
@@ -68,12 +59,8 @@ class Collision(Term):
     def start(
         self, position: Float[Array, "vertices 3"], garment: Garment, body: Obstacle | None
     ) -> Float[Array, "vertices 3"]:
-        """Return positions [m] pushed out of the body and, if that is modelled, lifted off the skin."""
-        if body is None:
-            return position
-        now = body.positions[0]
-        position = clear_of_body(position, now, body.surface, garment)
-        return lift_off_skin(position, now, body.surface, garment) if self.has_skin else position
+        """Return positions [m] pushed out of the body."""
+        return position if body is None else clear_of_body(position, body.positions[0], body.surface, garment)
 
     def prepare(self, problem: FrameProblem) -> BodyContact:
         """Return the contacts of a frame."""
@@ -84,21 +71,11 @@ class Collision(Term):
         nearest, opposing = find_both_sides(
             cloth[0], body.start, body.end, body.surface, garment.vertex_blocks, cloth[1]
         )
-        skin = tips = None
-        if self.has_skin:
-            skin = find_skin_contacts(cloth, (body.start, body.end), nearest, body.surface, garment)
-            # Between two limbs nobody sees skin, and rows of both would pull the cloth to both sides.
-            pinched = are_pinched(nearest, opposing)
-            skin = skin.replace(is_near=skin.is_near & ~jnp.any(pinched[skin.corners], axis=1))
-        if self.has_tips:
-            tips = find_tip_contacts(*cloth, body.start, body.end, body.surface.patch_vertices, garment)
         return BodyContact(
             nearest=nearest,
             opposing=opposing,
             thickness=contact_thickness(garment, self.thickness),
             stiffness=self.stiffness * contact_excess(problem.material),
-            skin=skin,
-            tips=tips,
         )
 
     def corner_energies(
@@ -111,48 +88,18 @@ class Collision(Term):
         )
         return near + across
 
-    def elements(self, x: Vector3, problem: FrameProblem, data: BodyContact) -> tuple[Elements, ...]:
-        """Return the energies of vertices, of places of the body under faces, and of tips [J]."""
-        return (self._assembled(x, problem, data), *self._rows(x, data))
-
-    def _rows(self, x: Vector3, data: BodyContact) -> tuple[Elements, ...]:
-        limits, rows = (data.stiffness, self.thickness), []
-        if data.skin is not None:
-            rows.append(Elements(skin_energies(x, data.skin, *limits), data.skin.corners))
-        if data.tips is not None:
-            rows.append(Elements(repulsion_energies(x, data.tips, *limits), data.tips.corners))
-        return tuple(rows)
-
-    def remainder(self, problem: FrameProblem) -> Callable[[Vector3, Any], Float[Array, ""]] | None:
-        """Return the energy of faces against skin and tips, which no vertex's block holds."""
-        if not (self.has_skin or self.has_tips):
-            return None
-        return lambda x, data: sum_elements(self._rows(x, data), x)
-
     def diagonal(self, x: Vector3, problem: FrameProblem, data: BodyContact) -> Float[Array, " vertices"]:
         """Return a third of the curvature along the normal [N/m]: it acts along one of three axes."""
         near, across = (
             penetration(x, contacts, data.thickness) for contacts in (data.nearest, data.opposing)
         )
-        curvature = 2.0 * data.stiffness * problem.garment.vertex_areas * (near + across)
-        limits = data.stiffness, self.thickness
-        if data.skin is not None:
-            curvature = curvature + skin_diagonal(x, data.skin, *limits)
-        if data.tips is not None:
-            curvature = curvature + repulsion_diagonal(x, data.tips, *limits)
-        return curvature
+        return 2.0 * data.stiffness * problem.garment.vertex_areas * (near + across)
 
     def push_out(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: BodyContact
     ) -> Float[Array, "vertices 3"]:
         """Return positions [m] with vertices inside the body lifted out of it."""
         return lifted(position, data.nearest, data.thickness)
-
-    def separate(
-        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: BodyContact
-    ) -> Float[Array, "vertices 3"] | None:
-        """Return positions [m] with faces pushed off the tips."""
-        return None if data.tips is None else push_apart(position, data.tips, self.thickness)
 
     def touched(self, problem: FrameProblem, data: BodyContact) -> tuple[Contacts, Float[Array, " vertices"]]:
         """Return the nearest points of the body with the force of the frame before.
@@ -168,17 +115,11 @@ class Collision(Term):
         return contact_forces(position, data.nearest, problem.garment, data.stiffness, data.thickness)
 
     def status(self, problem: FrameProblem, data: BodyContact) -> Int[Array, ""]:
-        """Return whether the body is too fast to follow, or a buffer for tips too small."""
+        """Return whether the body is too fast to follow."""
         contacts = data.nearest
         moved = approach(contacts.points, contacts.next_points, contacts.normals)
         is_too_fast = jnp.any(contacts.is_near & (moved > MAX_APPROACH) & problem.garment.vertex_mask)
-        status = jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
-        return status if data.tips is None else status | data.tips.status
-
-    def describe(self, garment: Garment) -> str:
-        """Return what keeps off the body."""
-        extra = ", faces off the skin" * self.has_skin + ", faces off the body's tips" * self.has_tips
-        return super().describe(garment) + extra
+        return jnp.where(is_too_fast, int(Status.BODY_TOO_FAST), int(Status.OK))
 
 
 def penetration(
@@ -213,48 +154,6 @@ def collision_energies(
     depth = penetration(position, contacts, thickness)
     (areas,) = in_memory(stiffness * garment.vertex_areas)
     return areas * depth * depth * depth
-
-
-def skin_depths(
-    position: Float[Array, "vertices 3"] | Vector3, skin: SkinContacts, thickness: Float[Array, ""] | float
-) -> Float[Array, " rows"]:
-    """Return max(thickness - d, 0) [m], d the height of the cloth's face over the skin; zero where far."""
-    return jnp.where(skin.is_near, jnp.maximum(thickness - skin_heights(position, skin), 0.0), 0.0)
-
-
-def skin_energies(
-    position: Float[Array, "vertices 3"] | Vector3,
-    skin: SkinContacts,
-    stiffness: Float[Array, ""] | float,
-    thickness: Float[Array, ""] | float,
-) -> Float[Array, " rows"]:
-    """Return stiffness a_p max(thickness - d_p, 0)^3 of every place p of the body under the cloth [J].
-
-    Args:
-        position: Vertex positions at t + 1 [m].
-        skin: Places of the body, the places of the cloth over them, and the areas a_p.
-        stiffness: [J/m^5].
-        thickness: Distance kept from the body [m].
-
-    Source: the barrier is `collision_energies`'.
-    """
-    depth = skin_depths(position, skin, thickness)
-    (areas,) = in_memory(stiffness * skin.areas)
-    return areas * depth * depth * depth
-
-
-def skin_diagonal(
-    position: Float[Array, "vertices 3"] | Vector3,
-    skin: SkinContacts,
-    stiffness: Float[Array, ""] | float,
-    thickness: Float[Array, ""] | float,
-) -> Float[Array, " vertices"]:
-    """Return an estimate of the curvature per vertex [N/m], a third of that along the normal."""
-    values = (
-        skin.weights**2 * (2.0 * stiffness * skin.areas * skin_depths(position, skin, thickness))[:, None]
-    )
-    num_vertices = components(position)[0].shape[0]
-    return segment_sum(values.T.ravel(), skin.corners.T.ravel(), num_vertices)
 
 
 def contact_forces(

@@ -27,6 +27,11 @@ _ROWS = 8  # per vertex of the cloth, of the tables that a scene begins with; a 
 _HEADROOM = 1.5  # of larger tables
 
 
+def starting_rows(num_vertices: int) -> int:
+    """Return the rows of either table that a scene of a garment of so many vertices begins with."""
+    return CHUNK * math.ceil(_ROWS * num_vertices / CHUNK)
+
+
 class Ends(NamedTuple):
     """What came of a frame's ends."""
 
@@ -38,7 +43,7 @@ class Ends(NamedTuple):
 class Contact(Term):
     """Nothing passes through cloth: not the body, and not cloth.
 
-    Energies such as `Collision` and `Repulsion` push apart, and can be overcome. This term has none. It takes
+    An energy such as that of `Collision` can be overcome. This term has none. It takes
     the positions that a frame would end with, and pushes them until no vertex has met a face, and no edge an
     edge, on the straight ways from the frame's start. So cloth that starts uncrossed stays so. The body yields
     where its own parts pass through each other (`mesh.parting`). Where that does not make room, something is let
@@ -100,7 +105,7 @@ class Contact(Term):
         return grown.position.T
 
     def _num_rows(self, num_vertices: int) -> int:
-        return CHUNK * math.ceil(_ROWS * num_vertices / CHUNK) if self.rows is None else self.rows
+        return starting_rows(num_vertices) if self.rows is None else self.rows
 
     def correct(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: None

@@ -35,3 +35,7 @@ def scene_terms(*changed: Term, without: tuple[type[Term], ...] = ()) -> tuple[T
     behind = (term for term in others if type(term).touched is Term.touched)
     first = next((i for i, term in enumerate(kept) if isinstance(term, Friction)), len(kept))
     return (*kept[:first], *rubbed, *kept[first:], *behind)
+
+
+FAST: tuple[Term, ...] = scene_terms(without=(Contact,))
+"""The default terms without strict contact, as networks were trained with them."""

@@ -94,12 +94,6 @@ class Term:
         """Return positions at t + 1 [m] with vertices moved out of an obstacle: where a frame starts."""
         return position
 
-    def separate(
-        self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
-    ) -> Float[Array, "vertices 3"] | None:
-        """Return positions at t + 1 [m] with elements moved apart, after `push_out`; None: nothing moves."""
-        return None
-
     def correct(
         self, position: Float[Array, "vertices 3"], problem: FrameProblem, data: Any
     ) -> tuple[Float[Array, "vertices 3"], Any]:

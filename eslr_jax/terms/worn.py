@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.contact.self_contact import SEARCH_RADIUS
 from eslr_jax.mesh.parting import parted, uncrossed
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.mesh.topology import vertex_components
@@ -21,7 +20,8 @@ from eslr_jax.types import Body, BodyMotion, BodySurface, Garment
 # [m] that cloth may be away from its skinned place, besides its distance from the body at rest. Body faces that
 # are farther away are left out.
 REACH = 0.08
-_FAR_AT_REST = 2.0 * SEARCH_RADIUS  # [m] between places of one piece that may meet; nearer ones bend towards
+_MEETS = 0.04  # [m] between layers that may touch during the frames around
+_FAR_AT_REST = 2.0 * _MEETS  # [m] between places of one piece that may meet; nearer ones bend towards
 _SPACING = 0.1  # [s] between the frames that are looked at to decide what is modelled
 _MOST_COMPARED = (
     4000  # vertices of a piece that are compared with each other; a part of a finer one is enough
@@ -106,7 +106,7 @@ class Worn:
         for positions in self.skinned[self._sampled][:, self._is_real]:
             for number in range(1, self.num_pieces):
                 one, others = positions[piece == number], positions[piece < number]
-                if np.isfinite(cKDTree(others).query(one, distance_upper_bound=SEARCH_RADIUS)[0]).any():
+                if np.isfinite(cKDTree(others).query(one, distance_upper_bound=_MEETS)[0]).any():
                     return True
         return False
 
@@ -116,13 +116,13 @@ class Worn:
         It hangs so far off the body that it can fold, or two places that are far apart at rest come close, such
         as a sleeve and the trunk.
         """
-        if np.max(self.radii, initial=0.0) - REACH > SEARCH_RADIUS:
+        if np.max(self.radii, initial=0.0) - REACH > _MEETS:
             return True
         rest = np.asarray(self.garment.rest_positions)[self._is_real]
         stride = -(-len(rest) // _MOST_COMPARED)
         rest = rest[::stride]
         for positions in self.skinned[self._sampled][:, self._is_real][:, ::stride]:
-            pairs = cKDTree(positions).query_pairs(SEARCH_RADIUS, output_type="ndarray")
+            pairs = cKDTree(positions).query_pairs(_MEETS, output_type="ndarray")
             if np.any(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > _FAR_AT_REST):
                 return True
         return False

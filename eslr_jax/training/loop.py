@@ -19,7 +19,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from eslr_jax.config import TrainConfig
-from eslr_jax.errors import CapacityError, CheckpointError, ConfigError, NonFiniteError
+from eslr_jax.errors import CheckpointError, ConfigError, NonFiniteError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 from eslr_jax.networks.network import Network
 from eslr_jax.networks.weights import write_network
@@ -37,7 +37,7 @@ from eslr_jax.training.step import TrainState, init_train_state, make_mesh, make
 _AXES = TrainState(network=0, optimizer=0, pools=0, key=0, step=None, skipped=0)  # type: ignore[arg-type]
 _ARENA_MAX, _MMAP_MAX, _TRIM_THRESHOLD, _TOP_PAD = -8, -4, -1, -2  # of glibc's malloc.h
 _DRAWN = ("stretch", "bending", "inertia", "collision", "friction")  # terms
-_SHARES = ("resets", "overflows", "skipped")  # shares of the trajectories of a step
+_SHARES = ("resets", "skipped")  # shares of the trajectories of a step
 
 Progress = Callable[[int, int, dict[str, float]], None]
 
@@ -117,7 +117,6 @@ def train(
             window.append(metrics)
             done = step + 1
             if done % config.log_every == 0 or done == config.steps:
-                overflowed = any(np.any(entry["overflows"]) for entry in window)
                 of_seeds = window_metrics(window, len(folders))
                 window = []
                 speed = (done - first) / (time.perf_counter() - began)
@@ -131,11 +130,6 @@ def train(
                     log.flush()
                 on_progress(done, config.steps, records[0])
                 _check_skipped(state, config, checkpoints, out, earlier)
-                if overflowed:
-                    raise CapacityError(
-                        f"self-contact needed more room than its buffers have by step {done}; train with "
-                        "self_contact = false, or on a coarser mesh"
-                    )
             if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
             is_stopping = stop.is_wanted

@@ -23,7 +23,7 @@ from eslr_jax.networks.normalizer import is_warming_up
 from eslr_jax.simulation.frame import BodyStep, FrameInput, frame_problem
 from eslr_jax.simulation.stepper import next_state
 from eslr_jax.solver.potential import potential_terms
-from eslr_jax.terms import Collision, Contact, Ground, Repulsion, scene_terms
+from eslr_jax.terms import Collision, Contact, Ground, scene_terms
 from eslr_jax.terms.hood import (
     METRIC_PARAMETERS,
     BodyFrames,
@@ -250,14 +250,12 @@ def _sample_gradient(
         acceleration = _skinned_acceleration(slot, data, index)
         statistics = measure_statistics(network, graph, problem.garment, acceleration)
     moved, is_astray = _advance(slot, problem, report, data, config, progress.horizon)
-    overflow = moved.state.status & Status.SELF_CONTACT_OVERFLOW
     is_good = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
     slot = _choose(is_good, moved, slot.replace(is_done=jnp.ones((), bool)))
     metrics = {
         "loss": loss,
         "inertial_energy": report.inertial_energy,
         "resets": (is_astray | ~is_good).astype(jnp.float32),
-        "overflows": (overflow > 0).astype(jnp.float32),
         **report.energies,
     }
     return gradient, _Sample(slot, metrics, statistics)
@@ -294,7 +292,6 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
     transforms, later = (data.transforms(k, slot.yaw, slot.shape) for k in frames)
     body = BodyStep(*(data.body(frame, slot.girth, slot.shape) for frame in (transforms, later)))
     searched = Obstacle(data.surface, body.start[None, :0])
-    layers = (Repulsion(),) if config.self_contact else ()
     scene = Scene(
         garment=garment,
         material=slot.material,
@@ -303,9 +300,7 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
         body=searched,
         pin_targets=None,
         num_frames=0,
-        terms=scene_terms(
-            Collision(stiffness=config.collision_stiffness), *layers, without=(Ground, Contact)
-        ),
+        terms=scene_terms(Collision(stiffness=config.collision_stiffness), without=(Ground, Contact)),
     )
     inputs = FrameInput(body, data.skinned(index, later, slot.shape))
     return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))

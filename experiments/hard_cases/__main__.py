@@ -1,7 +1,7 @@
 """Run the fifteen hard cases with a simulator and keep the figures, with device and versions.
 
     python experiments/hard_cases physics
-    python experiments/hard_cases physics --integrator bdf2 --skin   # as `eslr simulate` has the solver
+    python experiments/hard_cases physics --integrator bdf2   # as `eslr simulate` has the solver
     python experiments/hard_cases network --model eslr-small
     python experiments/hard_cases corrected --model smooth-small --sheet
     python experiments/hard_cases vbd                 # or style3d, xpbd: Newton's solvers (extra `peers`)
@@ -43,8 +43,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--model", default=DEFAULT_MODEL)
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
     parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
-    parser.add_argument("--skin", action="store_true", help="physics: keep faces off the body too")
-    parser.add_argument("--strict", action="store_true", help="physics: let nothing pass through cloth")
     parser.add_argument("--substeps", type=int, default=1, help="physics: of every frame")
     parser.add_argument("--case", nargs="*", default=[])
     parser.add_argument("--sheet", action="store_true")
@@ -71,8 +69,6 @@ def find_simulator(arguments: argparse.Namespace):
     name = arguments.simulator
     stepping = {
         "--integrator": arguments.integrator != "euler",
-        "--skin": arguments.skin,
-        "--strict": arguments.strict,
         "--substeps": arguments.substeps > 1,
     }
     if name != "physics" and any(stepping.values()):
@@ -84,8 +80,6 @@ def find_simulator(arguments: argparse.Namespace):
         return solver_simulator(
             arguments.iterations,
             arguments.integrator,
-            has_skin=arguments.skin,
-            is_strict=arguments.strict,
             substeps=arguments.substeps,
         )
     if name in ITERATIONS:

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
-from eslr_jax.contact.self_contact import starting_rows
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.mesh.prepare import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.mesh.topology import face_cross_products
 from eslr_jax.simulation.scene import initial_state
-from eslr_jax.terms import Bending, Collision, Friction, Gravity, Inertia, Repulsion, Stretch, Term
+from eslr_jax.terms import Bending, Collision, Contact, Friction, Gravity, Inertia, Stretch, Term
+from eslr_jax.terms.contact import starting_rows
 from eslr_jax.types import Garment, Material, Obstacle, Scene
 
 FRAME = 1.0 / 30.0  # [s]
@@ -196,26 +196,25 @@ def make_scene(
     body_positions: Float[np.ndarray, "frames body_vertices 3"] | None = None,
     pin_targets: Float[np.ndarray, "frames vertices 3"] | None = None,
     self_contact: bool = False,
-    has_tips: bool = False,
 ) -> Scene:
     """Put cloth, body and pins together; the cloth starts at rest.
 
     Without their tracks [m] the body, whose vertices all have faces, stands still, and pinned vertices stay
-    where they start. In frame 0 the body must not touch itself; `has_tips` says that it has
-    tips finer than the cloth's mesh.
+    where they start. In frame 0 the body must not touch itself. Nothing passes through the cloth where there is a
+    body, or with `self_contact`.
     """
     position = jnp.asarray(start, jnp.float32)
     obstacle = pins = None
     terms: list[Term] = [Stretch(), Bending(), Inertia(), Gravity(gravity)]
     if body is not None:
-        terms += [Collision(has_tips=has_tips), Friction(friction)]
+        terms += [Collision(), Friction(friction)]
         track = body[0][None] if body_positions is None else body_positions
         obstacle = Obstacle(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
         )
-    if self_contact:
-        terms.append(Repulsion(num_rows=starting_rows(len(start))))
+    if self_contact or body is not None:
+        terms.append(Contact(rows=starting_rows(len(start))))
     if np.any(garment.is_pinned):
         targets = np.asarray(start)[None] if pin_targets is None else pin_targets
         pins = jnp.asarray(np.broadcast_to(targets, (num_frames, *position.shape)), jnp.float32)

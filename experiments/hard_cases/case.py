@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.simulation.scene import Integrator, start_integrator
-from eslr_jax.terms import Collision, Contact, Repulsion
 from eslr_jax.types import Scene, Trajectory
 from hard_cases.colliders import Collider
 
@@ -36,18 +35,11 @@ class Simulator:
     simulate: Callable[[Scene], Trajectory]
     garment_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of `prepare_garment`
     integrator: Integrator = "euler"
-    has_skin: bool = False  # faces of the cloth keep off the body too
-    is_strict: bool = False  # and nothing passes through cloth
     substeps: int = 1  # of every frame
 
     def prepare(self, scene: Scene) -> Scene:
         """Return a case's scene with what this simulator models."""
         start = start_integrator(scene.initial_state, self.integrator)
-        if (touching := scene.term(Collision)) is not None:
-            scene = scene.with_term(touching.replace(has_skin=self.has_skin))
-        if self.is_strict:
-            strict = Contact(has_layers=scene.term(Repulsion) is not None)
-            scene = scene.replace(terms=(*scene.terms, strict))
         return scene.replace(initial_state=start, substeps=self.substeps)
 
 

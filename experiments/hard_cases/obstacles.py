@@ -39,10 +39,8 @@ def _build_needle(options: Mapping[str, Any]) -> Scenes:
     edge = capsule(_TIP, 0.7, around=12, rings=60)
     bar = Capsule(np.array([-0.35, 0.0, 0.0]), np.array([0.35, 0.0, 0.0]), _TIP)
     return {
-        "needle": CaseScene(make_scene(garment, start, 46, body=mesh, has_tips=True), lambda frame: (cone,)),
-        "thin edge": CaseScene(
-            make_scene(garment, start, 46, body=edge, has_tips=True), lambda frame: (bar,)
-        ),
+        "needle": CaseScene(make_scene(garment, start, 46, body=mesh), lambda frame: (cone,)),
+        "thin edge": CaseScene(make_scene(garment, start, 46, body=edge), lambda frame: (bar,)),
     }
 
 

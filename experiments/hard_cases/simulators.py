@@ -9,24 +9,17 @@ from hard_cases.case import Simulator
 
 
 def solver_simulator(
-    iterations: int = 200,
-    integrator: Integrator = "euler",
-    *,
-    has_skin: bool = False,
-    is_strict: bool = False,
-    substeps: int = 1,
+    iterations: int = 200, integrator: Integrator = "euler", *, substeps: int = 1
 ) -> Simulator:
     """Return the L-BFGS solver as a simulator, see `Simulator`."""
 
     def run(scene: Scene) -> Trajectory:
         return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
 
-    parts = ["physics", integrator * (integrator != "euler"), "skin" * has_skin, "strict" * is_strict]
+    parts = ["physics", integrator * (integrator != "euler")]
     parts += [f"{substeps} substeps" * (substeps > 1), f"{iterations} iterations"]
     name = ", ".join(filter(None, parts))
-    return Simulator(
-        name, run, integrator=integrator, has_skin=has_skin, is_strict=is_strict, substeps=substeps
-    )
+    return Simulator(name, run, integrator=integrator, substeps=substeps)
 
 
 def network_simulator(name: str, network: Network, iterations: int = 0) -> Simulator:

@@ -39,6 +39,7 @@ from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.stepper import make_stepper
+from eslr_jax.terms import FAST
 from paper.rollouts import (
     CONTROLS,
     CONTROLS_OF_WEIGHTS,
@@ -276,7 +277,11 @@ def cost_table(rows: Rows, vertices: str, is_smoke: bool) -> dict[str, Any]:
     poses = pose_body(load_body(), load_motion("cmu_016_32"), num_frames=2)
     parts, found = {}, {}
     for label, system in systems.items():
-        scene = prepare_scene(load_garment("tshirt", vertices=vertices, **system.garment_options), poses)  # type: ignore[arg-type]
+        scene = prepare_scene(
+            load_garment("tshirt", vertices=vertices, **system.garment_options),
+            poses,
+            terms=FAST,
+        )  # type: ignore[arg-type]
         inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
 
         def forward(network, state, config=system.config, scene=scene, inputs=inputs):

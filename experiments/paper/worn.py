@@ -12,6 +12,7 @@ from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.assets import load_body, load_garment, load_motion
 from eslr_jax.pose.motion import back_and_forth, pose_body
 from eslr_jax.simulation.plan import prepare_scenes
+from eslr_jax.terms import FAST
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 OPTIMUM_ITERATIONS = 60  # of L-BFGS: leaves 0.03 % of the initial gap
@@ -74,5 +75,5 @@ def wear(garment_options: tuple[tuple[str, object], ...], setting: Setting) -> l
     names = [name for name in setting.garments for _ in motions]
     worn = [load_garment(name, vertices=setting.vertices, **dict(garment_options)) for name in names]  # type: ignore[arg-type]
     poses = motions * len(setting.garments)
-    scenes = prepare_scenes(worn, poses, [COTTON] * len(worn))
+    scenes = prepare_scenes(worn, poses, [COTTON] * len(worn), terms=FAST)
     return [Worn(*row) for row in zip(names, scenes, poses, strict=True)]

@@ -13,7 +13,7 @@ from hard_cases.measures import depths, mechanical_energy, optimality_gaps, sett
 
 from eslr_jax import ConfigError, MeshError, Status
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.terms import Repulsion
+from eslr_jax.terms import Contact
 
 
 def kinematic(path):
@@ -173,7 +173,7 @@ def test_without_self_contact_layers_pass_through_each_other():
     solver = solver_simulator(50)
 
     def simulate(scene):
-        bare = tuple(term for term in scene.terms if not isinstance(term, Repulsion))
+        bare = tuple(term for term in scene.terms if not isinstance(term, Contact))
         return solver.simulate(scene.replace(terms=bare))
 
     blind = Simulator("blind", simulate)

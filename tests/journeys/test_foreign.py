@@ -172,7 +172,7 @@ def test_lengths_that_are_listed_are_accepted(eslr, tmp_path):
     }
     count = listed["cmu_016_22"]["frames"]
     words = ("--motion", "cmu_016_22", "--simulator", "physics", "--iterations", 10)
-    words += ("--no-self-contact", "--no-pictures")  # for speed
+    words += ("--contact", "fast", "--no-pictures")  # for speed
     refused = eslr("simulate", *words, "--frames", count + 1, "--out", tmp_path / "out")
     assert refused.returncode == 2
     assert f"{count} frames" in refused.stderr

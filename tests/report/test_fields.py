@@ -14,7 +14,6 @@ from own_term import Push
 from eslr_jax import (
     AssetError,
     SimConfig,
-    prepare_garment,
     prepare_scene,
     rollout_scene,
     save_scene,
@@ -24,13 +23,12 @@ from eslr_jax import (
 from eslr_jax.pipeline.formats.garment import GarmentFile
 from eslr_jax.pipeline.report.fields import energy_shares, gap_shares, run_field
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_poses, run_trajectory, write_run
-from eslr_jax.simulation.frame import first_problem, frame_inputs, frame_problem
+from eslr_jax.simulation.frame import first_problem
 from eslr_jax.simulation.plan import first_frames
-from eslr_jax.simulation.scene import initial_state
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential, potential_terms
 from eslr_jax.solver.solve import Start, solve
-from eslr_jax.terms import CLOTH, Collision, Gravity, Repulsion
+from eslr_jax.terms import Gravity
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +51,7 @@ def test_stretch_of_uniform_stretch(runs):
 @pytest.fixture(scope="module")
 def problem():
     """The first frame of a square that lies on a ball, by vertices and by faces."""
-    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Collision(has_skin=True)))
+    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms())
     start = scene.initial_state
     loaded = start.replace(friction_load=jnp.full_like(start.friction_load, 1e-3))
     return jax.jit(first_problem)(scene.replace(initial_state=loaded))
@@ -80,30 +78,6 @@ def test_gap_shares_add_up_to_the_optimality_gap(problem):
     assert -shares[shares < 0].sum() < 0.5 * gap
     at_optimum = gap_shares(minimum.position, problem)
     assert abs(float(at_optimum.sum())) < 0.01 * gap
-
-
-@pytest.mark.slow
-def test_repulsion_counts_where_layers_meet():
-    """Two squares 1 mm apart: the pairs' energy goes to both layers."""
-    lower = square(6, 0.1)
-    upper = np.add(lower.rest_positions, [0.003, 1e-3, 0.002])
-    ones = np.ones((72, 1))
-    garment = prepare_garment(
-        np.concatenate([lower.rest_positions, upper]),
-        np.concatenate([lower.faces, np.add(lower.faces, 36)]),
-        skin_weights=ones,
-        skin_indices=np.zeros((72, 1), int),
-        allow_components=True,
-    )
-    options = {"terms": (*CLOTH, Repulsion(where="all")), "starts_at_rest": True}
-    scene = prepare_scene(garment, drifting_ball(2), **options)
-    still = jnp.asarray(garment.rest_positions)
-    inputs = jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene))
-    problem = jax.jit(frame_problem)(scene, initial_state(still, jnp.zeros_like(still)), inputs)
-    whole = float(potential_terms(still, problem)["repulsion"])
-    shares = np.asarray(energy_shares("repulsion", still, problem))
-    assert shares.sum() == pytest.approx(whole, rel=1e-4)
-    assert min(shares[:36].sum(), shares[36:].sum()) > 0.2 * whole > 0
 
 
 @pytest.mark.slow
@@ -155,12 +129,6 @@ def test_a_run_without_a_body_has_no_field_of_it(runs, name):
     with pytest.raises(AssetError, match=f"has no body, and so no {name}") as caught:
         run_field(run, name)
     assert "\n" not in str(caught.value)
-
-
-def test_a_run_without_self_contact_has_no_repulsion(tmp_path, body):
-    run = read_run(write_run_by_hand(tmp_path, body, "run", terms=scene_terms(without=(Repulsion,))))
-    with pytest.raises(AssetError, match="without self-contact"):
-        run_field(run, "repulsion-energy")
 
 
 def test_distance_grows_by_what_the_cloth_is_moved(runs):

@@ -5,23 +5,22 @@ import pytest
 
 from eslr_jax import prepare_scene
 from eslr_jax.pipeline.report.scene_parts import describe_scene, take_turns, time_parts
-from eslr_jax.terms import CLOTH, Air, Damping, Repulsion
+from eslr_jax.terms import CLOTH, Air, Damping
 from eslr_jax.types import Threads
 
 
 def test_what_a_scene_lacks_is_left_out(small_garment, small_poses, small_scene):
     parts = describe_scene(small_scene, small_poses, None)
     assert set(parts.modelled) == {
-        "stretch", "bending", "inertia", "gravity", "collision", "friction", "body",
+        "stretch", "bending", "inertia", "gravity", "collision", "friction", "contact", "body",
     }  # fmt: skip
     assert set(parts.left_out) == {
-        "pins", "ground", "air", "damping", "repulsion", "fabric by part", "network",
+        "pins", "ground", "air", "damping", "fabric by part", "network",
     }  # fmt: skip
     assert parts.modelled["stretch"] == "100 faces"
-    options = {"terms": (*CLOTH, Repulsion(where="all"), Air((3.0, 0.0, 4.0)), Damping(0.01))}
+    options = {"terms": (*CLOTH, Air((3.0, 0.0, 4.0)), Damping(0.01))}
     bare = describe_scene(prepare_scene(small_garment, small_poses, **options), small_poses, None)
     assert bare.left_out["collision"] == "no body in reach"
-    assert bare.modelled["repulsion"] == "layers of cloth"
     assert (bare.modelled["air"], bare.modelled["damping"]) == ("5.0 m/s", "0.01 s")
     scene = prepare_scene(small_garment, small_poses, integrator="bdf2", substeps=2)
     threads = Threads(warp=jnp.ones((100, 2)), stiffness=jnp.ones((4, 100)))

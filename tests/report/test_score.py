@@ -20,7 +20,6 @@ from eslr_jax.pipeline.report.evaluate import EvaluationOptions, evaluate
 from eslr_jax.pipeline.report.foreign import foreign_trajectory, with_energies
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.pipeline.report.report import trajectory_report
-from eslr_jax.terms import Repulsion
 from eslr_jax.terms.air import blowing
 
 FRAMES = 7
@@ -106,7 +105,6 @@ def test_a_trajectory_is_plain_arrays_by_name(tmp_path, small_trajectory):
     np.testing.assert_array_equal(arrays["stretch_energy"], small_trajectory.energies["stretch"])
     np.testing.assert_array_equal(arrays["positions"], small_trajectory.positions)
     assert "terms" not in arrays
-    assert "repulsion_demand" not in arrays  # no self-contact
     np.savez(tmp_path / "a.npz", **arrays)
 
 
@@ -139,20 +137,3 @@ def test_an_evaluation_without_the_gap_has_the_rollouts():
     assert not {"gap_median_j", "on_policy"} & set(result)
     assert [(row["garment"], row["clip"]) for row in result["scenes"]] == [("tshirt", "cmu_016_32")]
     assert result["rollout"]["drift_mm_s_of"].keys() == {"tshirt"}
-
-
-@pytest.mark.slow
-def test_a_scene_whose_buffers_are_too_small_is_scored_with_larger_ones():
-    """`prepare_scene` begins with a small buffer, which `simulate` enlarges in a scene of its own."""
-    scene = prepare_scene(square(), drifting_ball(4), terms=scene_terms(Repulsion(where="all")))
-    low = np.asarray(scene.initial_state.position)
-    folded = low.copy()
-    folded[:, 0] = np.where(low[:, 0] > 0, -low[:, 0], low[:, 0])  # one half lies 6 mm over the other
-    folded[:, 1] += np.where(low[:, 0] > 0, 6e-3, 0.0)
-    positions = np.repeat(folded[None], 4, axis=0)
-    little = scene.with_term(scene.term(Repulsion).replace(num_rows=2))
-    told = with_energies(foreign_trajectory(positions, little), little)
-    assert int(np.max(told.demands["repulsion"])) > 2
-    ample = scene.with_term(scene.term(Repulsion).replace(num_rows=256))
-    expected = score_trajectory(positions, ample, every=1)
-    assert score_trajectory(positions, little, every=1)["total"] == expected["total"]

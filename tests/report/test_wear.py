@@ -15,7 +15,7 @@ from eslr_jax.pipeline.report.referee import judge
 from eslr_jax.pipeline.report.report import describe_report, describe_start, start_crossing, trajectory_report
 from eslr_jax.pipeline.report.wear import wear_report
 from eslr_jax.pose.lbs import skin_garment
-from eslr_jax.terms import Repulsion
+from eslr_jax.terms import Contact
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def rolled(flat):
 
 def test_cloth_through_cloth_is_told_where_it_is_modelled(worn):
     garment, poses, scene, trajectory, skinned = worn
-    layered = scene.replace(terms=(*scene.terms, Repulsion()))
+    layered = scene.with_term(scene.term(Contact).replace(has_layers=True))
     crossed = skinned.copy()
     crossed[2] = rolled(skinned[0] - skinned[0].mean(axis=0))
     report = report_of((garment, poses, layered, trajectory, skinned), crossed)
@@ -128,7 +128,7 @@ def test_a_start_with_cloth_deep_behind_cloth_is_told_with_its_place(dent, is_to
         put_on = describe_start(start_crossing(scene, parts=parts), is_put_on=True)
         assert put_on
         assert "--start" not in put_on, "which does not change the rest pose"
-    bare = tuple(term for term in scene.terms if not isinstance(term, Repulsion))
+    bare = tuple(term for term in scene.terms if not isinstance(term, Contact))
     assert start_crossing(scene.replace(terms=bare)) is None
 
 

@@ -28,7 +28,7 @@ from eslr_jax.mesh.rest_shape import with_rest_positions
 from eslr_jax.simulation.batch import _group_alike, rollout_scenes, stack_scenes
 from eslr_jax.simulation.plan import shared_surface
 from eslr_jax.simulation.simulate import raise_for_status
-from eslr_jax.terms import CLOTH, Collision, Damping, Ground, Repulsion
+from eslr_jax.terms import CLOTH, Damping, Ground
 
 QUICK = SimConfig(iterations=5)
 CLIPS = (
@@ -134,9 +134,7 @@ def test_fabrics_that_lie_on_one_mesh_are_refused(garments, poses):
 @pytest.mark.slow
 def test_all_that_a_scene_can_model_maps_over_scenes(poses):
     options = {
-        "terms": scene_terms(
-            Collision(has_skin=True), Ground(is_always=True), Repulsion(where="all"), Damping(0.002)
-        ),
+        "terms": scene_terms(Ground(is_always=True), Damping(0.002)),
         "integrator": "bdf2",
         "substeps": 2,
     }

@@ -18,7 +18,6 @@ from eslr_jax import (
     Status,
     load_motion,
     pose_body,
-    prepare_garment,
     prepare_scene,
     rollout,
     rollout_scene,
@@ -30,7 +29,7 @@ from eslr_jax.networks.registry import MODELS
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.solver.solve import Start, solve, solve_hessian
-from eslr_jax.terms import CLOTH, Air, Collision, Damping, Friction, Gravity, Ground, Repulsion, Term
+from eslr_jax.terms import CLOTH, Air, Collision, Damping, Friction, Gravity, Ground, Term
 from eslr_jax.types import tree_cast
 
 TIGHT = SimConfig(iterations=400)  # ends where float64 ends
@@ -88,29 +87,12 @@ def windy_scene(num_frames):
     return wide(scene.replace(terms=(*scene.terms, air, Damping(jnp.asarray(0.01)))))
 
 
-def layered_scene(num_frames):
-    """Two sheets, one three millimetres above the other, which hangs from its corners."""
-    sheet = square(4, 0.08)
-    rest, faces = np.asarray(sheet.rest_positions), np.asarray(sheet.faces)
-    garment = prepare_garment(
-        np.concatenate([rest, rest + np.array([2e-3, 3e-3, 1e-3])]),
-        np.concatenate([faces, faces + len(rest)]),
-        skin_weights=np.tile(sheet.skin_weights, (2, 1)),
-        skin_indices=np.tile(sheet.skin_indices, (2, 1)),
-        is_pinned=np.array([0, 3, 12, 15]),
-        allow_components=True,
-    )
-    options = {"terms": (*CLOTH, Repulsion(where="all", num_rows=200)), "starts_at_rest": True}
-    return wide(prepare_scene(garment, drifting_ball(num_frames), **options))
-
-
 # What of a term may be differentiated, and by which name; places move, and positive numbers grow.
 OF_TERMS = {
     Gravity: {"acceleration": "gravity"},
     Collision: {"stiffness": "collision_stiffness", "thickness": "collision_thickness"},
     Ground: {"stiffness": "ground_stiffness", "thickness": "ground_thickness"},
     Friction: {"coefficient": "friction_coefficient", "speed": "friction_speed"},
-    Repulsion: {"stiffness": "repulsion_stiffness", "thickness": "repulsion_thickness"},
     Air: {"density": "air_density", "normal_drag": "normal_drag", "tangential_drag": "tangential_drag"},
     Damping: {"time": "damping"},
 }
@@ -228,10 +210,8 @@ SCENES = {
     "friction": lambda: small_scene(4, has_body=True),
     "bdf2": lambda: small_scene(4, has_body=True, integrator="bdf2"),
     "substeps": lambda: small_scene(3, has_body=True, integrator="bdf2", substeps=2),
-    "skin": lambda: small_scene(3, Collision(has_skin=True), has_body=True),
     "air": lambda: windy_scene(4),
     "ground": lambda: grounded_scene(4),
-    "layers": lambda: layered_scene(3),
 }
 
 

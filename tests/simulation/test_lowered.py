@@ -7,7 +7,7 @@ from draped_ball import drifting_ball, square
 from eslr_jax import SimConfig, prepare_scene, scene_terms
 from eslr_jax.simulation import frame
 from eslr_jax.simulation.stepper import make_stepper
-from eslr_jax.terms import Air, Collision, Damping, Ground, Repulsion
+from eslr_jax.terms import Air, Damping, Ground
 
 
 @pytest.mark.slow
@@ -15,9 +15,7 @@ def test_physics_multiplies_in_full_precision():
     """A GPU rounds the operands of other products of float32 to ten bits."""
     options = {
         "terms": scene_terms(
-            Collision(has_skin=True),
             Ground(is_always=True),
-            Repulsion(where="all"),
             Air((0.0, 0.0, 0.0)),
             Damping(0.01),
         ),

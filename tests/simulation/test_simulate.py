@@ -18,7 +18,6 @@ from eslr_jax import (
     Status,
     prepare_scene,
     rollout_scene,
-    scene_terms,
     simulate,
 )
 from eslr_jax.fabric.materials import COTTON
@@ -37,7 +36,7 @@ from eslr_jax.simulation.simulate import (
     hold_last,
     raise_for_status,
 )
-from eslr_jax.terms import CLOTH, Friction, Repulsion
+from eslr_jax.terms import CLOTH, Contact, Friction
 
 SOLVER = SimConfig(iterations=12)
 
@@ -98,7 +97,6 @@ def crossing_sheets(num_frames=3, **options):
     scene = prepare_scene(
         garment,
         drifting_ball(num_frames),
-        terms=scene_terms(Repulsion(where="all")),
         starts_at_rest=True,
         **options,
     )
@@ -119,7 +117,6 @@ def simulated(kind):
     }
     if kind == "self-contact in substeps of bdf2":
         scene = crossing_sheets(14, integrator="bdf2", substeps=2)
-        scene = scene.with_term(scene.term(Repulsion).replace(num_rows=1000))
     else:
         scene = prepare_scene(square(), drifting_ball(14), **options[kind])
     return simulate(None, scene, config=SOLVER)
@@ -294,18 +291,18 @@ def slow_first_program(monkeypatch, seconds):
 @pytest.mark.slow
 def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     scene = crossing_sheets()
-    few = scene.with_term(scene.term(Repulsion).replace(num_rows=20))
+    few = scene.with_term(scene.term(Contact).replace(rows=512))
     short = rollout_scene(None, few, SOLVER)
     assert Status.SELF_CONTACT_OVERFLOW in Status(int(short.status))
     with pytest.raises(CapacityError, match=r"frame 1: .*: \d+ rows or more"):
         raise_for_status(short)
-    assert enlarge_buffers(few, short).term(Repulsion).num_rows > 20
+    assert enlarge_buffers(few, short).term(Contact).rows > 512
     waits = slow_first_program(monkeypatch, 5.0)
     found = simulate(None, few, config=SOLVER)
     assert len(waits) > 1, "a program for every buffer"
     assert found.timing.compile_s >= sum(waits)
     assert found.timing.frame_ms * 2 * len(waits) > 5e3, "the mean is over the two frames of every pass"
-    assert found.scene.term(Repulsion).num_rows > 20
+    assert found.scene.term(Contact).rows > 512
     expected = rollout_scene(None, found.scene, SOLVER)
     assert Status(int(expected.status)) == Status.OK
     np.testing.assert_allclose(found.trajectory.positions, expected.positions, atol=1e-5)
@@ -315,13 +312,13 @@ def test_self_contact_that_overflows_gets_the_buffers_it_needs(monkeypatch):
     assert Status(int(stopped.trajectory.status)) == Status.OK
 
 
-def test_buffers_grow_by_shared_sizes_until_they_hold_the_fullest_frame_and_a_quarter_more(scene, whole):
-    tight = scene.replace(terms=(*scene.terms, Repulsion(num_rows=20)))
-    for most, pairs in ((21, 28), (33, 48), (38, 48), (60, 80), (64, 80), (65, 95), (40, 57)):
+def test_buffers_grow_until_they_hold_the_fullest_frame_and_half_as_much_more(scene, whole):
+    tight = scene.with_term(scene.term(Contact).replace(rows=512))
+    for most, rows in ((513, 1024), (1500, 2560), (600, 1024)):
         demand = jnp.array([0] * 5 + [most] + [10] * 8)
-        full = whole.replace(demands={"repulsion": demand}, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
-        assert enlarge_buffers(tight, full).term(Repulsion).num_rows == pairs
-    with pytest.raises(CapacityError, match="40 rows or more"):
+        full = whole.replace(demands={"contact": demand}, status=jnp.int32(Status.SELF_CONTACT_OVERFLOW))
+        assert enlarge_buffers(tight, full).term(Contact).rows == rows
+    with pytest.raises(CapacityError, match="600 rows or more"):
         raise_for_status(full)
     full = full.replace(first_bad_frame=jnp.int32(5))
     with pytest.raises(CapacityError, match=r"^frame 3: "):
@@ -348,11 +345,6 @@ def test_a_body_that_jumps_away_from_the_cloth_is_not_too_fast_to_follow(scene):
     )
     trajectory = simulate(None, fallen, config=SOLVER).trajectory
     assert (trajectory.num_frames, int(trajectory.first_bad_frame)) == (14, -1)
-
-
-def test_a_buffer_without_a_row_is_refused():
-    with pytest.raises(ConfigError, match="one row or more"):
-        Repulsion(num_rows=0).check()
 
 
 def test_a_scene_of_one_frame_is_refused(scene):

@@ -215,7 +215,7 @@ class Info:
             rig = load_body()
             poses = pose_body(rig, load_motion(self.motion or DEFAULT_MOTION))
             cloth = load_garment(garment, vertices=self.vertices, body=rig)
-            scene = prepare_scene(cloth, poses, terms=options.terms(has_solver=True), integrator="bdf2")
+            scene = prepare_scene(cloth, poses, terms=options.terms(), integrator="bdf2")
             parts = describe_scene(scene, poses, method.params)
             costs = time_parts(method.params, scene, method.config)
         if self.json:

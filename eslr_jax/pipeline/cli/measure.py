@@ -155,6 +155,7 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     from eslr_jax.pipeline.fabrics import garment_material
     from eslr_jax.pipeline.formats.garment import in_outfit_order
     from eslr_jax.simulation.plan import prepare_scene
+    from eslr_jax.terms import FAST
 
     if len(sequences) > 1 and "garment" not in given:
         known = ", ".join(sequence.mesh for sequence in sequences)
@@ -173,7 +174,8 @@ def _named_task(sequences: list[MeshSequence], given: dict[str, Any]) -> _Task:
     by_name = dict(zip(garment_names(files), garments, strict=True))
     positions = in_outfit_order(sequences, stored, by_name)
     cloth = prepare_stored(stored, name=label)
-    scene = prepare_scene(cloth, poses, material=garment_material(options.fabric, cloth, stored))
+    material = garment_material(options.fabric, cloth, stored)
+    scene = prepare_scene(cloth, poses, material=material, terms=FAST)  # no body has yielded to it
     _check_sequence(sequences[0], positions, scene)
     return _Task(positions, scene, poses, stored, {"garment": label, "motion": motion, "body": options.body})
 

@@ -84,9 +84,9 @@ class Options:
     # iterations are those of each substep.
     substeps: int = 1
     # How contact is kept. With strict nothing passes through cloth, neither the body nor other cloth. With fast,
-    # in half the time, vertices of the cloth keep off the body; skin may show between them, and layers of one
-    # garment pass through each other. The default is strict, or fast for a network alone.
-    contact: Literal["strict", "fast"] | None = None
+    # in half the time, vertices of the cloth keep off the body; skin may show between them, and layers of
+    # cloth pass through each other.
+    contact: Literal["strict", "fast"] = "strict"
     # Model a level ground under the body's lowest point; auto does where cloth could reach it.
     ground: Literal["auto", "on", "off"] = "auto"
     # Model air that moves with this velocity in m/s, such as 3 0 0; y points up, and 0 0 0 is still air.
@@ -117,21 +117,18 @@ class Options:
             if value is not None and value < 0:
                 raise ConfigError(f"--{name} {value}: give a number, 0 or more")
 
-    def terms(self, *, has_solver: bool) -> tuple[Term, ...]:
+    def terms(self) -> tuple[Term, ...]:
         """Return what is modelled where it is needed."""
-        from eslr_jax.terms import Contact, Damping, Ground, Repulsion, scene_terms
+        from eslr_jax.terms import Contact, Damping, Ground, scene_terms
         from eslr_jax.terms.air import blowing
 
-        is_strict = has_solver if self.contact is None else self.contact == "strict"
         changed: list[Term] = [Ground(is_always=self.ground == "on")]
-        if not is_strict:
-            changed.append(Repulsion())
         if (air := blowing(self.wind, self.gust)) is not None:
             changed.append(air)
         if self.damping is not None:
             changed.append(Damping(self.damping))
         changed += map(read_term, self.term)
-        left_out = (Ground,) * (self.ground == "off") + (Contact,) * (not is_strict)
+        left_out = (Ground,) * (self.ground == "off") + (Contact,) * (self.contact == "fast")
         return scene_terms(*changed, without=left_out)
 
     def record(self) -> dict[str, Any]:

@@ -104,7 +104,6 @@ class Render:
         "gravity-energy",
         "collision-energy",
         "friction-energy",
-        "repulsion-energy",
         "gap",
         "distance",
     ] = "fabric"

@@ -204,7 +204,7 @@ def _prepare(options: Options) -> _Setting:
         cloth,
         settling,
         material=material,
-        terms=options.terms(has_solver=has_solver),
+        terms=options.terms(),
         integrator=options.integrator or ("bdf2" if has_solver else "euler"),
         substeps=options.substeps,
         on_shapes=begin,

@@ -16,7 +16,7 @@ from eslr_jax.mesh.topology import is_on_boundary, vertex_normals
 from eslr_jax.pipeline.dressing.report import common_wearer
 from eslr_jax.pipeline.formats.garment import GarmentFile
 
-LAYER_GAP = 5e-3  # [m] left between two layers at rest: two millimetres over the thickness of repulsion
+LAYER_GAP = 5e-3  # [m] left between two layers at rest: more than the thickness of the body's contact
 _REACH = 0.05  # [m] beneath a layer from which cloth is moved over it; deeper, it belongs to another limb
 _ROUNDS = 20
 _SPREAD = 3  # smoothings that let the neighbours of a moved vertex follow

@@ -22,6 +22,7 @@ from eslr_jax.pipeline.report.report import mean_energies
 from eslr_jax.pose.motion import back_and_forth, pose_body, still_motion
 from eslr_jax.simulation.plan import prepare_scene, shared_surface
 from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
+from eslr_jax.terms import FAST
 from eslr_jax.types import Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
@@ -72,7 +73,7 @@ def evaluate(
 
             def scene_of(num_frames: int, motion=motion, cloth=cloth):
                 poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
-                return prepare_scene(cloth, poses, surface=surface)
+                return prepare_scene(cloth, poses, surface=surface, terms=FAST)
 
             if options.gap_frames:
                 scene = scene_of(options.gap_frames)
@@ -90,7 +91,7 @@ def evaluate(
             scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
-        resting = prepare_scene(cloth, pose_body(body, still), surface=surface)
+        resting = prepare_scene(cloth, pose_body(body, still), surface=surface, terms=FAST)
         drifts[garment] = _drift(network, resting, config)
     known = [drift for drift in drifts.values() if drift is not None]
     largest = max(known) if len(known) == len(drifts) else None

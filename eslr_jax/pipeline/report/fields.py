@@ -20,17 +20,16 @@ from eslr_jax.simulation.frame import frame_inputs
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential
 from eslr_jax.solver.solve import Start, solve
-from eslr_jax.terms import Repulsion
 from eslr_jax.terms.problem import FrameProblem, pin
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.terms.term import vertex_shares
 from eslr_jax.types import ClothState, Garment, Scene
 
 # Energy lost to air and damping belongs to a frame, not to a shape.
-_TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction", "repulsion")
+_TERMS = ("stretch", "bending", "inertia", "gravity", "collision", "friction")
 FIELDS = ("stretch", *(f"{term}-energy" for term in _TERMS), "gap", "distance")
 _BODY_FIELDS = ("collision-energy", "friction-energy", "distance")
-_CONTACT_FIELDS = ("collision-energy", "friction-energy", "repulsion-energy", "gap")
+_CONTACT_FIELDS = ("collision-energy", "friction-energy", "gap")
 _ITERATIONS, _TOLERANCE = 500, 1e-3  # most of a frame's solver, and the share of its gain that it may leave
 _QUADRATURE = 5  # places on the way to the optimum; two are exact for a membrane, contacts have kinks
 
@@ -58,8 +57,6 @@ def run_field(run: Run, name: str) -> Field:
         raise AssetError(f"no field {name!r} to colour by: there are {', '.join(FIELDS)}")
     if name in _BODY_FIELDS and run.trajectory.body is None:
         raise AssetError(f"{run.name} has no body, and so no {name}; colour by something else")
-    if name == "repulsion-energy" and run.scene.term(Repulsion) is None:
-        raise AssetError(f"{run.name} has no {name}: it was simulated without self-contact")
     if name == "distance":
         trajectory = run.trajectory
         assert trajectory.body is not None

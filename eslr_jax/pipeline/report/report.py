@@ -16,7 +16,7 @@ from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.formats.garment import split_outfit
 from eslr_jax.pipeline.report.crossing import find_crossings
 from eslr_jax.pipeline.report.metrics import face_stretches, measure_frames, penetration_p999_mm
-from eslr_jax.terms import Contact, Ground, Repulsion
+from eslr_jax.terms import Contact, Ground
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _EVERY = 10  # frames between those whose crossings are counted
@@ -145,9 +145,9 @@ def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, 
 
 
 def _keeps_layers(scene: Scene) -> bool:
-    """Tell whether a term keeps cloth from passing through cloth."""
+    """Tell whether cloth is kept from passing through cloth."""
     contact = scene.term(Contact)
-    return scene.term(Repulsion) is not None or (contact is not None and contact.has_layers)
+    return contact is not None and contact.has_layers
 
 
 def _real_faces(scene: Scene) -> np.ndarray:
