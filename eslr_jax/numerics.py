@@ -173,12 +173,6 @@ def pierces(
     return is_inside
 
 
-def take3(a: Vector3, rows: Int[Array, ...]) -> Vector3:
-    """Return the chosen rows of vectors given by components."""
-    x, y, z = jnp.stack(a)[:, rows]
-    return x, y, z
-
-
 def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:
     """Split vectors into component arrays; vectors given by components stay as they are."""
     if isinstance(x, tuple):

@@ -67,7 +67,7 @@ def test_a_term_of_ones_own_takes_its_constants_and_choices_from_the_command_lin
 )
 def test_a_term_that_can_not_be_made_is_refused_in_one_line(text, reason):
     with pytest.raises(ConfigError, match=reason) as caught:
-        Options(term=(text,)).terms(has_solver=True)
+        Options(term=(text,)).terms()
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
 

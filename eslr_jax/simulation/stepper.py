@@ -30,9 +30,9 @@ class FrameReport(NamedTuple):
     residual: Float[Array, ""]  # force norm over weight
     iterations: Int[Array, ""]  # of the solver
     demands: dict[str, Int[Array, ""]]  # see Trajectory
-    is_passed: Bool[Array, ""] | None  # likewise
     # Share of the initial gap that the solver left at most; infinite without one.
     gap_bound: Float[Array, ""] | float = math.inf
+    is_passed: Bool[Array, ""] | None = None  # see Trajectory
 
 
 MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15

@@ -100,16 +100,6 @@ class Worn:
         lowest = self.skinned[:, self._is_real, 1].min(axis=0) - self.radii
         return bool((lowest[~self._is_pinned] < height).any())
 
-    def pieces_meet(self) -> bool:
-        """Tell whether two pieces come close enough to touch."""
-        piece = self.pieces[self._is_real]
-        for positions in self.skinned[self._sampled][:, self._is_real]:
-            for number in range(1, self.num_pieces):
-                one, others = positions[piece == number], positions[piece < number]
-                if np.isfinite(cKDTree(others).query(one, distance_upper_bound=_MEETS)[0]).any():
-                    return True
-        return False
-
     def meets_itself(self) -> bool:
         """Tell whether cloth of one piece can touch itself.
 

@@ -27,7 +27,6 @@ _STRETCH = 1.5  # of one face in a hundred, from which cloth looks stretched
 _TORN = 2.0  # of a single face, from which it looks torn
 _PENETRATION_MM = 5.0
 _THROUGH_MM = 1.0  # of skin in front of cloth
-_UNTANGLED_MM = 20.0  # behind other cloth, up to which self-contact pulls it back: `contact.crossing`
 _SLID_M = 0.25
 _EDGE_SLID_M = 0.2  # of an edge that lies on the skin, as at neck, waist and wrists; sleeves ride up by less
 _LEFT = 0.75  # of the covered skin that cloth should still be near
@@ -156,7 +155,7 @@ def _real_faces(scene: Scene) -> np.ndarray:
 
 
 def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any] | None:
-    """Return where cloth lies deepest behind cloth in frame 0, which self-contact has to bring back.
+    """Return where cloth lies deepest behind cloth in frame 0, where contact then keeps it.
 
     Returns: Plain values: pairs of faces that intersect, `depth_mm` of the deepest vertex, its `position_m` and
     its place, with its part. None where nothing is behind a layer that it passed, or self-contact is not
@@ -328,19 +327,19 @@ def describe_report(report: dict[str, Any]) -> Words:
 
 
 def describe_start(crossing: dict[str, Any] | None, *, is_put_on: bool) -> str | None:
-    """Return a warning where cloth begins deeper behind cloth than self-contact pulls it back; else None.
+    """Return a warning where cloth begins behind cloth that it passes through; else None.
 
     `crossing` is of `start_crossing`; `is_put_on`: the garment begins on the body's rest pose.
     """
-    if crossing is None or crossing["depth_mm"] <= _UNTANGLED_MM:
+    if crossing is None:
         return None
     x, y, z = crossing["position_m"]
     place = _where(crossing["place"], "on the rest pose" if is_put_on else None)
     other = "begin with another frame (--start), lift the arms (--arm-abduction), or "
     return (
         f"cloth begins {crossing['depth_mm']:.0f} mm behind cloth that it passes through, at {x:.2f} {y:.2f} "
-        f"{z:.2f} m, {place}, with {crossing['crossing_pairs']} pairs of faces. What is deeper than "
-        f"{_UNTANGLED_MM:.0f} mm may stay: {'' if is_put_on else other}mend the garment there"
+        f"{z:.2f} m, {place}, with {crossing['crossing_pairs']} pairs of faces, and will stay "
+        f"there: {'' if is_put_on else other}mend the garment there"
     )
 
 

@@ -137,7 +137,7 @@ def simulation_steps(python: str, folder: Path, fabric: str, tolerance: str, has
         folder: Folder of the job.
         fabric: As for `eslr simulate --fabric`.
         tolerance: As for `eslr simulate --tolerance`.
-        has_layers: Keep the cloth off itself.
+        has_layers: Let nothing pass through cloth.
     """
 
     def step(text: str, *words: object) -> Step:
