@@ -19,9 +19,8 @@ from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, dot3, sub3
 
 GAP = 1e-4  # [m] within which pairs are looked for
-_PUSHED = (
-    5e-4  # [m] that pushed pairs are left: far more than they need, since pushes of many pairs are averaged
-)
+# [m] that pushed pairs are left. It is far more than they need, since pushes of many pairs are averaged.
+_PUSHED = 5e-4
 # [m] that pairs may end with, so that gaps do not shrink from frame to frame: in float32 the normal across a gap
 # of a micrometre is off by 1e-2, which is more than the gap over the length of a face.
 FLOOR = 0.5 * GAP
@@ -178,8 +177,8 @@ def pushed_apart(
 ) -> tuple[Vector3, Float[Array, ""]]:
     """Return ends of straight ways, pushed so that no pair meets, and what gap is lacking.
 
-    A pair that may meet, or ends nearer than `FLOOR`, is pushed apart to `GAP` along the direction that separated
-    it last. Vertices take the mean of their pushes.
+    A pair that may meet, or ends nearer than `FLOOR`, is pushed apart to half a millimetre, along the direction
+    that separated it last. Vertices take the mean of their pushes.
 
     Args:
         start: Vertices before, by components [m]; no pair crosses.

@@ -117,9 +117,7 @@ def _in_chunks(
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     # The last chunk goes on beyond the last frame, and what it simulates there is dropped: all stands still.
     held = np.minimum(np.arange(scene.num_frames + chunk), total)
-    inputs = frame_inputs(
-        slice_tracks(jax.device_get(scene), held)
-    )  # cut on the host, where it compiles nothing
+    inputs = frame_inputs(slice_tracks(jax.device_get(scene), held))  # on the host, where it compiles nothing
     constant = jax.tree.map(jnp.asarray, _without_frames(scene))
 
     def part(first: int) -> FrameInput:

@@ -118,8 +118,6 @@ def run(arguments: argparse.Namespace) -> None:
     simulator = find_simulator(arguments)
     other = f"_{arguments.model}" if arguments.model != DEFAULT_MODEL else ""
     other += f"_{arguments.integrator}" if arguments.integrator != "euler" else ""
-    other += "_skin" if arguments.skin else ""
-    other += "_strict" if arguments.strict else ""
     other += f"_{arguments.substeps}_substeps" if arguments.substeps > 1 else ""
     path = arguments.out / f"hard_cases_{arguments.simulator}{other}.json"
     outcomes = []

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
 from eslr_jax.fabric.materials import COTTON
+from eslr_jax.mesh.parting import parted
 from eslr_jax.mesh.prepare import prepare_garment
 from eslr_jax.mesh.surface import prepare_surface
 from eslr_jax.mesh.topology import face_cross_products
@@ -208,7 +209,7 @@ def make_scene(
     terms: list[Term] = [Stretch(), Bending(), Inertia(), Gravity(gravity)]
     if body is not None:
         terms += [Collision(), Friction(friction)]
-        track = body[0][None] if body_positions is None else body_positions
+        track = body[0][None] if body_positions is None else parted(body_positions, body_positions[0], body[1])
         obstacle = Obstacle(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
