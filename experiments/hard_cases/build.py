@@ -209,7 +209,9 @@ def make_scene(
     terms: list[Term] = [Stretch(), Bending(), Inertia(), Gravity(gravity)]
     if body is not None:
         terms += [Collision(), Friction(friction)]
-        track = body[0][None] if body_positions is None else parted(body_positions, body_positions[0], body[1])
+        track = (
+            body[0][None] if body_positions is None else parted(body_positions, body_positions[0], body[1])
+        )
         obstacle = Obstacle(
             surface=prepare_surface(track[0], body[1]),
             positions=jnp.asarray(np.broadcast_to(track, (num_frames, *body[0].shape)), jnp.float32),
