@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from eslr_jax.mesh.piercing import piercing_edges
 from eslr_jax.mesh.topology import unique_edges
 
-_GAP = 3e-3  # [m] between two parts: two layers of cloth, and a millimetre around each
+_GAP = 5e-3  # [m] between two parts: cloth on both sides that keeps two millimetres off, and one to spare
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
 _AROUND = 0.025  # [m] in which faces are looked for
 # [m] apart at rest, below which places belong to one crease; and the gap over what is beyond `_CREASE_START`
