@@ -19,6 +19,7 @@ from eslr_jax.pipeline.assets import split_clips
 from eslr_jax.pipeline.assets.training import load_training_data
 from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
+from eslr_jax.terms import FAST
 from eslr_jax.training.loop import keep_memory
 from eslr_jax.training.loss import physics_loss
 from eslr_jax.training.recipe import load_recipe
@@ -34,7 +35,7 @@ def main() -> None:
     data = load_training_data(config, config.vertices[0])
     state = init_train_state(config, (data,))
     poses = pose_body(load_body(), load_motion(split_clips(config.split)[0]), num_frames=2)
-    scene = prepare_scene(data.garment(jnp.int32(0)), poses, surface=data.surface)
+    scene = prepare_scene(data.garment(jnp.int32(0)), poses, surface=data.surface, terms=FAST)
     cloth = scene.initial_state
     problem = jax.jit(frame_problem)(scene, cloth, jax.tree.map(lambda leaf: leaf[0], frame_inputs(scene)))
     optimizer = make_optimizer(config)

@@ -21,6 +21,7 @@ from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.motion import still_motion
 from eslr_jax.pose.retarget import ARM_ABDUCTION
 from eslr_jax.simulation.rollout import rollout_scene
+from eslr_jax.terms import FAST
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Body, Scene
 from inverse.search import descend, gradient_cost, search_simplex
@@ -46,7 +47,9 @@ def band_weights(rest: np.ndarray) -> np.ndarray:
 def make_scene(body: Body, num_frames: int) -> Scene:
     """Return the T-shirt as it is cut, on a body that stands still."""
     scene = prepare_scene(
-        load_garment("tshirt"), pose_body(body, still_motion(body, num_frames, arm_angle=ARM_ABDUCTION))
+        load_garment("tshirt"),
+        pose_body(body, still_motion(body, num_frames, arm_angle=ARM_ABDUCTION)),
+        terms=FAST,
     )
     return scene.replace(timestep=jnp.float32(TIMESTEP))
 
