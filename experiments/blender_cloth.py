@@ -34,7 +34,8 @@ from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.point_cache import write_pc2
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.terms import Collision, Contact, Friction, Gravity
+from eslr_jax.terms import Collision, Friction, Gravity
+from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness
 from eslr_jax.types import Scene, Trajectory
 
@@ -89,7 +90,7 @@ def run_blender(scene: Scene, effort: tuple[int, int]) -> BlenderRun:
         "distance": max(distance - _BODY_DISTANCE, _BODY_DISTANCE), "body_distance": _BODY_DISTANCE,
         "friction": 100.0 * float(friction.coefficient),
     }  # fmt: skip
-    if (kept := scene.term(Contact)) is not None and kept.has_layers:
+    if keeps_layers(scene):
         arrays["layer_distance"] = float(contact_thickness(scene.garment, LAYER_THICKNESS))
     if cloth.is_pinned.any():
         below = np.repeat(start[None], scene.num_frames, axis=0)

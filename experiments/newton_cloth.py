@@ -37,7 +37,8 @@ from jaxtyping import Float, Int
 from eslr_jax.errors import EslrError
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.terms import Collision, Contact, Friction, Gravity
+from eslr_jax.terms import Collision, Friction, Gravity
+from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
@@ -318,7 +319,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
     friction_speed = float((scene.term(Friction) or Friction()).speed)
     if setting.solver == "vbd":
         layers = {}
-        if (kept := scene.term(Contact)) is not None and kept.has_layers:
+        if keeps_layers(scene):
             distance = float(contact_thickness(scene.garment, LAYER_THICKNESS))
             layers = {
                 "particle_enable_self_contact": True,
@@ -329,7 +330,7 @@ def _make_solver(newton: ModuleType, model: Any, setting: Setting, scene: Scene)
     if setting.solver == "xpbd":
         return solvers.SolverXPBD(model, iterations=iterations)
     solver = solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=iterations))
-    if (kept := scene.term(Contact)) is None or not kept.has_layers:
+    if not keeps_layers(scene):
         solver.collision.stiff_vf = solver.collision.stiff_ee = solver.collision.stiff_ef = 0.0
     solver.collision.friction_epsilon = friction_speed
     return solver

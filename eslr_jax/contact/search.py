@@ -220,23 +220,13 @@ def _bounds(values: Float[Array, "3 groups members"], multiple: int = 1) -> _Box
     return _Boxes(low, jnp.pad(jnp.max(values, axis=2), more, constant_values=-jnp.inf))
 
 
-Range = tuple[Array, Array]
-"""The lowest and the highest of one component in every group, each of shape [groups]."""
-
-
-def box_gaps(own: list[Range], others: list[Range]) -> Float[Array, "own others"]:
-    """Return all squared distances between two sets of boxes [m^2], given by their ranges along the axes."""
+def _gaps(blocks: _Boxes, patches: _Boxes) -> Float[Array, "blocks patches"]:
+    """Return the squared distances between the boxes around blocks and around patches [m^2]."""
     squared = 0.0
-    for (low, high), (other_low, other_high) in zip(own, others, strict=True):
+    for low, high, other_low, other_high in zip(*blocks, *patches, strict=True):
         gap = jnp.maximum(low[:, None] - other_high[None], other_low[None] - high[:, None])
         squared = squared + jnp.square(jnp.maximum(gap, 0.0))
     return squared  # type: ignore[return-value]
-
-
-def _gaps(blocks: _Boxes, patches: _Boxes) -> Float[Array, "blocks patches"]:
-    """Return the squared distances between the boxes around blocks and around patches [m^2]."""
-    own, others = (list(zip(boxes.low, boxes.high, strict=True)) for boxes in (blocks, patches))
-    return box_gaps(own, others)
 
 
 def _may_oppose(

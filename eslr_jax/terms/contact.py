@@ -20,7 +20,7 @@ from eslr_jax.numerics import Vector3, vertex_normals
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.terms.term import Elements, Term
 from eslr_jax.terms.worn import Worn, parted_body
-from eslr_jax.types import BodyMotion, Garment, Obstacle
+from eslr_jax.types import BodyMotion, Garment, Obstacle, Scene
 
 _GROWTH = 16e-3  # [m] under its skin, from which a body grows at the start: edges of the cloth dip in less
 _ROWS = 8  # per vertex of the cloth, of the tables that a scene begins with; a T-shirt needs one, a dress two
@@ -30,6 +30,12 @@ _HEADROOM = 1.5  # of larger tables
 def starting_rows(num_vertices: int) -> int:
     """Return the rows of either table that a scene of a garment of so many vertices begins with."""
     return CHUNK * math.ceil(_ROWS * num_vertices / CHUNK)
+
+
+def keeps_layers(scene: Scene) -> bool:
+    """Tell whether a scene keeps cloth from passing through cloth."""
+    contact = scene.term(Contact)
+    return contact is not None and contact.has_layers
 
 
 class Ends(NamedTuple):

@@ -16,7 +16,8 @@ from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.formats.garment import split_outfit
 from eslr_jax.pipeline.report.crossing import find_crossings
 from eslr_jax.pipeline.report.metrics import face_stretches, measure_frames, penetration_p999_mm
-from eslr_jax.terms import Contact, Ground
+from eslr_jax.terms import Ground
+from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.types import BodyMotion, Scene, Trajectory
 
 _EVERY = 10  # frames between those whose crossings are counted
@@ -127,7 +128,7 @@ def _penetration(depth: np.ndarray | None) -> dict[str, float | None]:
 
 def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, Any]:
     """Return where cloth passes through cloth in spite of self-contact."""
-    if not _keeps_layers(scene):
+    if not keeps_layers(scene):
         return {"crossing_pairs": None, "crossing_share": None, "worst_crossing": None}
     faces = _real_faces(scene)
     last = trajectory.num_frames - 1
@@ -143,12 +144,6 @@ def _crossings(trajectory: Trajectory, scene: Scene, parts: Parts) -> dict[str, 
     }
 
 
-def _keeps_layers(scene: Scene) -> bool:
-    """Tell whether cloth is kept from passing through cloth."""
-    contact = scene.term(Contact)
-    return contact is not None and contact.has_layers
-
-
 def _real_faces(scene: Scene) -> np.ndarray:
     """Return the faces of the garment that are no padding."""
     return np.asarray(scene.garment.faces)[np.asarray(scene.garment.rest_areas) > 0]
@@ -161,7 +156,7 @@ def start_crossing(scene: Scene, *, parts: Parts = (None, ())) -> dict[str, Any]
     its place, with its part. None where nothing is behind a layer that it passed, or self-contact is not
     modelled.
     """
-    if not _keeps_layers(scene):
+    if not keeps_layers(scene):
         return None
     positions = np.asarray(scene.initial_state.position)
     crossings = find_crossings(positions, _real_faces(scene))
