@@ -36,6 +36,7 @@ def prepare_garment(
     skin_indices: Int[np.ndarray, "vertices influences"],
     is_pinned: Bool[np.ndarray, " vertices"] | Int[np.ndarray, " pins"] | None = None,
     sewn_positions: Float[np.ndarray, "vertices 3"] | None = None,
+    panel_corners: Float[np.ndarray, "faces 3 2"] | None = None,
     embedding_size: int = 8,
     embedding_mode: EmbeddingMode = "canonical",
     allow_components: bool = False,
@@ -52,6 +53,8 @@ def prepare_garment(
         is_pinned: Vertices that follow their skinned position, as a mask, shape [vertices], or as indices.
         sewn_positions: Positions on which lengths, areas and angles are measured [m], shape [vertices, 3]; the
             rest positions by default. They differ where the rest shape was posed or moved out of the body.
+        panel_corners: Corners of each face in the plane of the panel that it was cut from [m], shape
+            [faces, 3, 2], where that measures lengths, areas and angles instead.
         embedding_size: Number of coordinates of the geodesic embedding.
         embedding_mode: Kind of geodesic embedding; see `embedding.geodesic_embedding`.
         allow_components: Accept a mesh of several connected components.
@@ -83,8 +86,18 @@ def prepare_garment(
     skin_indices = np.asarray(skin_indices)
     _check_rows(name, num_vertices, skin_weights, skin_indices)
 
-    areas = topology.face_areas(sewn, faces)
+    corners = sewn[faces]
+    if panel_corners is not None:
+        if np.shape(panel_corners) != (len(faces), 3, 2):
+            raise MeshError(f"{name}: panel corners {np.shape(panel_corners)} do not fit {len(faces)} faces")
+        corners = np.pad(np.asarray(panel_corners, np.float64), ((0, 0), (0, 0), (0, 1)))
+    points, apart = corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    if panel_corners is not None:
+        validate_lengths(points, apart, name=f"{name}, as cut")
+    areas = topology.face_areas(points, apart)
     hinges, hinge_faces = topology.find_hinges(faces)
+    sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=2).ravel()
+    left, right = topology.hinge_half_edges(faces)
     edges = topology.unique_edges(faces)
     senders, receivers, reverse = topology.directed_edges(edges)
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
@@ -93,10 +106,10 @@ def prepare_garment(
         sewn_positions=sewn,
         faces=faces,
         rest_areas=areas,
-        inverse_rest_frames=topology.inverse_rest_frames(sewn, faces),
+        inverse_rest_frames=topology.inverse_rest_frames(points, apart),
         hinges=hinges,
         hinge_rest_areas=areas[hinge_faces].sum(axis=1),
-        hinge_rest_lengths=np.linalg.norm(sewn[hinges[:, 1]] - sewn[hinges[:, 0]], axis=1),
+        hinge_rest_lengths=0.5 * (sides[left] + sides[right]),
         vertex_areas=topology.vertex_areas(areas, faces, num_vertices),
         senders=senders,
         receivers=receivers,

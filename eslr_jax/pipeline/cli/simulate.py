@@ -217,7 +217,7 @@ def _prepare(options: Options) -> _Setting:
 
 def _announce(options: Options, setting: _Setting) -> None:
     """Say what a person wants to know before the simulation begins."""
-    from eslr_jax.pipeline.dressing.report import LARGE, describe_fit, describe_transfer
+    from eslr_jax.pipeline.dressing.report import LARGE, describe_fit, describe_sewing, describe_transfer
     from eslr_jax.pipeline.fabrics import beyond_training
     from eslr_jax.pipeline.report.report import describe_start, start_crossing
     from eslr_jax.pose.timing import begins_at_rest
@@ -237,6 +237,8 @@ def _announce(options: Options, setting: _Setting) -> None:
     for name, worn in zip(setting.names, setting.garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))
+        if "sewing" in worn.metadata:
+            say(describe_sewing(worn.metadata["sewing"]))
         if "transfer" in worn.metadata:
             say(f"{name} carried to {options.body}: {describe_transfer(worn.metadata['transfer'])}")
     num_vertices = len(stored.rest_positions)

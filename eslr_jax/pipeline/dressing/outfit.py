@@ -12,7 +12,7 @@ from eslr_jax.errors import MeshError
 from eslr_jax.files.parsing import split_name
 from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.skinning import smooth
-from eslr_jax.mesh.topology import is_on_boundary, vertex_normals
+from eslr_jax.mesh.topology import inverse_rest_frames, is_on_boundary, vertex_normals
 from eslr_jax.pipeline.dressing.report import common_wearer
 from eslr_jax.pipeline.formats.garment import GarmentFile
 
@@ -72,6 +72,11 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
     sewn = [g.rest_positions if g.sewn_positions is None else g.sewn_positions for g in garments]
     uvs = [np.zeros((len(g.faces), 3, 2)) if g.corner_uvs is None else g.corner_uvs for g in garments]
     has_uvs = any(garment.corner_uvs is not None for garment in garments)
+    is_cut = any(garment.panel_corners is not None for garment in garments)
+    corners = [
+        _flat(s, g.faces) if g.panel_corners is None else g.panel_corners
+        for s, g in zip(sewn, garments, strict=True)
+    ]
     part_names, face_parts, fabrics = [], [], []
     for garment, name in zip(garments, names, strict=True):
         own, numbers = [name], np.zeros(len(garment.faces), np.int64)
@@ -91,6 +96,7 @@ def combine_garments(garments: Sequence[GarmentFile], names: Sequence[str]) -> G
         skin_indices=_stack([garment.skin_indices for garment in garments], influences),
         is_pinned=np.concatenate([garment.is_pinned for garment in garments]),
         sewn_positions=np.concatenate(sewn),
+        panel_corners=np.concatenate(corners) if is_cut else None,
         corner_uvs=np.concatenate(uvs) if has_uvs else None,
         face_parts=np.concatenate(face_parts),
         part_names=tuple(part_names),
@@ -143,6 +149,14 @@ def _heights(
     is_beside |= np.linalg.norm(place.offsets, axis=1) > _REACH
     heights = np.einsum("px,px->p", place.offsets, place.normals)
     return np.where(is_beside, np.inf, heights), place.normals, place.faces
+
+
+def _flat(
+    positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 2"]:
+    """Return the corners of every face in its own plane [m]."""
+    edges = np.linalg.inv(inverse_rest_frames(positions, faces)).swapaxes(1, 2)
+    return np.concatenate([edges, np.zeros((len(faces), 1, 2))], axis=1)
 
 
 def _stack(tables: list[np.ndarray], width: int) -> np.ndarray:

@@ -50,6 +50,20 @@ def describe_fit(report: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"warning: {text}" for text in report["warnings"])])
 
 
+def describe_sewing(report: dict[str, Any]) -> str:
+    """Return the report in `GarmentFile.metadata["sewing"]` as a few lines."""
+    return "\n".join(
+        [
+            f"sewn: {report['panels']} panels along {len(report['seams'])} seams, all closed; {report['vertices']} "
+            f"vertices, {report['faces']} faces",
+            f"before it settles: 99 % stretch less than {report['p99_principal_stretch']:.2f}; pairs of faces that "
+            f"cross: {report['crossing_pairs']}; vertices inside the body: {report['inside']}",
+            f"pinned: {report['pinned']} vertices ({report['pinned_by']})",
+            *(f"warning: {text}" for text in report["warnings"]),
+        ]
+    )
+
+
 def describe_transfer(report: dict[str, Any]) -> str:
     """Return what a transfer did as one line, without the names of garment and body."""
     cut = {

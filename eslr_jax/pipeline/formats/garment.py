@@ -29,6 +29,7 @@ _LAYOUT = {
     "skin_indices": ("iu", "vertices influences"),
     "pinned": ("biuf", "vertices"),
     "sewn_positions": ("f", "vertices 3"),
+    "panel_corners": ("f", "faces 3 2"),
     "corner_uvs": ("f", "faces 3 2"),
     "part_names": ("U", "parts"),
     "face_parts": ("iu", "faces", "parts"),
@@ -49,6 +50,8 @@ class GarmentFile:
     is_pinned: Bool[np.ndarray, " vertices"]
     # [m], the shape with the garment's own lengths, areas and angles, where the rest pose distorts them
     sewn_positions: Float[np.ndarray, "vertices 3"] | None = None
+    # [m], corners of each face on its flat panel, which then measure lengths, areas and angles
+    panel_corners: Float[np.ndarray, "faces 3 2"] | None = None
     corner_uvs: Float[np.ndarray, "faces 3 2"] | None = None
     face_parts: Int[np.ndarray, " faces"] | None = None
     part_names: tuple[str, ...] = ()
@@ -64,8 +67,8 @@ class GarmentFile:
 
     @property
     def fit_warnings(self) -> list[str]:
-        """What was doubtful when the garment was fitted."""
-        return self.metadata.get("fit", {}).get("warnings", [])
+        """What was doubtful when the garment was fitted or sewn."""
+        return [text for key in ("fit", "sewing") for text in self.metadata.get(key, {}).get("warnings", [])]
 
 
 def split_outfit(
