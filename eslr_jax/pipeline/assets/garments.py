@@ -40,7 +40,7 @@ from eslr_jax.types import Body, Garment
 
 # Of the bundled body, at which it has the stature (1.72 m) and within 2 cm the girths of GarmentCode's mean body:
 # bust 1.00 m, waist .84 m, hips 1.03 m
-MEAN_SHAPE = (-1.3, 0.0, 0.0, 1.0)
+MEAN_SHAPE = (-1.6, 0.0, 1.0, 0.0)
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
 _SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
 _REFINED = {

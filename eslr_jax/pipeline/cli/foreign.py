@@ -1,9 +1,10 @@
-"""`eslr fit`, `eslr joints`, `eslr convert`: garments, motions and networks of other programs."""
+"""`eslr fit`, `eslr sew`, `eslr joints`, `eslr convert`: what comes from other programs."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,8 @@ from eslr_jax.pipeline.cli.console import app, say, stderr, use_compile_cache, w
 from eslr_jax.pipeline.dressing.options import FitOptions
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from eslr_jax.pipeline.formats.garment import GarmentFile
     from eslr_jax.types import Body
 
@@ -86,7 +89,8 @@ class Fit:
         write_garment_npz(self.out, stored)
         # The name of the file alone may be that of the garment's texture.
         drawn = self.out.with_name(f"{self.out.stem}_fit.png")
-        has_picture = self.picture and _write_before_and_after(drawn, stored, rig)
+        views = [("before", stored.sewn_positions, 25.0), ("after", stored.rest_positions, 25.0)]
+        has_picture = self.picture and _write_views(drawn, stored.faces, rig, views)
         if self.json:
             print(json.dumps(report, indent=2))
             for text in report.get("warnings", ()):
@@ -119,25 +123,93 @@ class Fit:
         return fit_garment(source, rig, self.options, made_for=first)
 
 
-def _write_before_and_after(path: Path, stored: GarmentFile, rig: Body) -> bool:
-    """Render the garment before and after the fit, or say that the extra `render` is missing and return False."""
+def _write_views(
+    path: Path, faces: np.ndarray, rig: Body, views: Sequence[tuple[str, np.ndarray, float]]
+) -> bool:
+    """Render a garment on its body side by side, or say that the extra `render` is missing and return False.
+
+    A view is a caption, the garment's vertices [m] and the angle of the camera in degrees.
+    """
     import numpy as np
 
     from eslr_jax.pipeline.pictures import render_frame, side_by_side, write_png
 
     body = np.asarray(rig.rest_positions), np.asarray(rig.faces)
-    look = {"rest_positions": body[0], "rig": rig, "camera": 25.0, "size": (420, 560)}
+    look = {"rest_positions": body[0], "rig": rig, "size": (420, 560)}
     try:
         with waiting("rendering"):
             pictures = [
-                render_frame(*body, positions, stored.faces, **look)
-                for positions in (stored.sewn_positions, stored.rest_positions)
+                render_frame(*body, positions, faces, camera=camera, **look) for _, positions, camera in views
             ]
     except MissingExtraError as error:
         say(f"no picture: {error}")
         return False
-    write_png(path, side_by_side(pictures, ("before", "after")))
+    write_png(path, side_by_side(pictures, tuple(caption for caption, _, _ in views)))
     return True
+
+
+@app.command(name="sew")
+@dataclasses.dataclass(frozen=True)
+class Sew:
+    """Sew a pattern around a body, for `eslr simulate --garment OUT`.
+
+    A pattern is a specification of GarmentCode (..._specification.json): panels placed around a body, and
+    stitches between their edges. A picture beside OUT shows the garment from the front and from the back.
+    """
+
+    # The pattern's file.
+    pattern: tyro.conf.Positional[Path]
+    # The garment file to write, such as shirt.npz; the picture is then shirt_sewn.png.
+    out: Path
+    # Name of a bundled body, a body file, or a moving mesh, which rests in its first frame: who wears it.
+    body: str = "anny"
+    # Unit of the body's file: m, cm, mm, in or ft; recognised if not given.
+    body_units: str | None = None
+    # Shape of a body with shapes, in standard deviations.
+    betas: tuple[float, ...] = ()
+    # The body that the pattern is made for, from which it is carried to the wearer: a name or a file; `body` is
+    # the wearer itself. By default the bundled body in the shape of GarmentCode's mean body.
+    made_for: str | None = None
+    # About how many vertices the garment gets.
+    vertices: int = 1000
+    # Vertices that follow the body, as for `eslr fit`; a panel is a part, as in part:left_waistband.
+    pin: tuple[str, ...] = ()
+    # Fabric as for `eslr simulate`; it is kept in the file.
+    fabric: tuple[str, ...] = ()
+    # Render the picture (extra `render`).
+    picture: bool = True
+    # Print the report as JSON.
+    json: bool = False
+
+    def __call__(self) -> None:
+        """Sew, write the file and the picture, and say what was done."""
+        from eslr_jax.pipeline.assets import prepare_stored
+        from eslr_jax.pipeline.assets.garments import sew_pattern_file
+        from eslr_jax.pipeline.dressing.report import describe_sewing
+        from eslr_jax.pipeline.fabrics import garment_material
+        from eslr_jax.pipeline.formats.garment import write_garment_npz
+
+        if self.out.suffix != ".npz":
+            raise AssetError(
+                f"--out {self.out}: a garment is an npz file; name it such as {self.out.stem}.npz"
+            )
+        with waiting("sewing"):
+            rig = load_wearer(self.body, units=self.body_units, betas=self.betas)
+            made_for = rig if self.made_for == "body" else self.made_for and load_wearer(self.made_for)
+            stored = sew_pattern_file(
+                self.pattern, rig, made_for=made_for or None, num_vertices=self.vertices, pin=self.pin
+            )
+            stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(self.fabric)})
+            # It refuses a fabric that is unknown, or of a part that the garment lacks.
+            garment_material(self.fabric, prepare_stored(stored, name=self.pattern.name), stored)
+        write_garment_npz(self.out, stored)
+        report = stored.metadata["sewing"]
+        print(json.dumps(report, indent=2) if self.json else describe_sewing(report))
+        drawn = self.out.with_name(f"{self.out.stem}_sewn.png")
+        views = [("front", stored.rest_positions, 25.0), ("back", stored.rest_positions, 205.0)]
+        has_picture = self.picture and _write_views(drawn, stored.faces, rig, views)
+        if not self.json:
+            print(self.out, *([drawn] if has_picture else []), sep="\n")
 
 
 @app.command(name="joints")

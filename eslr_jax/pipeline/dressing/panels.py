@@ -35,12 +35,13 @@ class SewnMesh:
     edge_seams: Int[np.ndarray, " edges"]  # the seam of each
 
 
-def join_panels(pattern: Pattern, num_vertices: int) -> SewnMesh:
+def join_panels(pattern: Pattern, num_vertices: int, name: str = "pattern") -> SewnMesh:
     """Cut the panels of a pattern into triangles and join them.
 
     Args:
         pattern: Panels and seams.
         num_vertices: About how many vertices the mesh is to have.
+        name: Name of the pattern in messages.
 
     Raises:
         ConfigError: The number is out of range.
@@ -53,31 +54,31 @@ def join_panels(pattern: Pattern, num_vertices: int) -> SewnMesh:
     spacing = float(np.sqrt(2.0 * area / (np.sqrt(3.0) * num_vertices)))  # of equilateral triangles
     sewn = {side for seam in pattern.seams for side in seam.sides}
     pieces = {
-        Side(name, number): _num_pieces(edge_length(edge) / spacing, 1 if Side(name, number) in sewn else 2)
-        for name, panel in pattern.panels.items()
+        Side(key, number): _num_pieces(edge_length(edge) / spacing, 1 if Side(key, number) in sewn else 2)
+        for key, panel in pattern.panels.items()
         for number, edge in enumerate(panel.edges)
     }
     for seam in pattern.seams:
         pieces |= dict.fromkeys(seam.sides, max(pieces[side] for side in seam.sides))
     flat, placed, faces, owners, rows, count = [], [], [], [], {}, 0
-    for number, (name, panel) in enumerate(pattern.panels.items()):
-        lines = [_divided(edge, pieces[name, k]) for k, edge in enumerate(panel.edges)]
+    for number, (key, panel) in enumerate(pattern.panels.items()):
+        lines = [_divided(edge, pieces[Side(key, k)]) for k, edge in enumerate(panel.edges)]
         outline = np.concatenate([line[:-1] for line in lines])
         if len(outline) < 3:
             raise MeshError(
-                f"panel {name} is smaller than a triangle; ask for more vertices, or leave it out"
+                f"{name}: panel {key} is smaller than a triangle; ask for more vertices, or leave it out"
             )
         starts = np.cumsum([0, *(len(line) - 1 for line in lines)])
         is_sewn = np.zeros(len(outline), bool)
         for k in range(len(lines)):
             along = np.arange(starts[k], starts[k + 1] + 1) % len(outline)
-            is_sewn[along] |= (name, k) in sewn
-            rows[name, k] = count + along
+            is_sewn[along] |= Side(key, k) in sewn
+            rows[Side(key, k)] = count + along
         try:
             points, triangles = _triangulate(outline, is_sewn, spacing)
         except RuntimeError as error:  # CDT's
             raise MeshError(
-                f"panel {name} can't be cut: its outline touches itself; correct its vertices"
+                f"{name}: panel {key} can't be cut: its outline touches itself; correct its vertices"
             ) from error
         flat.append(points)
         placed.append(panel.placed(points))
@@ -99,7 +100,7 @@ def join_panels(pattern: Pattern, num_vertices: int) -> SewnMesh:
     spans[vertex[first]] = placed[first] - placed[second]
     joined = vertex[faces]
     turn = consistent_orientation(start, joined)
-    corners = flat[faces]
+    corners = _gathered(flat, faces, pairs)
     return SewnMesh(
         faces=np.where(turn[:, None], joined[:, ::-1], joined),
         panel_corners=np.where(turn[:, None, None], corners[:, ::-1], corners),
@@ -109,6 +110,34 @@ def join_panels(pattern: Pattern, num_vertices: int) -> SewnMesh:
         seam_edges=np.concatenate([np.stack([vertex[a[:-1]], vertex[a[1:]]], axis=1) for a, _ in pairs]),
         edge_seams=np.repeat(np.arange(len(pairs)), [len(a) - 1 for a, _ in pairs]),
     )
+
+
+def _gathered(
+    flat: Float[np.ndarray, "rows 2"],
+    faces: Int[np.ndarray, "faces 3"],
+    pairs: list[tuple[np.ndarray, np.ndarray]],
+) -> Float[np.ndarray, "faces 3 2"]:
+    """Return the corners of faces [m], those along the longer side of a seam as short there as the other side.
+
+    Folds of a gather are smaller than a face, and its seam is not stretched.
+    """
+    sides = [
+        np.stack([np.concatenate([row[:-1] for row in rows]), np.concatenate([row[1:] for row in rows])])
+        for rows in zip(*pairs, strict=True)
+    ]
+    lengths = [np.linalg.norm(flat[start] - flat[end], axis=1) for start, end in sides]
+    shares = scipy.sparse.lil_array((len(flat), len(flat)))
+    for (start, end), own, other in zip(sides, lengths, lengths[::-1], strict=True):
+        lack = np.maximum(1.0 - other / own, 0.0)
+        shares[start, end] = shares[end, start] = lack
+    corners, table = flat[faces], shares.tocsr()
+    for k in range(3):
+        following = (k + 1) % 3
+        lack = np.asarray(table[faces[:, k], faces[:, following]]).reshape(-1, 1)
+        shift = 0.5 * lack * (corners[:, following] - corners[:, k])
+        corners[:, k] += shift
+        corners[:, following] -= shift
+    return corners
 
 
 def _num_pieces(length: float, least: int) -> int:

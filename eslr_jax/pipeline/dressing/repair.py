@@ -161,7 +161,10 @@ def consistent_orientation(
     _, sheet = connected_components(graph, directed=False)
     sheet, turned_sheet = sheet[:num_faces], sheet[num_faces:]
     areas = np.bincount(sheet, weights=face_areas(positions, faces), minlength=2 * num_faces)
-    return areas[turned_sheet] > areas[sheet]
+    is_tie = (areas[turned_sheet] == areas[sheet]) & (
+        turned_sheet < sheet
+    )  # as of a pattern's front and back
+    return (areas[turned_sheet] > areas[sheet]) | is_tie
 
 
 def _select_faces(

@@ -54,10 +54,10 @@ def describe_sewing(report: dict[str, Any]) -> str:
     """Return the report in `GarmentFile.metadata["sewing"]` as a few lines."""
     return "\n".join(
         [
-            f"sewn: {report['panels']} panels along {len(report['seams'])} seams, all closed; {report['vertices']} "
-            f"vertices, {report['faces']} faces",
-            f"before it settles: 99 % stretch less than {report['p99_principal_stretch']:.2f}; pairs of faces that "
-            f"cross: {report['crossing_pairs']}; vertices inside the body: {report['inside']}",
+            f"sewn: {report['panels']} panels along {len(report['seams'])} seams, all closed; "
+            f"{report['vertices']} vertices, {report['faces']} faces",
+            f"before it settles: 99 % of it stretches by less than {report['p99_principal_stretch']:.2f}; "
+            f"{report['crossing_pairs']} pairs of faces cross, {report['inside']} vertices are inside the body",
             f"pinned: {report['pinned']} vertices ({report['pinned_by']})",
             *(f"warning: {text}" for text in report["warnings"]),
         ]

@@ -1,9 +1,9 @@
 """Sew a pattern around a body: the cloth contracts from where its panels stand, outside the body (host).
 
-Seams are joined from the first moment. The cloth then starts far stretched, and flows to its cut shape: every face
-is drawn to its panel's, turned as it lies (local step), and one linear system with a constant matrix finds the
-vertices (global step). What is inside the body after a step is moved out of it. There is no gravity and no fold of
-cloth on cloth: panels before and behind the body close like a sandwich.
+Seams are joined from the first moment. The cloth then starts far stretched, and flows to its cut shape: every
+face is drawn to its panel's, turned as it lies (local step), and a linear system finds the vertices (global
+step). What is inside the body after a step is moved out of it, and slides along it ever more easily. There is no
+gravity, and cloth does not keep off cloth: panels before and behind the body close like a sandwich.
 
 Source: Bouaziz et al. 2014, doi 10.1145/2601097.2601116, whose iteration this is.
 """
@@ -11,6 +11,7 @@ Source: Bouaziz et al. 2014, doi 10.1145/2601097.2601116, whose iteration this i
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from jaxtyping import Float, Int
 from scipy.sparse.linalg import splu
 
 from eslr_jax.errors import MeshError
+from eslr_jax.mesh.parting import uncrossed
 from eslr_jax.mesh.piercing import piercing_edges
 from eslr_jax.mesh.topology import face_cross_products
 from eslr_jax.mesh.validate import validate_mesh
@@ -43,12 +45,12 @@ _STANCE = {
 _BEYOND = 0.3  # of the body's height: panels farther away belong to no garment
 _TIGHT = 1.25  # stretch of a tenth of a panel, from which on it does not fit
 _MARGIN = 0.02  # [m] between panels that are laid out
-_STEPS = 300
+_STEPS = 400
 _STRIDE = 0.015  # [m] that a vertex moves in a step at most: less than limbs are thick
-_INERTIA = 40.0  # [1/m2] weight of staying, against stretch: waves longer than a metre take several steps
+_INERTIA = 10.0  # [1/m2] weight of staying, against stretch: waves longer than a metre take several steps
 _STIFFNESS = 4e-4  # [m2] of bending, against stretch: folds are a few centimetres wide
-_FRICTION = 20.0  # weight of staying of what touches the body, against the stretch of its faces, some 3.5
-_CLEARANCE = 8e-3  # [m] from the skin, at the end
+_FRICTION = 5.0  # weight of staying of what touches the body, against the stretch of its faces, some 3.5
+_CLEARANCE = 5e-3  # [m] from the skin, at the end
 _EXACT = 20  # steps at the end, with exact distances from the skin
 _NEAR = 0.04  # [m] from a vertex of the skin, within which its tangent plane stands for it
 _SANDWICH = 0.1  # [m] between the sides of a seam, from which on the body may be between them
@@ -83,7 +85,7 @@ def sew_pattern(
         ConfigError: The number of vertices is out of range, or a pin is unknown.
         MissingExtraError: The extra `patterns` is not installed.
     """
-    mesh, posture = join_panels(pattern, num_vertices), pattern_posture(made_for)
+    mesh, posture = join_panels(pattern, num_vertices, name), pattern_posture(made_for)
     mesh = dataclasses.replace(mesh, placed=mesh.placed + posture.stands[-1])
     _check_place(mesh, pattern, posture, name)
     draped = drape(mesh, posture)
@@ -144,12 +146,11 @@ def _check_place(mesh: SewnMesh, pattern: Pattern, posture: Posture, name: str) 
     height = float(np.ptp(posture.positions[:, 1]))
     for number, panel in enumerate(pattern.panels):
         place = mesh.placed[np.unique(mesh.faces[mesh.face_panels == number])]
-        away = float(np.abs(posture.heights(place)).min())
-        if away > _BEYOND * height:
-            up = place[:, 1].mean() - posture.floor
+        away, top = float(np.abs(posture.heights(place)).min()), float(place[:, 1].max()) - posture.floor
+        if away > _BEYOND * height or top > (1.0 + _BEYOND) * height:
             raise MeshError(
-                f"{name}: panel {panel} stands {away:.2f} m away from the body, {up:.2f} m above its soles, and the "
-                f"body is {height:.2f} m tall; move the panel, correct units_in_meter, or give the body that the "
+                f"{name}: panel {panel} reaches {top:.2f} m above the soles, and is {away:.2f} m away from the "
+                f"body, which is {height:.2f} m tall; move it, correct units_in_meter, or give the body that the "
                 "pattern is made for (eslr sew --made-for)"
             )
 
@@ -170,8 +171,8 @@ def _judge(
     panel, most = max(tight.items(), key=lambda item: item[1])
     if most > _TIGHT:
         warnings.append(
-            f"{panel} is stretched to {most:.2f} times its length: the pattern is too small for this body, or stands "
-            "too far from where it is worn"
+            f"{panel} is stretched to {most:.2f} times its length: the pattern is too small for this body, or "
+            "stands too far from where it is worn"
         )
     report = {
         "panels": len(names),
@@ -228,7 +229,7 @@ def pattern_posture(body: Body) -> Posture:
     for limb, direction in _STANCE.items():
         for side, sign in (("left", 1.0), ("right", -1.0)):
             chain = [parts[side, part][0] for part in limb if (side, part) in parts]
-            for above, below in zip(chain[:-1], chain[1:], strict=True):
+            for above, below in itertools.pairwise(chain):
                 length = np.linalg.norm(skeleton.rest_positions[below] - skeleton.rest_positions[above])
                 joints[below] = joints[above] + length * np.array([sign, 1.0, 1.0]) * direction
     try:
@@ -266,7 +267,7 @@ def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
         heights, normals = measure(position, posture)
         position = position + np.clip(_CLEARANCE - heights, 0.0, 3 * _STRIDE)[:, None] * normals
         is_held = heights < _CLEARANCE
-    return position
+    return uncrossed(position, mesh.faces)
 
 
 def _beside(
@@ -274,8 +275,8 @@ def _beside(
 ) -> Float[np.ndarray, "vertices 3"]:
     """Return points, of which those of seams that begin in the body stand beside it [m].
 
-    A seam between a panel before and one behind the body belongs to its outline as seen from there. So it leaves the
-    body at right angles to its span: at the shoulder upwards, and not to the front or to the back.
+    A seam between a panel before and one behind the body belongs to its outline as seen from there. So it leaves
+    the body at right angles to its span: at the shoulder upwards, and not to the front or to the back.
     """
     length = np.linalg.norm(spans, axis=1)
     heights, _ = body_heights(points, posture)
@@ -300,7 +301,7 @@ def _beside(
 def _heights(
     points: Float[np.ndarray, "points 3"], posture: Posture
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
-    """Return `body_heights`, quickly and to a few millimetres, from the skin's tangent plane at the next vertex."""
+    """Return `body_heights`, to a few millimetres, from the skin's tangent plane at the nearest vertex."""
     distance, nearest = posture.tree.query(points)
     vertex = posture.touchable[nearest]
     normals = posture.normals[vertex]
@@ -309,7 +310,7 @@ def _heights(
 
 
 def _frames(mesh: SewnMesh) -> tuple[Float[np.ndarray, "faces 3 2"], Float[np.ndarray, " faces"]]:
-    """Return what the corners of every face add to the columns of its deformation gradient [1/m], and areas [m2]."""
+    """Return what each corner adds to the columns of its face's deformation gradient [1/m], and areas [m2]."""
     corners = mesh.panel_corners
     edges = np.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=2)
     inverse = np.linalg.inv(edges)

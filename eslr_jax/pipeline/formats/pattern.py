@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -93,8 +94,8 @@ def read_pattern(path: Path) -> Pattern:
     extent = float(np.ptp(corners, axis=0).max())
     if not _GARMENT[0] < extent < _GARMENT[1]:
         raise MeshError(
-            f"{name}: with {unit:g} units in a metre it is {extent:.3g} m large; give the right units_in_meter (100 "
-            "for centimetres), or move panels nearer that stand far from the others"
+            f"{name}: with {unit:g} units in a metre it is {extent:.3g} m large; give the right units_in_meter "
+            "(100 for centimetres), or move panels nearer that stand far from the others"
         )
     return Pattern(panels, _read_seams(_part(found, "stitches", list, name), panels, name))
 
@@ -191,7 +192,7 @@ def _curve(start: np.ndarray, end: np.ndarray, given: Any, unit: float, where: s
     points = [start, *(start + u * along + v * across for u, v in controls), end]
     t = np.linspace(0.0, 1.0, _CURVE_POINTS)[:, None]
     while len(points) > 1:  # de Casteljau
-        points = [(1 - t) * a + t * b for a, b in zip(points[:-1], points[1:], strict=True)]
+        points = [(1 - t) * a + t * b for a, b in itertools.pairwise(points)]
     return points[0]
 
 
