@@ -22,19 +22,23 @@ from flax import struct
 from harness import EXPERIMENTS, RESULTS, parser
 from known_answers.drape import hang
 from other_bodies import child
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.fabric.materials import WOVEN, fabric_names
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
+from eslr_jax.pipeline.assets.garments import MEAN_SHAPE
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.outfit import wear_together
+from eslr_jax.pipeline.dressing.panels import join_panels
+from eslr_jax.pipeline.dressing.sewing import pattern_posture
 from eslr_jax.pipeline.fabrics import garment_material
 from eslr_jax.pipeline.formats.garment import read_garment_source
 from eslr_jax.pipeline.formats.obj import obj_text
 from eslr_jax.pipeline.formats.palette import outfit_colors
+from eslr_jax.pipeline.formats.pattern import read_pattern
 from eslr_jax.pipeline.pictures import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.pipeline.report.fields import Field, run_field
 from eslr_jax.pipeline.report.foreign import foreign_trajectory
@@ -59,6 +63,8 @@ _CAMERA = 25.0  # [degrees] from the front towards the side
 _CONFIG = SimConfig(iterations=300, tolerance=1e-2)
 _FRAMES, _SMOKE_FRAMES = 40, 3
 _CLIP = "cmu_069_23"
+PATTERN = EXPERIMENTS.parent / "data" / "patterns" / "tshirt.json"
+_PANEL = 150.0  # [pixels/m] of a flat panel
 _WIND = 4.0  # [N/m2], of the guide's own energy
 
 
@@ -312,10 +318,25 @@ def play(frames: int) -> np.ndarray | None:
     return picture
 
 
+def pattern(frames: int) -> np.ndarray:
+    """A T-shirt of four panels: cut, placed around the body, sewn, and on a walk."""
+    cut, image = read_pattern(PATTERN), Image.new("RGB", _SIZE, "white")
+    for k, panel in enumerate(cut.panels.values()):
+        middle = np.array([(0.28 + 0.44 * (k % 2)) * _SIZE[0], (0.3 + 0.4 * (k // 2)) * _SIZE[1]])
+        points = middle + _PANEL * (panel.outline - panel.outline.mean(axis=0)) * [1.0, -1.0]
+        ImageDraw.Draw(image).polygon([tuple(point) for point in points], fill="#dce6f2", outline="#2a5d9a")
+    body = load_body(betas=MEAN_SHAPE)
+    sewn, mesh = load_garment_file(PATTERN, body=body), join_panels(cut, 1000)
+    placed = mesh.placed + pattern_posture(body).stands[-1]
+    pictures = [worn(dataclasses.replace(sewn, faces=mesh.faces), body, placed), worn(sewn, body)]
+    walking = figures(shoot((str(PATTERN),), frames), [frames - 1])
+    return side_by_side([np.asarray(image), *pictures, *walking], ("cut", "placed", "sewn", "walking"))
+
+
 PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
     make.__name__.replace("_", "-"): make
     for make in (
-        install, first_cloth, own_garment, own_body, outfits, fabrics, extend, report, score, limits, play,
+        install, first_cloth, own_garment, pattern, own_body, outfits, fabrics, extend, report, score, limits, play,
     )
 }  # fmt: skip
 

@@ -131,6 +131,7 @@ def workplace(tmp_path_factory, body):
     shutil.copy(ROOT / "tests" / "fixtures" / "cmu_01_01.bvh", folder / "walk.bvh")
     write_walker(folder / "character.glb", folder / "jacket.obj", body)
     shutil.copy(ROOT / "experiments" / "configs" / "eslr-small.toml", folder / "recipe.toml")
+    shutil.copy(ROOT / "data" / "patterns" / "tshirt.json", folder)
     for page in PAGES:  # a snippet whose first line is a comment with a file's name is that file
         for code in blocks(page, "python"):
             if named := re.match(r"# (\w+\.py)\n", code):

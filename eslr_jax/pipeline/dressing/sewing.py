@@ -46,6 +46,8 @@ _BEYOND = 0.3  # of the body's height: panels farther away belong to no garment
 _TIGHT = 1.25  # stretch of a tenth of a panel, from which on it does not fit
 _MARGIN = 0.02  # [m] between panels that are laid out
 _STEPS = 400
+_ANKLE = 0.13  # [m] over the soles, below which hems start rolled up: feet would go through them
+_ROLLED = 0.9  # by how much
 _STRIDE = 0.015  # [m] that a vertex moves in a step at most: less than limbs are thick
 _INERTIA = 10.0  # [1/m2] weight of staying, against stretch: waves longer than a metre take several steps
 _STIFFNESS = 4e-4  # [m2] of bending, against stretch: folds are a few centimetres wide
@@ -251,7 +253,9 @@ def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
     masses = np.bincount(mesh.faces.ravel(), np.repeat(areas / 3.0, 3), num_vertices)
     bending = _STIFFNESS * stretch @ scipy.sparse.diags_array(1.0 / masses) @ stretch
     elastic = (stretch + bending).tocsc()
-    position = _beside(mesh.placed, mesh.spans, posture)
+    over = mesh.placed[:, 1] - posture.floor - _ANKLE
+    lifted = mesh.placed - np.outer(np.minimum(over, 0.0) * _ROLLED, [0.0, 1.0, 0.0])
+    position = _beside(lifted, mesh.spans, posture)
     is_held = np.zeros(num_vertices, bool)
     for number in range(_STEPS):
         deformed = (gradient @ position).reshape(-1, 2, 3)
