@@ -9,8 +9,8 @@ import pytest
 
 # Packages of the extras, and of the development environment.
 EXTRAS = (
-    "mitsuba", "PIL", "viser", "pxr", "imageio_ffmpeg", "matplotlib", "pyacvd", "pyvista", "tensorboardX",
-    "ipctk", "pygeodesic", "torch", "newton", "warp", "bpy", "beartype", "hypothesis", "pytest",
+    "mitsuba", "PIL", "viser", "pxr", "imageio_ffmpeg", "matplotlib", "pyacvd", "pyvista", "pythoncdt",
+    "tensorboardX", "ipctk", "pygeodesic", "torch", "newton", "warp", "bpy", "beartype", "hypothesis", "pytest",
 )  # fmt: skip
 WITHOUT = f"""
 import sys

@@ -1,6 +1,7 @@
 """A pattern becomes one mesh around the body, with the lengths of its panels."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_a_parallel_seam_runs_the_other_way():
     turned = (Seam(pattern.seams[0].sides, True), pattern.seams[1])
     mesh = join_panels(dataclasses.replace(pattern, seams=turned), 400)
     with pytest.raises(MeshError, match="opposite directions"):
-        validate_mesh(mesh.placed, mesh.faces)
+        validate_mesh(np.random.default_rng(0).normal(size=mesh.placed.shape), mesh.faces)
 
 
 def test_sewn_garment_lies_around_the_body(tshirt, mean_body):
@@ -129,3 +130,13 @@ def test_skirt_is_held_at_the_waist(mean_body):
     assert np.abs(up[:, 1]).sum() > 0
     heights = [uvs[skirt.face_parts == k].reshape(-1, 2) for k in range(2)]
     assert heights[0][:, 0].max() < heights[1][:, 0].min()  # side by side
+
+
+def test_a_tube_of_one_panel_is_doubted(mean_body, tmp_path):
+    whole = json.loads((PATTERNS / "skirt.json").read_text())
+    del whole["pattern"]["panels"]["back"]
+    sides = [{"panel": "front", "edge": 1}, {"panel": "front", "edge": 3}]
+    whole["pattern"]["stitches"] = [sides]
+    (tmp_path / "tube.json").write_text(json.dumps(whole))
+    tube = sew_pattern_file(tmp_path / "tube.json", mean_body, num_vertices=150, cache=False)
+    assert any("front edge 1 to front edge 3 joins a panel to itself" in text for text in tube.fit_warnings)
