@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 from eslr_jax.errors import MeshError
 from eslr_jax.mesh.parting import uncrossed
 from eslr_jax.mesh.piercing import piercing_edges
-from eslr_jax.mesh.topology import face_cross_products
+from eslr_jax.mesh.topology import face_cross_products, vertex_components
 from eslr_jax.mesh.validate import validate_mesh
 from eslr_jax.pipeline.dressing.clearance import body_heights, lay_to_rest
 from eslr_jax.pipeline.dressing.panels import SewnMesh, join_panels
@@ -46,7 +46,7 @@ _BEYOND = 0.3  # of the body's height: panels farther away belong to no garment
 _TIGHT = 1.25  # stretch of a tenth of a panel, from which on it does not fit
 _DART = 0.15  # [m] across the open end of a dart, at most
 _MARGIN = 0.02  # [m] between panels that are laid out
-_STEPS = 400
+_STEPS = 400  # in which the cloth contracts; friction ceases in the second half
 _ANKLE = 0.13  # [m] over the soles, below which hems start rolled up: feet would go through them
 _ROLLED = 0.9  # by how much
 _STRIDE = 0.015  # [m] that a vertex moves in a step at most: less than limbs are thick
@@ -75,7 +75,7 @@ def sew_pattern(
     Args:
         pattern: Panels that stand around a body whose feet are at the origin.
         body: Who wears the garment.
-        made_for: The body that the pattern is made for, with the same joints, which may be the same.
+        made_for: The body that the pattern is made for; the same object if that is the wearer.
         num_vertices: About how many vertices the garment is to have.
         pin: Vertices that follow the body, see `FitOptions.pin`; a panel is a part.
         name: Name of the garment in messages.
@@ -94,9 +94,11 @@ def sew_pattern(
     draped = drape(mesh, posture)
     faces, corners = mesh.faces, mesh.panel_corners
     _, nearest = posture.tree.query(draped[faces].mean(axis=1))
-    crosses = face_cross_products(draped, faces)
-    if np.einsum("fx,fx->", crosses, posture.normals[posture.touchable[nearest]]) < 0:
-        faces, corners = faces[:, ::-1], corners[:, ::-1]
+    outward = np.vecdot(face_cross_products(draped, faces), posture.normals[posture.touchable[nearest]])
+    piece = vertex_components(faces, len(draped))[1][faces[:, 0]]
+    is_inward = (np.bincount(piece, weights=outward) < 0)[piece]
+    faces = np.where(is_inward[:, None], faces[:, ::-1], faces)
+    corners = np.where(is_inward[:, None, None], corners[:, ::-1], corners)
     validate_mesh(draped, faces, name=f"{name}, sewn", allow_components=True)
     warnings, report = _judge(dataclasses.replace(mesh, faces=faces, panel_corners=corners), draped, pattern)
     placed, worn_in, transfer = draped, posture, {}

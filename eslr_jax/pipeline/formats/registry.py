@@ -5,6 +5,7 @@ is imported. Kinds of readers, each with its arguments after the path:
 
 - "mesh": `like`, the same mesh in another shape, or None; returns a `MeshFile`;
 - "garment": the name of one of several; returns a `GarmentSource`. Every mesh is a garment, too;
+- "pattern": nothing; returns a `Pattern`;
 - "body": the names of its meshes; returns a `RiggedMesh`, or a `Body`;
 - "motion": the name of a clip; returns a `SkeletonMotion`;
 - "mesh sequence": the name of a mesh, and a frame rate or None; returns a list of `MeshSequence`.
