@@ -139,4 +139,4 @@ def test_a_tube_of_one_panel_is_doubted(mean_body, tmp_path):
     whole["pattern"]["stitches"] = [sides]
     (tmp_path / "tube.json").write_text(json.dumps(whole))
     tube = sew_pattern_file(tmp_path / "tube.json", mean_body, num_vertices=150, cache=False)
-    assert any("front edge 1 to front edge 3 joins a panel to itself" in text for text in tube.fit_warnings)
+    assert any("front edge 1 to edge 3 joins a panel to itself" in text for text in tube.fit_warnings)

@@ -44,7 +44,6 @@ _STANCE = {
 }
 _BEYOND = 0.3  # of the body's height: panels farther away belong to no garment
 _TIGHT = 1.25  # stretch of a tenth of a panel, from which on it does not fit
-_DART = 0.15  # [m] across the open end of a dart, at most
 _MARGIN = 0.02  # [m] between panels that are laid out
 _STEPS = 400  # in which the cloth contracts; friction ceases in the second half
 _ANKLE = 0.13  # [m] over the soles, below which hems start rolled up: feet would go through them
@@ -179,14 +178,14 @@ def _judge(
             f"{panel} is stretched to {most:.2f} times its length: the pattern is too small for this body, or "
             "stands too far from where it is worn"
         )
-    spans = np.linalg.norm(mesh.spans, axis=1)
-    warnings += [
-        f"{seam} joins a panel to itself from far apart: if it goes around a limb, cut it in two panels, one on "
-        "either side"
-        for number, seam in enumerate(pattern.seams)
-        if seam.sides[0].panel == seam.sides[1].panel
-        and spans[mesh.seam_edges[mesh.edge_seams == number]].max(initial=0.0) > _DART
-    ]
+    for (first, second), _ in pattern.seams:
+        between = abs(first.edge - second.edge)
+        is_dart = between in (1, len(pattern.panels[first.panel].edges) - 1)  # its sides meet in a corner
+        if first.panel == second.panel and not is_dart:
+            warnings.append(
+                f"{first.panel} edge {first.edge} to edge {second.edge} joins a panel to itself: if it goes around a "
+                "limb, cut it in two panels, one on either side"
+            )
     report = {
         "panels": len(names),
         "vertices": len(draped),
