@@ -78,7 +78,7 @@ def test_a_parallel_seam_runs_the_other_way():
     turned = (Seam(pattern.seams[0].sides, True), pattern.seams[1])
     mesh = join_panels(dataclasses.replace(pattern, seams=turned), 400)
     with pytest.raises(MeshError, match="opposite directions"):
-        validate_mesh(np.random.default_rng(0).normal(size=mesh.placed.shape), mesh.faces)
+        validate_mesh(np.random.default_rng(0).random(mesh.placed.shape), mesh.faces)
 
 
 def test_sewn_garment_lies_around_the_body(tshirt, mean_body):

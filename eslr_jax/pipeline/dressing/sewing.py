@@ -183,8 +183,8 @@ def _judge(
         is_dart = between in (1, len(pattern.panels[first.panel].edges) - 1)  # its sides meet in a corner
         if first.panel == second.panel and not is_dart:
             warnings.append(
-                f"{first.panel} edge {first.edge} to edge {second.edge} joins a panel to itself: if it goes around a "
-                "limb, cut it in two panels, one on either side"
+                f"{first.panel} edge {first.edge} to edge {second.edge} joins a panel to itself: if it goes "
+                "around a limb, cut it in two panels, one on either side"
             )
     report = {
         "panels": len(names),
