@@ -45,7 +45,9 @@ _STANCE = {
 _BEYOND = 0.3  # of the body's height: panels farther away belong to no garment
 _TIGHT = 1.25  # stretch of a tenth of a panel, from which on it does not fit
 _MARGIN = 0.02  # [m] between panels that are laid out
-_STEPS = 400  # in which the cloth contracts; friction ceases in the second half
+# Turns in which the cloth contracts, each of steps with one matrix, whose factors take half the time. Friction
+# ceases in the second half; in the last turn distances from the skin are exact.
+_TURNS, _STEPS = 100, 4
 _ANKLE = 0.13  # [m] over the soles, below which hems start rolled up: feet would go through them
 _ROLLED = 0.9  # by how much
 _STRIDE = 0.015  # [m] that a vertex moves in a step at most: less than limbs are thick
@@ -53,7 +55,6 @@ _INERTIA = 10.0  # [1/m2] weight of staying, against stretch: waves longer than 
 _STIFFNESS = 4e-4  # [m2] of bending, against stretch: folds are a few centimetres wide
 _FRICTION = 5.0  # weight of staying of what touches the body, against the stretch of its faces, some 3.5
 _CLEARANCE = 5e-3  # [m] from the skin, at the end
-_EXACT = 20  # steps at the end, with exact distances from the skin
 _NEAR = 0.04  # [m] from a vertex of the skin, within which its tangent plane stands for it
 _SANDWICH = 0.1  # [m] between the sides of a seam, from which on the body may be between them
 _BESIDE = 0.02  # [m] from the skin, from which on a seam starts beside the body
@@ -267,20 +268,21 @@ def drape(mesh: SewnMesh, posture: Posture) -> Float[np.ndarray, "vertices 3"]:
     lifted = mesh.placed - np.outer(np.minimum(over, 0.0) * _ROLLED, [0.0, 1.0, 0.0])
     position = _beside(lifted, mesh.spans, posture)
     is_held = np.zeros(num_vertices, bool)
-    for number in range(_STEPS):
-        deformed = (gradient @ position).reshape(-1, 2, 3)
-        left, _, right = np.linalg.svd(deformed, full_matrices=False)
-        turned = (left @ right).reshape(-1, 3)
-        friction = _FRICTION * min(1.0, 2.0 * (1.0 - number / _STEPS)) ** 2
+    for turn in range(_TURNS):
+        friction = _FRICTION * min(1.0, 2.0 * (1.0 - turn / _TURNS)) ** 2
         staying = _INERTIA * masses + friction * is_held
         solve = splu(elastic + scipy.sparse.diags_array(staying, format="csc")).solve
-        step = solve(weighted @ turned + staying[:, None] * position) - position
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        position = position + step * np.minimum(1.0, _STRIDE / np.maximum(length, 1e-12))
-        measure = body_heights if number >= _STEPS - _EXACT else _heights
-        heights, normals = measure(position, posture)
-        position = position + np.clip(_CLEARANCE - heights, 0.0, 3 * _STRIDE)[:, None] * normals
-        is_held = heights < _CLEARANCE
+        measure = body_heights if turn == _TURNS - 1 else _heights
+        for _ in range(_STEPS):
+            deformed = (gradient @ position).reshape(-1, 2, 3)
+            left, _, right = np.linalg.svd(deformed, full_matrices=False)
+            turned = (left @ right).reshape(-1, 3)
+            step = solve(weighted @ turned + staying[:, None] * position) - position
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            position = position + step * np.minimum(1.0, _STRIDE / np.maximum(length, 1e-12))
+            heights, normals = measure(position, posture)
+            position = position + np.clip(_CLEARANCE - heights, 0.0, 3 * _STRIDE)[:, None] * normals
+            is_held = heights < _CLEARANCE
     return uncrossed(position, mesh.faces)
 
 
