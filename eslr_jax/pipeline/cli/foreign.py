@@ -185,7 +185,7 @@ class Sew:
         """Sew, write the file and the picture, and say what was done."""
         from eslr_jax.pipeline.assets import prepare_stored
         from eslr_jax.pipeline.assets.garments import sew_pattern_file
-        from eslr_jax.pipeline.dressing.report import describe_sewing
+        from eslr_jax.pipeline.dressing.report import describe_sewing, describe_transfer
         from eslr_jax.pipeline.fabrics import garment_material
         from eslr_jax.pipeline.formats.garment import write_garment_npz
 
@@ -205,6 +205,8 @@ class Sew:
         write_garment_npz(self.out, stored)
         report = stored.metadata["sewing"]
         print(json.dumps(report, indent=2) if self.json else describe_sewing(report))
+        if "transfer" in stored.metadata:
+            say(f"carried to {self.body}: {describe_transfer(stored.metadata['transfer'])}")
         drawn = self.out.with_name(f"{self.out.stem}_sewn.png")
         views = [("front", stored.rest_positions, 25.0), ("back", stored.rest_positions, 205.0)]
         has_picture = self.picture and _write_views(drawn, stored.faces, rig, views)
