@@ -23,7 +23,8 @@ class Options:
     """What is simulated: `eslr simulate` takes these options, and keeps them for --resume."""
 
     # Name of a bundled garment (see `eslr assets`), which is transferred to the body, or a mesh file, which
-    # is fitted to the body; see `eslr fit` if the fit goes wrong. Repeat the option for an outfit, the
+    # is fitted to the body; see `eslr fit` if the fit goes wrong. A sewing pattern (.json) is sewn, as by
+    # `eslr sew`. Repeat the option for an outfit, the
     # innermost garment first, as in --garment pants --garment tshirt. By default a T-shirt.
     garment: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     # Name of a bundled motion; turn, jump or swing; or a motion file: BVH, AMASS (.npz), HOOD or VTO (.pkl),
@@ -38,7 +39,7 @@ class Options:
     # Name of a bundled network or an exported file; the default network if a network is asked for and none is
     # named.
     model: str | None = None
-    # Resolution of bundled garments; from 50k on it is made at run time.
+    # Resolution of bundled garments and of sewing patterns; from 50k on it is made at run time.
     vertices: Literal["1k", "4k", "10k", "50k", "200k"] = "1k"
     # Name of a fabric (see `eslr assets --kind fabric`), or numbers as in density=0.2,bending_stiffness=1e-5
     # or flexural_rigidity=5e-6. PART:FABRIC is the fabric of one part or of one garment of an outfit; the
