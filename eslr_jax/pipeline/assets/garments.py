@@ -63,8 +63,9 @@ def load_garment(
 
     Args:
         name: Name of a bundled garment, or path of a fitted one: of `eslr fit`, or `garment.npz` of a run.
-            A mesh (obj, ply, stl, glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first.
-        vertices: Resolution of a bundled garment; 50k and 200k are subdivisions of its 4k mesh.
+            A mesh (obj, ply, stl, glb, npz) or one of HOOD's garments (`garments_dict.pkl#NAME`) is fitted first,
+            and a sewing pattern (json) sewn.
+        vertices: Resolution of a bundled garment or a pattern; 50k and 200k are subdivisions of its 4k mesh.
         body: Body that wears it, by default the bundled one. A mesh is fitted to this body, and a bundled garment
             is transferred to it.
         fit: Options of the fit; everything is recognised by default.
