@@ -39,9 +39,9 @@ class Score:
     """
 
     # The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in their
-    # order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a folder
-    # of OBJ or PLY files. If a .glb has several meshes, they are the garments of an outfit, by name;
-    # FILE.glb#NAME picks one. A run of `eslr simulate` also works, and holds its own scene.
+    # order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, an .abc, or a
+    # folder of OBJ or PLY files. If a .glb or .abc has several meshes, they are the garments of an outfit, by
+    # name; FILE.glb#NAME picks one. A run of `eslr simulate` also works, and holds its own scene.
     file: tyro.conf.Positional[str]
     # Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
     run: Path | None = None
