@@ -79,7 +79,7 @@ class BatchScene:
         words = ["+".join(Path(str(part)).stem for part in _listed(value)) for value in known if value]
         words = [re.sub(r"[^A-Za-z0-9_+]", "_", word) for word in words]
         digest = hashlib.sha256(json.dumps([self.options, self.seed], sort_keys=True).encode()).hexdigest()
-        return f"{'-'.join(words)[:100]}-s{self.seed}-{digest[:8]}"
+        return "-".join([*words, f"s{self.seed}", digest[:8]])[-120:].lstrip("-")
 
     @property
     def program(self) -> str:
@@ -113,22 +113,23 @@ class Batch:
         if self.workers < 1:
             raise ConfigError(f"--workers {self.workers}: give 1 or more")
         require("distributed", extra="batch", purpose="eslr batch")
-        out = ensure_output_dir(self.out).resolve()
+        out = self.out.expanduser().resolve()
         open_ = {name: scene for name, scene in scenes.items() if not (out / name).is_dir()}
         if len(open_) < len(scenes):
             say(f"{len(scenes) - len(open_)} of {len(scenes)} scenes are done already")
         failures: dict[str, str] = {}
-        _clear_parts(out)
-        _write_manifest(out, scenes, failures)
         if open_:
             with _client(self.workers, self.scheduler) as client, progress("scenes", len(open_)) as advance:
+                _clear_parts(ensure_output_dir(out))
                 near = shared_reach(scenes, out, client)
+                _write_manifest(out, scenes, failures)
                 for done, (name, error) in enumerate(simulate_scenes(open_, out, client, near), 1):
                     if error is not None:
                         failures[name] = error
                     _write_manifest(out, scenes, failures)
                     advance(done, len(open_))
         _clear_parts(out)
+        _write_manifest(out, scenes, failures)
         if failures:
             table = Table("scene", "cause", box=None)
             for name, error in sorted(failures.items()):

@@ -142,7 +142,7 @@ betas = [[-0.5, 0.5]]
 """
 
 
-@pytest.mark.slow  # 100 s on a busy machine: two processes begin with JAX, and compile
+@pytest.mark.slow  # 80 to 100 s on a busy machine: two processes begin with JAX, and compile
 def test_a_killed_worker_costs_its_task_alone(tmp_path):
     """One of two workers is killed while it simulates: every scene is there once and whole."""
     distributed = pytest.importorskip("distributed")
@@ -187,7 +187,7 @@ def test_a_killed_worker_costs_its_task_alone(tmp_path):
     assert {read_run(path).trajectory.num_frames for path in runs} == {3}
 
 
-@pytest.mark.slow  # 60 s on a busy machine
+@pytest.mark.slow  # 60 to 90 s on a busy machine
 def test_the_command_goes_on_tells_failures_and_is_scored(tmp_path):
     pytest.importorskip("distributed")
     text = FEW.replace("seeds = 3", "seeds = 1")
