@@ -207,7 +207,7 @@ def _is_numbers(bounds: Any) -> bool:
 
 
 def _hold_out(given: _File) -> dict[str, str]:
-    """Return the split of each value that is held out, as JSON; which they are depends on the values alone."""
+    """Return the split of each value that is held out, as JSON; their order in the file does not matter."""
     split = given.split
     if split.by != "seed" and split.by not in given.every:
         raise ConfigError(f"split.by = {split.by!r}; name an option of [every], or seed")
@@ -359,13 +359,10 @@ def simulate_scene(options: dict[str, Any], near: np.ndarray | None, folder: str
             return str(report["error"])
         said = list(dict.fromkeys(str(entry.message) for entry in heard))
         (part / "options.json").write_text(json.dumps({"options": options, "warnings": said}, indent=2))
-        with contextlib.suppress(FileExistsError):
-            part.rename(target)
-        return None if target.is_dir() else f"{target} could not be written"
+        part.rename(target)
+        return None
     except OSError as error:
-        if target.is_dir():  # a folder that is there is no empty one
-            return None
-        return one_line(error)
+        return None if target.is_dir() else one_line(error)
     except Exception as error:  # whatever it is, the other scenes go on
         return str(error) if isinstance(error, EslrError) else f"{type(error).__name__}: {one_line(error)}"
     finally:
