@@ -35,7 +35,9 @@ from eslr_jax.pipeline.dressing.outfit import wear_together
 from eslr_jax.pipeline.dressing.panels import join_panels
 from eslr_jax.pipeline.dressing.sewing import pattern_posture
 from eslr_jax.pipeline.fabrics import garment_material
+from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import read_garment_source
+from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequences
 from eslr_jax.pipeline.formats.obj import obj_text
 from eslr_jax.pipeline.formats.palette import outfit_colors
 from eslr_jax.pipeline.formats.pattern import read_pattern
@@ -270,6 +272,25 @@ def colored(shot: Shot, field: Field, high: float) -> np.ndarray:
     return figures(shot, [len(field.values) - 1], color_scale(field.values, field.low, high))[0]
 
 
+def studio(frames: int) -> np.ndarray:
+    """An outfit on a walk, drawn from its Alembic file: meshes alone."""
+    shot = shoot(("pants", "tshirt"), frames)
+    track = ClothTrack(shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads)
+    with tempfile.TemporaryDirectory() as folder:
+        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
+        run = read_run(Path(folder)).trajectory
+        path = export_trajectory(run, Path(folder) / "run.abc", garment=shot.stored)
+        *cloths, body = read_mesh_sequences(path)
+    counts = [cloth.positions.shape[1] for cloth in cloths]
+    starts = np.cumsum([0, *counts])
+    faces = np.concatenate([cloth.faces + start for cloth, start in zip(cloths, starts, strict=False)])
+    positions = np.concatenate([cloth.positions for cloth in cloths], axis=1)
+    indices = np.linspace(0, frames - 1, 4).round().astype(int).tolist()
+    look = {"camera": _CAMERA, "size": _SIZE, "vertex_colors": outfit_colors(counts)}
+    pictures = render_frames(body.positions, body.faces, positions, faces, frame_indices=indices, **look)
+    return side_by_side(list(pictures), [f"{k / 30:.2f} s" for k in indices])
+
+
 def limits(frames: int) -> np.ndarray:
     """A dress in all bundled resolutions: cloth folds between faces."""
     pictures, labels = [], []
@@ -336,7 +357,7 @@ def pattern(frames: int) -> np.ndarray:
 PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
     make.__name__.replace("_", "-"): make
     for make in (
-        install, first_cloth, own_garment, pattern, own_body, outfits, fabrics, extend, report, score, limits,
+        install, first_cloth, own_garment, pattern, own_body, outfits, fabrics, extend, report, score, studio, limits,
         play,
     )
 }  # fmt: skip

@@ -19,6 +19,8 @@ def open_file(path: Path, num_vertices: int) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     if path.suffix == ".usdc":
         bpy.ops.wm.usd_import(filepath=str(path))
+    elif path.suffix == ".abc":
+        bpy.ops.wm.alembic_import(filepath=str(path), as_background_job=False)
     elif path.suffix == ".glb":
         bpy.ops.import_scene.gltf(filepath=str(path))
     else:
@@ -34,7 +36,7 @@ def shown(frames: int, *, seconds: bool) -> dict[str, np.ndarray]:
     """Return the meshes' positions in the world, [frames, vertices, 3], and their faces."""
     scene, found = bpy.context.scene, {}
     for frame in range(frames):
-        # glTF counts seconds, which Blender lays on the scene's own rate.
+        # glTF and Alembic count seconds, which Blender lays on the scene's own rate.
         at = frame * scene.render.fps / FPS if seconds else frame
         scene.frame_set(int(at), subframe=at - int(at))
         graph = bpy.context.evaluated_depsgraph_get()
@@ -51,4 +53,4 @@ def shown(frames: int, *, seconds: bool) -> dict[str, np.ndarray]:
 if __name__ == "__main__":
     source, out, frames, vertices = sys.argv[1:]
     open_file(Path(source), int(vertices))
-    np.savez(out, **shown(int(frames), seconds=source.endswith(".glb")))
+    np.savez(out, **shown(int(frames), seconds=source.endswith((".glb", ".abc"))))

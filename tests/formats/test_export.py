@@ -212,7 +212,7 @@ def shown_in_blender(path, frames, vertices=0):
 
 @needs_blender
 @pytest.mark.slow
-@pytest.mark.parametrize(("suffix", "name"), [("usdc", "My_shirt"), ("glb", "My shirt")])
+@pytest.mark.parametrize(("suffix", "name"), [("usdc", "My_shirt"), ("glb", "My shirt"), ("abc", "My_shirt")])
 def test_blender_shows_every_frame(tmp_path, run, garment, suffix, name):
     path = export_trajectory(run, tmp_path / f"run.{suffix}", garment=garment)
     seen = shown_in_blender(path, FRAMES)

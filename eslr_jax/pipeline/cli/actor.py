@@ -25,10 +25,12 @@ class Actor(NamedTuple):
 
 def is_moving_mesh(body: str) -> bool:
     """Tell a mesh in motion from a rigged body; a folder that has the name of a bundled body is none."""
+    from eslr_jax.files.parsing import split_name
     from eslr_jax.pipeline.assets import asset_names
     from eslr_jax.pipeline.formats.mesh_sequence import is_mesh_sequence
 
-    return Path(body).exists() and body not in asset_names("body") and is_mesh_sequence(body)
+    path = body if Path(body).exists() else split_name(body)[0]
+    return Path(path).exists() and body not in asset_names("body") and is_mesh_sequence(path)
 
 
 def load_wearer(body: str, *, units: str | None = None, betas: tuple[float, ...] = ()) -> Body:

@@ -15,6 +15,7 @@ from rich.table import Table
 from eslr_jax.config import EvaluationOptions
 from eslr_jax.errors import ConfigError, MeshError, MotionError
 from eslr_jax.pipeline.cli.actor import load_actor
+from eslr_jax.pipeline.cli.batch import MANIFEST, read_manifest
 from eslr_jax.pipeline.cli.console import app, print_report, progress, say, use_compile_cache, waiting
 from eslr_jax.pipeline.cli.options import Options
 
@@ -39,9 +40,10 @@ class Score:
     """
 
     # The garment in motion, in metres, Y up, at 30 frames a second, with the vertices of the garment in their
-    # order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, or a folder
-    # of OBJ or PLY files. If a .glb has several meshes, they are the garments of an outfit, by name;
-    # FILE.glb#NAME picks one. A run of `eslr simulate` also works, and holds its own scene.
+    # order: an .npz with positions [frames, vertices, 3] and faces, a .glb whose shapes move it, an .abc, or a
+    # folder of OBJ or PLY files. If a .glb or .abc has several meshes, they are the garments of an outfit, by
+    # name; FILE.glb#NAME picks one. A run of `eslr simulate` also works, and holds its own scene;
+    # so does the folder of `eslr batch`, of which every scene is scored.
     file: tyro.conf.Positional[str]
     # Folder of a run: its garment, fabric, body, motion, ground and wind, and how it stepped time.
     run: Path | None = None
@@ -64,21 +66,14 @@ class Score:
     def __call__(self) -> None:
         """Score, and print the report."""
         from eslr_jax.pipeline.report.report import environment
-        from eslr_jax.pipeline.report.score import score_trajectory
 
         use_compile_cache()
+        if (Path(self.file) / MANIFEST).is_file():
+            return self._score_batch(Path(self.file))
         with waiting("reading"):
             task = self._read_task()
         with waiting("scoring"):
-            stored = task.stored
-            result = score_trajectory(
-                task.trajectory,
-                task.scene,
-                poses=task.poses,
-                parts=(None, ()) if stored is None else (stored.face_parts, stored.part_names),
-                outfit=None if stored is None else stored.outfit,
-                every=self.every,
-            )
+            result = _score(task, self.every)
         result = {"file": self.file, **task.label, **result, **environment()}
         if result["intersections_cloth"] is None:
             say('intersections are not counted: that needs ipctk: pip install "eslr-jax[score]"')
@@ -86,6 +81,28 @@ class Score:
             print(json.dumps(result, indent=2))
         else:
             print_report({"error": None, "tolerance": None, **result}, _figures(result))
+
+    def _score_batch(self, folder: Path) -> None:
+        """Score the scenes of a batch that are done, and print a row for each."""
+        from eslr_jax.pipeline.report.run import read_run
+
+        entries = {name: entry for name, entry in read_manifest(folder).items() if entry["status"] == "done"}
+        rows = []
+        with progress("scoring", len(entries)) as advance:
+            for done, (name, entry) in enumerate(sorted(entries.items()), 1):
+                score = _score(_own_task(read_run(folder / name)), self.every)
+                rows.append({"scene": name, "split": entry["split"], **score})
+                advance(done, len(entries))
+        if self.json:
+            print(json.dumps(rows, indent=2))
+            return
+        table = Table("scene", "split", "gap, median", "at most", "stretch, 99 %", "inside [mm]", box=None)
+        for row in rows:
+            shares = (f"{100 * row[key]:.3g} %" for key in ("gap_relative_median", "gap_relative_max"))
+            depth = row["penetration_max_mm"]
+            figures = f"{row['p99_principal_stretch']:.3f}", "" if depth is None else f"{depth:.2f}"
+            table.add_row(row["scene"], row["split"], *shares, *figures)
+        Console().print(table, markup=False, highlight=False)
 
     def _read_task(self) -> _Task:
         """Read the trajectory, and its scene from itself, a run, or the names that are given."""
@@ -115,6 +132,21 @@ class _Task(NamedTuple):
     poses: BodyMotion | None
     stored: GarmentFile | None
     label: dict[str, Any]
+
+
+def _score(task: _Task, every: int) -> dict[str, Any]:
+    """Return the score of a trajectory."""
+    from eslr_jax.pipeline.report.score import score_trajectory
+
+    stored = task.stored
+    return score_trajectory(
+        task.trajectory,
+        task.scene,
+        poses=task.poses,
+        parts=(None, ()) if stored is None else (stored.face_parts, stored.part_names),
+        outfit=None if stored is None else stored.outfit,
+        every=every,
+    )
 
 
 def _own_task(run: Run) -> _Task:

@@ -31,7 +31,7 @@ class Options:
     # glTF, FILE#CLIP to pick a clip. By default the animation in the body's file, or else cmu_016_32.
     motion: str | None = None
     # Name of a bundled body, or a body: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned character
-    # (glTF), or a moving mesh (.npz, or a folder of OBJ or PLY files; a single one stands still).
+    # (glTF), or a moving mesh (.npz, .abc, or a folder of OBJ or PLY files; a single one stands still).
     # FILE#MESH,MESH picks the meshes of a character that are its body, without its clothes.
     body: str = "anny"
     # physics is the solver alone; network is a trained network, from whose prediction the solver starts.

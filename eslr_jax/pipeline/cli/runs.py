@@ -234,7 +234,7 @@ class Export:
     out: Path
     # Format of the file; by default what the suffix says.
     format: Annotated[str | None, _FORMAT] = None
-    # garment, body, or both; by default both to glb and usd, and the garment to all others.
+    # garment, body, or both; by default both to glb, usd and abc, and the garment to all others.
     content: Literal["garment", "body", "both"] | None = None
 
     def __call__(self) -> None:

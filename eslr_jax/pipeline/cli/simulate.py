@@ -25,12 +25,14 @@ from eslr_jax.pipeline.cli.method import Method, choose_method
 from eslr_jax.pipeline.cli.options import Options
 
 if TYPE_CHECKING:
+    import numpy as np
     from jax import Array
+    from jaxtyping import Int
 
     from eslr_jax.pipeline.formats.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.types import Material, Scene, Trajectory
+    from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
 _KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
@@ -65,7 +67,7 @@ class Simulate(Options):
         words = "stopping when these frames are written; Ctrl-C again stops at once and loses them"
         use_compile_cache()
         with Interruption(lambda: say(words)) as stop:
-            report = _simulate(dataclasses.replace(self, out=out), stop)
+            report = simulate_run(dataclasses.replace(self, out=out), stop)
         if self.json:
             print(json.dumps(report, indent=2))
         else:
@@ -105,8 +107,13 @@ class Unfinished(NamedTuple):
     done: Trajectory  # its first frames, without an error
 
 
-def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
-    """Simulate, write the run's folder, and return the report."""
+def simulate_run(
+    options: Simulate, stop: Interruption, *, near: Int[np.ndarray, " near"] | None = None
+) -> dict[str, Any]:
+    """Simulate, write the run's folder, and return the report.
+
+    `near` are body vertices to search instead of those in reach: scenes that share them share a compiled program.
+    """
     from eslr_jax.files.atomic import ensure_output_dir
 
     done = None
@@ -115,7 +122,7 @@ def _simulate(options: Simulate, stop: Interruption) -> dict[str, Any]:
     else:
         options.check()
         with waiting("preparing garment, body and motion"):
-            setting = _prepare(options)
+            setting = _prepare(options, near)
         ensure_output_dir(options.out)
         _announce(options, setting)
     simulation = _run(setting, done, stop)
@@ -164,19 +171,36 @@ def _typed(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _prepare(options: Options) -> _Setting:
-    """Load garments, body and motion, choose how to simulate them, and begin to compile it."""
+class _Dressed(NamedTuple):
+    """A body in motion, and what it wears."""
+
+    actor: Actor
+    garments: list[GarmentFile]
+    stored: GarmentFile
+    cloth: Garment
+    method: Method
+    settle: int
+    settling: BodyMotion  # the motion with the frames before
+
+
+def reached_vertices(options: Options) -> Int[np.ndarray, " near"]:
+    """Return the vertices of the body that the cloth of a scene can reach, see `simulate_run`."""
     import numpy as np
 
-    from eslr_jax.contact.nearest import MAX_APPROACH
+    from eslr_jax.terms.worn import Worn
+
+    dressed = _dress(options)
+    surface = Worn(dressed.cloth, dressed.settling).surface
+    return np.zeros(0, int) if surface is None else np.asarray(surface.vertex_ids)
+
+
+def _dress(options: Options) -> _Dressed:
+    """Load garments, body and motion, and choose how to simulate them."""
     from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
     from eslr_jax.pipeline.assets.garments import check_resolution
     from eslr_jax.pipeline.dressing.outfit import wear_together
     from eslr_jax.pipeline.dressing.report import describe_cost
-    from eslr_jax.pipeline.fabrics import garment_material
-    from eslr_jax.pose.timing import SETTLE_FRAMES, check_speed, with_settling
-    from eslr_jax.simulation.plan import prepare_scene
-    from eslr_jax.simulation.simulate import begin_compiling
+    from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 
     names, method = options.garments, choose_method(options)
     check_resolution(names, options.vertices)
@@ -193,26 +217,44 @@ def _prepare(options: Options) -> _Setting:
     stored = wear_together(garments, names)
     method = method.within_budget(len(stored.rest_positions), options.substeps)
     cloth = prepare_stored(stored, name="+".join(names), **method.garment_options)
-    material = garment_material(options.fabric, cloth, stored)
-    has_solver = method.config.iterations > 0
     settle = options.settle
     if settle is None:
-        settle = SETTLE_FRAMES if has_solver else 0
-    begin = partial(begin_compiling, method.params, config=method.config, is_paced=method.pace is not None)
+        settle = SETTLE_FRAMES if method.config.iterations > 0 else 0
     settling = with_settling(actor.poses, settle, actor.rig)
+    return _Dressed(actor, garments, stored, cloth, method, settle, settling)
+
+
+def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Setting:
+    """Prepare the scene, and begin to compile it."""
+    import numpy as np
+
+    from eslr_jax.contact.nearest import MAX_APPROACH
+    from eslr_jax.pipeline.fabrics import garment_material
+    from eslr_jax.pose.timing import check_speed
+    from eslr_jax.simulation.plan import prepare_scene
+    from eslr_jax.simulation.simulate import begin_compiling
+    from eslr_jax.terms.worn import surface_near
+
+    actor, garments, stored, cloth, method, settle, settling = _dress(options)
+    material = garment_material(options.fabric, cloth, stored)
+    begin = partial(begin_compiling, method.params, config=method.config, is_paced=method.pace is not None)
+    surface = None
+    if near is not None:
+        surface = surface_near(np.isin(np.arange(settling.positions.shape[1]), near), settling)
     scene = prepare_scene(
         cloth,
         settling,
         material=material,
         terms=options.terms(),
-        integrator=options.integrator or ("bdf2" if has_solver else "euler"),
+        integrator=options.integrator or ("bdf2" if method.config.iterations > 0 else "euler"),
         substeps=options.substeps,
+        surface=surface,
         on_shapes=begin,
     )
     if scene.body is not None:
         vertices = np.asarray(scene.body.surface.vertex_ids)
         check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
-    return _Setting(names, garments, stored, actor, material, method, settle, scene)
+    return _Setting(options.garments, garments, stored, actor, material, method, settle, scene)
 
 
 def _announce(options: Options, setting: _Setting) -> None:

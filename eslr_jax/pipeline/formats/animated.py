@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +63,9 @@ class AnimatedMesh:
     velocities: np.ndarray | None = None  # [frames, vertices, 3] [m/s]
     rest_positions: np.ndarray | None = None  # [vertices, 3] [m], what `skin` moves
     skin: Skin | None = None  # joints that move it, exactly or nearly
+    parts: Mapping[str, np.ndarray] = dataclasses.field(
+        default_factory=dict
+    )  # which faces a part has [faces]
 
 
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
@@ -107,6 +110,20 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     frames = {mesh.name: len(mesh.positions) for mesh in meshes}
     if len(set(frames.values())) > 1:
         raise MotionError(f"meshes need the same number of frames, these have {frames}")
+
+
+def identifiers(names: Sequence[str]) -> list[str]:
+    """Return distinct names of letters, digits and underscores, as the scenes of other programs want them."""
+    result: list[str] = []
+    for name in names:
+        base = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name) or "mesh"
+        base = f"_{base}" if base[0].isdigit() else base
+        number, unique = 1, base
+        while unique in result:
+            number += 1
+            unique = f"{base}_{number}"
+        result.append(unique)
+    return result
 
 
 def split_seams(

@@ -44,7 +44,7 @@ def export_trajectory(
 
     Raises:
         AssetError: The format is unknown, the run has no body, or the file can't be written.
-        MissingExtraError: USD is not installed.
+        MissingExtraError: The format needs an extra that is not installed.
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
@@ -76,6 +76,7 @@ def export_trajectory(
                     garment_color(number),
                     corner_uvs=None if uvs is None or not uvs[is_own].any() else uvs[is_own],
                     velocities=None if cloth.velocities is None else cloth.velocities[:, rows],
+                    parts={part: has[is_own] for part, has in cloth.parts.items() if has[is_own].any()},
                 )
                 for number, (name, rows, is_own) in enumerate(split_outfit(cloth.faces, garment.outfit))
             ]
@@ -88,10 +89,13 @@ def export_trajectory(
 def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, AnimatedMesh]:
     """Return the garment in the vertex order of its file, and the body if there is one."""
     faces, uvs, places = run.faces, None, np.arange(run.positions.shape[1])
+    parts: dict[str, np.ndarray] = {}
     if garment is not None:
         if not np.array_equal(garment.faces, faces):
             raise AssetError("the garment file is not the one of this run; simulate again")
         uvs, order = garment.corner_uvs, garment.vertex_map
+        if garment.face_parts is not None:
+            parts = {name: garment.face_parts == part for part, name in enumerate(garment.part_names)}
         if order is not None and order.max(initial=-1) < len(places):
             first = first_rows(order, len(places))
             if (first[faces] >= 0).all():
@@ -101,7 +105,12 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
                 places, faces = order[kept[np.minimum(following, len(kept) - 1)]], first[faces]
     name = Path(split_name(str(run.metadata.get("garment") or "garment"))[0]).stem or "garment"
     cloth = AnimatedMesh(
-        name, run.positions[:, places], faces, corner_uvs=uvs, velocities=run.velocities[:, places]
+        name,
+        run.positions[:, places],
+        faces,
+        corner_uvs=uvs,
+        velocities=run.velocities[:, places],
+        parts=parts,
     )
     if run.body is None:
         return {"garment": cloth}

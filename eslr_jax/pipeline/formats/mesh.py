@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ from jaxtyping import Float, Int
 
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.registry import find_reader
+
+_FOLDED = -1e-6  # share of a polygon's squared area below which a triangle looks the other way
+_SLIVER = 1e-4  # share of the squared sum of its edges' squares below which a polygon has no area
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +58,68 @@ def read_mesh_file(path: str | Path, *, like: MeshFile | None = None) -> MeshFil
         return dataclasses.replace(
             mesh, positions=np.array(mesh.positions, np.float64), faces=np.array(mesh.faces)
         )
+
+
+def cut_polygons(
+    points: np.ndarray,
+    sizes: Sequence[int] | np.ndarray,
+    corners: np.ndarray,
+    starts: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut polygons into triangles, each as a fan.
+
+    Triangles look to the side of the polygon's area vector (Newell's). Quads are cut along their shorter diagonal
+    if both will do, other polygons from their first such corner. So is a polygon with next to no area, in which
+    rounding decides where triangles look.
+
+    Args:
+        points: Vertices [vertices, 3].
+        sizes: Number of corners of each polygon, three or more.
+        corners: Vertex of each corner, polygon after polygon.
+        starts: Corner from which each polygon was cut in another shape of the mesh; another number of them is
+            left out.
+
+    Returns:
+        Triangles as places among the corners [triangles, 3]; the polygon of each triangle; and the corner from
+        which each polygon was cut, -1 if every fan folds over.
+    """
+    sizes = np.asarray(sizes, np.int64)
+    firsts = np.cumsum(sizes) - sizes
+    if starts is None or len(starts) != len(sizes):
+        starts = np.zeros(len(sizes), np.int64)
+        for size in np.unique(sizes[sizes > 3]):
+            rows = np.flatnonzero(sizes == size)
+            ids = corners[firsts[rows, None] + np.arange(size)]
+            is_known = (ids.min(axis=1) >= 0) & (ids.max(axis=1) < len(points))
+            is_known[is_known] = np.isfinite(points[ids[is_known]]).all(axis=(1, 2))
+            starts[rows[is_known]] = _fan_starts(points[ids[is_known]])  # the others are refused later
+    owner = np.repeat(np.arange(len(sizes)), sizes - 2)
+    second = 1 + np.arange(len(owner)) - (np.cumsum(sizes - 2) - (sizes - 2))[owner]
+    turns = np.stack([np.zeros_like(second), second, second + 1], axis=1)
+    places = (starts[owner, None] + turns) % sizes[owner, None]
+    return firsts[owner, None] + places, owner, starts
+
+
+def _fan_starts(polygons: np.ndarray) -> np.ndarray:
+    """Return the corner from which to cut each of some polygons of one size, [polygons, corners, 3]."""
+    count, size = polygons.shape[:2]
+    corners = polygons - polygons[:, :1]
+    area = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
+    order = np.tile(np.arange(size), (count, 1))
+    if size == 4:
+        diagonals = np.linalg.norm(corners[:, :2] - corners[:, 2:], axis=2)
+        order = order[:, :2] ^ (diagonals[:, 1] < diagonals[:, 0])[:, None]
+    edges = np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=(1, 2))
+    is_flat = np.square(area).sum(axis=1) < _SLIVER * np.square(edges)
+    starts = np.where(is_flat, order[:, 0], -1)
+    for start in order.T:
+        spokes = np.take_along_axis(corners, ((start[:, None] + np.arange(size)) % size)[..., None], axis=1)
+        spokes = spokes[:, 1:] - spokes[:, :1]
+        normals = np.cross(spokes[:, :-1], spokes[:, 1:])
+        heights = np.einsum("ptx,px->pt", normals, area)
+        is_folded = heights.min(axis=1) < _FOLDED * np.einsum("px,px->p", area, area)
+        starts = np.where((starts < 0) & ~is_folded, start, starts)
+    return starts
 
 
 def name_parts(choices: list[list[str]]) -> tuple[np.ndarray | None, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Read a mesh that moves and keeps its faces, or stands still: from npz, a folder of meshes, or glTF."""
+"""Read a mesh that moves and keeps its faces, or stands still: from npz, a folder of meshes, glTF or Alembic."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
         path: Path of a folder of OBJ or PLY files, which are taken in the order of the numbers in their names; or
             of an .npz with `faces` and positions [frames, vertices, 3], named rest_positions, positions, vertices
             or verts, and optionally `fps` or `timestep`; or of a .glb or .gltf with a mesh that shapes (morph
-            targets) move, `FILE#MESH` where there are several; or of a single OBJ, PLY or STL file.
+            targets) move, or of an .abc, `FILE#MESH` where there are several; or of one OBJ, PLY or STL file.
         fps: Frame rate [1/s]; by default the file's own, or 30.
 
     Raises:
@@ -64,14 +64,14 @@ def read_mesh_sequence(path: str | Path, *, fps: float | None = None) -> MeshSeq
     if len(sequences) != 1:
         known = ", ".join(sequence.mesh for sequence in sequences)
         raise AssetError(
-            f"{path}: {len(sequences)} meshes are moved by shapes, not one; it has {known}; name one, as in "
+            f"{path}: {len(sequences)} meshes move, not one; it has {known}; name one, as in "
             f"{Path(split_name(path)[0]).name}#NAME"
         )
     return sequences[0]
 
 
 def read_mesh_sequences(path: str | Path, *, fps: float | None = None) -> list[MeshSequence]:
-    """Read all meshes in motion of a file: one, or those that shapes move in a glTF file, over the same frames.
+    """Read all meshes in motion of a file: one, or those of a glTF or Alembic file, over the same frames.
 
     Arguments and errors are those of `read_mesh_sequence`.
     """

@@ -19,6 +19,7 @@ from eslr_jax.pipeline.formats.animated import (
     AnimatedMesh,
     Skin,
     corrections,
+    identifiers,
     influences,
     local_motion,
     vertex_normals,
@@ -57,25 +58,11 @@ def write_usd(path: str | Path, meshes: Sequence[AnimatedMesh], timestep: float)
         stage.SetEndTimeCode(len(meshes[0].positions) - 1)
         world = UsdGeom.Xform.Define(stage, "/World")
         stage.SetDefaultPrim(world.GetPrim())
-        names = _identifiers([mesh.name for mesh in meshes])
+        names = identifiers([mesh.name for mesh in meshes])
         for name, mesh in zip(names, meshes, strict=True):
             _add_mesh(stage, f"/World/{name}", mesh)
         stage.GetRootLayer().Save()
         del stage, world  # the layer keeps the file open
-
-
-def _identifiers(names: Sequence[str]) -> list[str]:
-    """Return distinct prim names: letters, digits and underscores."""
-    result: list[str] = []
-    for name in names:
-        base = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name) or "mesh"
-        base = f"_{base}" if base[0].isdigit() else base
-        number, unique = 1, base
-        while unique in result:
-            number += 1
-            unique = f"{base}_{number}"
-        result.append(unique)
-    return result
 
 
 def _add_mesh(stage: Any, path: str, mesh: AnimatedMesh) -> None:
@@ -159,7 +146,7 @@ def _bind(stage: Any, path: str, prim: Any, skin: Skin) -> None:
     from pxr import Gf, UsdSkel, Vt  # pyright: ignore[reportMissingImports]
 
     joints: list[str] = []  # paths: parent/child
-    for name, parent in zip(_identifiers(skin.joint_names), skin.parents, strict=True):
+    for name, parent in zip(identifiers(skin.joint_names), skin.parents, strict=True):
         joints.append(name if parent < 0 else f"{joints[parent]}/{name}")
     rest = np.asarray(skin.joint_rest_positions, np.float64)
     above = np.array([rest[parent] if parent >= 0 else np.zeros(3) for parent in skin.parents])
