@@ -357,8 +357,8 @@ def pattern(frames: int) -> np.ndarray:
 PICTURES: dict[str, Callable[[int], np.ndarray | None]] = {
     make.__name__.replace("_", "-"): make
     for make in (
-        install, first_cloth, own_garment, pattern, own_body, outfits, fabrics, extend, report, score, studio, limits,
-        play,
+        install, first_cloth, own_garment, pattern, own_body, outfits, fabrics, extend, report, score, studio,
+        limits, play,
     )
 }  # fmt: skip
 
