@@ -39,7 +39,8 @@ from eslr_jax.pipeline.formats.registry import suffixes_of
 from eslr_jax.types import Body, Garment
 
 # Of the bundled body, on which patterns for GarmentCode's mean body stretch little: 1.69 m tall, bust and hips
-# .98 m, waist .72 m, where that one has 1.72, 1.00, 1.03 and .84 m. At these girths its shoulders are too broad.
+# .98 m, waist .72 m, where that one has 1.72, 1.00, 1.03 and .84 m (its mean_all_tpose.yaml). At these girths its
+# shoulders are too broad.
 MEAN_SHAPE = (-1.6, 0.0, 1.0, 0.0)
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
 _SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
