@@ -110,6 +110,25 @@ def true_entries(mask: Bool[Array, "rows columns"]) -> TrueEntries:
     return entries_of_words(words.astype(jnp.int32))
 
 
+def entries_where(
+    is_true: Callable[[Int[Array, " words"]], Bool[Array, "words rows"]], num_rows: int, num_columns: int
+) -> TrueEntries:
+    """Return the true entries of a matrix, given by a function of some of its columns.
+
+    The matrix itself is never in memory: for boxes that meet this takes a quarter of the time.
+    """
+    first = jnp.arange(0, num_columns, 32, dtype=jnp.int32)
+
+    def add_columns(k: Array, words: Int[Array, "words rows"]) -> Int[Array, "words rows"]:
+        column = first + k
+        mask = is_true(jnp.minimum(column, num_columns - 1)) & (column < num_columns)[:, None]
+        return words | jnp.where(mask, jnp.left_shift(jnp.int32(1), k), 0)
+
+    # Rows last: XLA vectorises the longer of the two axes.
+    words = jax.lax.fori_loop(0, 32, add_columns, jnp.zeros((len(first), num_rows), jnp.int32))
+    return entries_of_words(words.T)
+
+
 def entries_of_words(words: Int[Array, "rows words"]) -> TrueEntries:
     """Return the true entries of a matrix that is given by its bits, 32 columns a word."""
     flat = words.ravel()
@@ -182,7 +201,7 @@ def components(x: Float[Array, "rows 3"] | Vector3) -> Vector3:
     return x_part[:, 0], y_part[:, 0], z_part[:, 0]
 
 
-def in_memory(*arrays: Float[ArrayLike, " rows"]) -> tuple[Array, ...]:
+def in_memory(*arrays: Float[ArrayLike, ...]) -> tuple[Array, ...]:
     """Return the arrays, JAX's or NumPy's, each computed once and stored before it is read.
 
     Use it for coefficients that contain a scalar of the scene. XLA does not vectorise a loop on a CPU that reads

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.pairs import GAP, Pairs, Rows, closest, corners_of, gap_along, signs
 from eslr_jax.contact.search import Candidates, append, test_candidates
-from eslr_jax.numerics import Vector3, true_entries
+from eslr_jax.numerics import TrueEntries, Vector3, entries_where, in_memory
 from eslr_jax.types import BodySurface, Garment
 
 
@@ -133,7 +133,7 @@ def _find_kind(
 ) -> Rows:
     """Return pairs of one kind, and how many there are, which may be more than the rows."""
     own, others = (_boxes(one, motion) for one in (first, second))
-    close = true_entries(_are_close(first, second, own, others, is_edge, has_layers))
+    close = _close_groups(first, second, own, others, is_edge, has_layers)
     members = _table(first.blocks, own)
     table = _table(second.blocks, others).transpose(2, 1, 0)  # [members, numbers, blocks]
 
@@ -154,31 +154,34 @@ def _find_kind(
     return Rows(ids, count)
 
 
-def _are_close(
+def _close_groups(
     first: Primitives, second: Primitives, own: _Boxes, others: _Boxes, is_edge: bool, has_layers: bool
-) -> Bool[Array, "blocks others"]:
+) -> TrueEntries:
     """Return which groups hold primitives whose boxes meet; the body is not looked for in itself."""
     # A couple of groups of edges is looked at once; the cloth's come first.
     rows = first.blocks[: first.num_cloth] if is_edge else first.blocks
-    is_close = jnp.ones((rows.shape[0], second.blocks.shape[0]), bool)
-    for (low, high), (other_low, other_high) in zip(
-        _ranges(rows, own), _ranges(second.blocks, others), strict=True
-    ):
-        is_close = is_close & (low[:, None] <= other_high[None]) & (other_low[None] <= high[:, None])
-    group, other = (jnp.arange(count) for count in is_close.shape)
-    is_first, is_second = (group < first.num_cloth)[:, None], (other < second.num_cloth)[None]
-    is_close = is_close & ((is_first | is_second) if has_layers else (is_first != is_second))
-    return is_close & (group[:, None] <= other[None]) if is_edge else is_close
+    ranges, other_ranges = in_memory(_ranges(rows, own), _ranges(second.blocks, others))
+    group = jnp.arange(len(rows), dtype=jnp.int32)[None]
+
+    def are_close(other: Int[Array, " words"]) -> Bool[Array, "words groups"]:
+        (near,) = in_memory(other_ranges[:, other])
+        overlaps = [ranges[k][None] + near[k - 3][:, None] >= 0 for k in range(6)]
+        is_first, is_second = group < first.num_cloth, (other < second.num_cloth)[:, None]
+        overlaps.append((is_first | is_second) if has_layers else (is_first != is_second))
+        if is_edge:
+            overlaps.append(group <= other[:, None])
+        return functools.reduce(jnp.logical_and, overlaps)
+
+    return entries_where(are_close, len(rows), len(second.blocks))
 
 
-def _ranges(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> list[tuple[Array, Array]]:
-    """Return from where to where the boxes of every group reach, all the way [m], axis by axis."""
+def _ranges(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "6 blocks"]:
+    """Return how far the boxes of every group reach, all the way [m]: down and up the three axes."""
     spread = [size + jnp.abs(half) for half, size in zip(boxes.half, boxes.size, strict=True)]
     ends = [sign * x + away for sign in (-1, 1) for x, away in zip(boxes.middle, spread, strict=True)]
-    # All in one: XLA computes minima anew for every couple of groups where each has its own array, in 60 times
+    # All in one: XLA computes maxima anew for every couple of groups where each has its own array, in 60 times
     # the time.
-    x, y, z, *highest = jnp.max(jnp.stack(ends)[:, blocks], axis=2)
-    return [(-low, high) for low, high in zip((x, y, z), highest, strict=True)]
+    return jnp.max(jnp.stack(ends)[:, blocks], axis=2)
 
 
 def _table(blocks: Int[Array, "blocks members"], boxes: _Boxes) -> Float[Array, "blocks numbers members"]:

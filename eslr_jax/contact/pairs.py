@@ -55,6 +55,7 @@ class Closest(NamedTuple):
 
     offset: Vector3  # [m], from the second primitive to the first
     distance: Float[Array, " rows"]  # [m], not less than `_SHORT`
+    weights: tuple[Float[Array, " rows"], ...]  # of the four vertices, whose sum with them is the offset
 
 
 def signs(is_edge: bool) -> tuple[int, int, int, int]:
@@ -74,10 +75,10 @@ def closest(p: tuple[Vector3, ...], is_edge: bool) -> Closest:
     """Return the closest points of every pair, from its four vertices by components [m]."""
     if is_edge:
         s, t = _closest_on_edges(*p)
-        shares = s, t
+        shares, weights = (s, t), (1.0 - s, s, t - 1.0, -t)
     else:
         _, u, v = point_triangle(*p)
-        shares = u, v
+        shares, weights = (u, v), (jnp.ones_like(u), u + v - 1.0, -u, -v)
     offset = []
     for axis in range(3):  # differences first: their rounding is that of the offset, not of the place
         a, b, c, d = (corner[axis] for corner in p)
@@ -86,7 +87,8 @@ def closest(p: tuple[Vector3, ...], is_edge: bool) -> Closest:
         else:
             offset.append((a - b) - shares[0] * (c - b) - shares[1] * (d - b))
     x, y, z = offset
-    return Closest((x, y, z), jnp.sqrt(jnp.maximum(dot3((x, y, z), (x, y, z)), _SHORT**2)))
+    distance = jnp.sqrt(jnp.maximum(dot3((x, y, z), (x, y, z)), _SHORT**2))
+    return Closest((x, y, z), distance, weights)
 
 
 def _closest_on_edges(p0: Vector3, p1: Vector3, q0: Vector3, q1: Vector3) -> tuple[Array, Array]:

@@ -18,7 +18,8 @@ published losses, for tables. Side by side, from x_t to x_{t+1}:
 |           | at t, u in the tangent plane                  | contact force; s a slope against the z axis |
 |   motion  | of the body under the vertex, t to t + 1      | of a face centroid, t - 1 to t in training  |
 | ground    | collision and friction as with the body       | none                                        |
-| contact   | no energy: ends of a frame are pushed until   | none                                        |
+| contact   | collision and friction of pairs that are near | none                                        |
+|           | at t; then ends of the frame are pushed until |                                             |
 |           | nothing has passed through cloth on the way   |                                             |
 | air       | drag and lift of faces, `terms.air`           | none                                        |
 | damping   | of the fabric's strain, `terms.damping`       | none                                        |

@@ -1,4 +1,4 @@
-"""Coulomb friction against the moving body, smoothed where it sticks."""
+"""Coulomb friction against the moving body and between layers, smoothed where it sticks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ class Rubbing(NamedTuple):
 
 @struct.dataclass
 class Friction(Term):
-    """Friction with what the terms before it say that the cloth touches: the body and the ground."""
+    """Friction with what the terms before it say that the cloth touches: the body and the ground.
+
+    Pairs of `Contact` rub with the same constants; their energy is counted there.
+    """
 
     name = "friction"
     on = "vertices"
@@ -41,8 +44,9 @@ class Friction(Term):
     speed: Float[Array, ""] | float = 9e-4
 
     def plan(self, worn: Worn, others: Sequence[Term]) -> Friction | None:
-        """Return itself, or None where no term before it touches anything."""
-        return self if any(type(term).touched is not Term.touched for term in others) else None
+        """Return itself, or None where no term before it touches anything, and no layer another one."""
+        is_touched = any(type(term).touched is not Term.touched for term in others)
+        return self if is_touched or worn.num_pieces > 1 else None
 
     def prepare(self, problem: FrameProblem) -> tuple[Rubbing, ...]:
         """Return all that the cloth rubs against."""
@@ -53,7 +57,7 @@ class Friction(Term):
         self, corners: tuple[Vector3, ...], problem: FrameProblem, data: tuple[Rubbing, ...]
     ) -> Float[Array, " vertices"]:
         """Return the energy of every vertex [J]; see `friction_energies`."""
-        slip = self._slip(problem)
+        slip = self.slip(problem)
         energies = [friction_energies(corners[0], problem.position, *rubbing, slip) for rubbing in data]
         return sum(energies, jnp.zeros_like(corners[0][0]))
 
@@ -61,9 +65,9 @@ class Friction(Term):
         self, x: Vector3, problem: FrameProblem, data: tuple[Rubbing, ...]
     ) -> Float[Array, " vertices"] | float:
         """Return the curvature where the cloth sticks [N/m]; along two of three axes, with its force spread."""
-        return sum((rubbing.force / (3.0 * self._slip(problem)) for rubbing in data), 0.0)
+        return sum((rubbing.force / (3.0 * self.slip(problem)) for rubbing in data), 0.0)
 
-    def _slip(self, problem: FrameProblem) -> Float[Array, ""]:
+    def slip(self, problem: FrameProblem) -> Float[Array, ""]:
         """Return the distance in a frame below which friction acts like a spring [m]."""
         return self.speed * problem.timestep
 
@@ -91,7 +95,13 @@ def friction_energies(
     """
     body_motion = sub3(components(contacts.next_points), components(contacts.points))
     motion = sub3(sub3(components(position), components(start)), body_motion)
-    normal = components(contacts.next_normals)
+    return slip_energies(motion, components(contacts.next_normals), force, slip)
+
+
+def slip_energies(
+    motion: Vector3, normal: Vector3, force: Float[Array, " rows"], slip: Float[Array, ""] | float
+) -> Float[Array, " rows"]:
+    """Return the energies of `friction_energies` [J], from relative motions [m] and unit normals."""
     along_normal = dot3(motion, normal)
     tangential = (
         motion[0] - along_normal * normal[0],

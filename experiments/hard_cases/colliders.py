@@ -65,15 +65,16 @@ class Plane:
 
 @dataclasses.dataclass(frozen=True)
 class RoundedCone:
-    """All points within a radius of an endless solid cone: a needle with a round tip."""
+    """All points within a radius of a solid cone, cut off at its base: a needle with a round tip."""
 
     apex: np.ndarray  # of the inner cone, the centre of the tip's sphere [m], shape [3]
     axis: np.ndarray  # unit vector from the tip into the cone, shape [3]
     half_angle: float  # [rad]
     radius: float  # of the tip [m]
+    length: float = np.inf  # from the apex to the base [m]
 
     def distance(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, " *points"]:
-        """Return signed distances [m].
+        """Return signed distances [m]; beyond the base those from its plane, if they are larger.
 
         With s along the axis and r across it, the flank is r cos(a) - s sin(a) away. The apex is nearest where
         r sin(a) + s cos(a) < 0.
@@ -84,7 +85,8 @@ class RoundedCone:
         sine, cosine = np.sin(self.half_angle), np.cos(self.half_angle)
         is_before_apex = across * sine + along * cosine < 0
         flank = across * cosine - along * sine
-        return np.where(is_before_apex, np.linalg.norm(offset, axis=-1), flank) - self.radius
+        cone = np.where(is_before_apex, np.linalg.norm(offset, axis=-1), flank) - self.radius
+        return np.maximum(cone, along - self.length)
 
 
 def triangle_distances(
