@@ -11,6 +11,7 @@ Source: Ando 2024, doi 10.1145/3687908, for a body that yields; the way it does 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,12 +53,15 @@ def parted(
     """
     positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
     is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
+    between = 0.5 * (positions[1:] + positions[:-1])
     # With the faces around them: these bound how far the others give way.
     is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
     ids, corners = np.unique(faces[is_near], return_inverse=True)
     part, yielded = _Body(rest[ids], corners.reshape(-1, 3)), np.zeros((len(ids), 3))
     for frame in range(len(positions)):
-        yielded = part.yielding(positions[frame, ids], _KEPT * yielded)
+        # A limb that passes another in the midst of a frame yields at both of its ends.
+        around = [positions[frame, ids], *between[max(frame - 1, 0) : frame + 1, ids]]
+        yielded = part.yielding(around, _KEPT * yielded)
         out[frame, ids] += yielded.astype(out.dtype)
     return out
 
@@ -121,19 +125,22 @@ class _Body(_Mesh):
         ).tocsr()
 
     def yielding(
-        self, posed: Float[np.ndarray, "vertices 3"], yielded: Float[np.ndarray, "vertices 3"]
+        self, places: Sequence[Float[np.ndarray, "vertices 3"]], yielded: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices 3"]:
-        """Return how far every vertex yields [m], from a first guess."""
-        opposed, folded = self.looked_for(posed)
+        """Return how far every vertex yields [m] so that parts keep their gaps at all places, from a first guess."""
+        found = [(posed, *self.looked_for(posed)) for posed in places]
         for _ in range(_SWEEPS):
-            push = _pushes(posed + yielded, opposed)
-            if push is not None:
+            before = yielded
+            for posed, opposed, folded in found:
+                push = _pushes(posed + yielded, opposed)
+                if push is None:
+                    crossing = _crossing(posed + yielded, self.faces[folded])
+                    if not crossing.any():
+                        continue
+                    push = self.smoothing(posed + yielded, self.faces[folded][crossing])
                 yielded = yielded + push
-                continue
-            crossing = _crossing(posed + yielded, self.faces[folded])
-            if not crossing.any():
+            if yielded is before:
                 break
-            yielded = yielded + self.smoothing(posed + yielded, self.faces[folded][crossing])
         return yielded
 
     def looked_for(
