@@ -34,6 +34,8 @@ _SWEEPS = 40  # of pushes; ten are enough for most frames
 _SHARE = 0.8  # of a push that is done at a time
 _SMOOTHING = 0.3  # share of the way to the neighbours' mean, at a time
 _KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so that it changes gently
+_FAST = 0.02  # [m] in a frame, beyond all parts' common way, from which parts may pass each other between frames
+_BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
 _ENOUGH = 2e-4  # [m] of a gap that may be lacking
 
 
@@ -53,17 +55,24 @@ def parted(
     """
     positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
     is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
-    between = 0.5 * (positions[1:] + positions[:-1])
     # With the faces around them: these bound how far the others give way.
     is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
     ids, corners = np.unique(faces[is_near], return_inverse=True)
     part, yielded = _Body(rest[ids], corners.reshape(-1, 3)), np.zeros((len(ids), 3))
     for frame in range(len(positions)):
-        # A limb that passes another in the midst of a frame yields at both of its ends.
-        around = [positions[frame, ids], *between[max(frame - 1, 0) : frame + 1, ids]]
-        yielded = part.yielding(around, _KEPT * yielded)
+        yielded = part.yielding(_places(positions[:, ids], frame), _KEPT * yielded)
         out[frame, ids] += yielded.astype(out.dtype)
     return out
+
+
+def _places(positions: Float[np.ndarray, "frames vertices 3"], frame: int) -> list[np.ndarray]:
+    """Return where a body is at a frame and next to it [m]: a limb that passes another yields at both ends."""
+    here, places = positions[frame], [positions[frame]]
+    for other in positions[max(frame - 1, 0) : frame + 2]:
+        way = other - here
+        if np.max(np.linalg.norm(way - way.mean(axis=0), axis=1)) > _FAST:
+            places += [here + share * way for share in _BETWEEN]
+    return places
 
 
 def uncrossed(

@@ -18,7 +18,7 @@ from eslr_jax.numerics import safe_norm
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.lbfgs import Minimum
 from eslr_jax.solver.potential import Point, contact_load, evaluate, potential_terms
-from eslr_jax.solver.solve import Start, lower_point, solve
+from eslr_jax.solver.solve import MOST_RESIDUAL, Start, lower_point, solve
 from eslr_jax.terms.problem import FrameProblem, pin, weight_norm
 from eslr_jax.types import ClothState, PastState
 
@@ -34,8 +34,6 @@ class FrameReport(NamedTuple):
     gap_bound: Float[Array, ""] | float = math.inf
     is_passed: Bool[Array, ""] | None = None  # see Trajectory
 
-
-MOST_RESIDUAL = 5.0  # weights, for BDF2; within 1 % of the optimum torn cloth leaves 3, a T-shirt 0.15
 
 Stepper = Callable[[FrameProblem, ClothState], tuple[ClothState, FrameReport]]
 """Advances the cloth by one frame; the common interface of the solver, of networks, and of both together."""

@@ -42,6 +42,9 @@ class Stop(NamedTuple):
     tolerance: Float[Array, ""] | float = 0.0
     reference: Float[Array, ""] | float = 0.0  # energy [J] from which the gain counts
     force: Float[Array, ""] | float = 0.0  # norm of the gradient [N] at which to stop
+    # Norm of the gradient [N] above which the share is not enough: of a start that strains cloth to pieces, one
+    # in a hundred tears it still.
+    most_force: Float[Array, ""] | float = jnp.inf
 
 
 class _State(NamedTuple):
@@ -142,6 +145,7 @@ def minimize(
     def is_running(state: _State) -> Array:
         is_above = product(state.gradient, state.gradient) > jnp.square(stop.force)
         is_far = _CAUTION * state.decrement > stop.tolerance**2 * (stop.reference - state.value)
+        is_far = is_far | (product(state.gradient, state.gradient) > jnp.square(stop.most_force))
         is_far = is_far & ~((stop.tolerance > 0) & is_at_rest(state))
         is_going = (state.iterations < stop.iterations) & is_above & is_far & ~state.is_stuck
         return is_going | (state.iterations < 0)

@@ -10,7 +10,7 @@ from known_answers.strip import LENGTH, kept_per_period, strip
 from eslr_jax import ConfigError, SimConfig, prepare_scene, rollout_scene, scene_terms
 from eslr_jax.networks.eslr import Eslr
 from eslr_jax.pipeline.report.gap import trajectory_gap
-from eslr_jax.simulation.stepper import MOST_RESIDUAL
+from eslr_jax.solver.solve import MOST_RESIDUAL
 from eslr_jax.terms import Air
 
 GRAVITY = 9.81  # [m/s^2]
