@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from eslr_jax.contact.search import PosedSurface, face_corners, nearest_faces, opposing_faces
 from eslr_jax.contact.triangle import point_triangle
-from eslr_jax.numerics import Vector3, components, safe_norm, safe_normalize, vertex_normals
+from eslr_jax.numerics import Vector3, components, in_memory, safe_norm, safe_normalize, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
 
 _OPPOSED = -0.2  # cosine between normals below which two parts of the body face each other
@@ -138,11 +138,15 @@ def find_both_sides(
         query = position + gone
         location = _point_on(face, query, body, surface)
     contacts = _contacts_at(location, query, step, surface)
-    posed = PosedSurface(body, step.normals, CONTACT_RADIUS + safe_norm(next_body - body))
-    at, facing, posed = jax.lax.stop_gradient((position, contacts.normals, posed))
+    # Across is what is there at t + 1, when a limb may have swung past another: its point at t tells nothing then.
+    carried = position + (contacts.next_points - contacts.points)
+    end = _SurfaceStep(next_body, next_body, step.next_normals, step.next_normals)
+    posed = PosedSurface(next_body, step.next_normals, jnp.full(len(next_body), CONTACT_RADIUS, position.dtype))
+    at, facing = in_memory(*jax.lax.stop_gradient((carried, contacts.next_normals)))
+    posed = jax.lax.stop_gradient(posed)
     face, is_found = opposing_faces(at, facing, posed, surface, groups, _OPPOSED)
-    opposing = _contacts_at(_point_on(face, position, body, surface), position, step, surface)
-    is_facing = jnp.sum(opposing.normals * contacts.normals, axis=-1) < _OPPOSED
+    opposing = _contacts_at(_point_on(face, carried, next_body, surface), carried, end, surface)
+    is_facing = jnp.sum(opposing.normals * contacts.next_normals, axis=-1) < _OPPOSED
     is_outside = opposing.distances > -_TOUCHING
     return contacts, opposing.replace(is_near=opposing.is_near & is_found & is_facing & is_outside)
 
