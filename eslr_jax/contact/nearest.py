@@ -138,12 +138,11 @@ def find_both_sides(
         query = position + gone
         location = _point_on(face, query, body, surface)
     contacts = _contacts_at(location, query, step, surface)
-    # Across is what is there at t + 1, when a limb may have swung past another: its point at t tells nothing then.
+    # Across is what is there at t + 1: a limb that faces the vertex at t may have swung past it.
     carried = position + (contacts.next_points - contacts.points)
     end = _SurfaceStep(next_body, next_body, step.next_normals, step.next_normals)
-    posed = PosedSurface(next_body, step.next_normals, jnp.full(len(next_body), CONTACT_RADIUS, position.dtype))
+    posed = PosedSurface(*jax.lax.stop_gradient((next_body, step.next_normals)), CONTACT_RADIUS)
     at, facing = in_memory(*jax.lax.stop_gradient((carried, contacts.next_normals)))
-    posed = jax.lax.stop_gradient(posed)
     face, is_found = opposing_faces(at, facing, posed, surface, groups, _OPPOSED)
     opposing = _contacts_at(_point_on(face, carried, next_body, surface), carried, end, surface)
     is_facing = jnp.sum(opposing.normals * contacts.next_normals, axis=-1) < _OPPOSED

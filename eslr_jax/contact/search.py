@@ -38,7 +38,7 @@ class PosedSurface(NamedTuple):
 
     positions: Float[Array, "surface_vertices 3"]  # [m]
     normals: Float[Array, "surface_vertices 3"]
-    reach: Float[Array, " surface_vertices"]  # [m] within which a vertex may oppose another
+    reach: float  # [m] within which a vertex may oppose another
 
 
 class _Groups(NamedTuple):
@@ -124,7 +124,7 @@ def opposing_faces(
     ids, count = surface.patch_vertices, blocks.shape[0]
     patches = _Patches(ids, _Groups(body.positions.T[:, ids], body.normals.T[:, ids]))
     groups = _Groups(query.T[:, blocks], facing.T[:, blocks])
-    may_oppose = _may_oppose(groups, patches.groups, jnp.max(body.reach[ids], axis=1), least_cosine)
+    may_oppose = _may_oppose(groups, patches.groups, body.reach, least_cosine)
 
     def is_excluded(points: _Groups, candidate: Vector3, normal: Vector3) -> Bool[Array, "pairs rows"]:
         here, facing = tuple(points.points), tuple(points.normals)
@@ -230,7 +230,7 @@ def _gaps(blocks: _Boxes, patches: _Boxes) -> Float[Array, "blocks patches"]:
 
 
 def _may_oppose(
-    blocks: _Groups, patches: _Groups, reach: Float[Array, " patches"], least_cosine: float
+    blocks: _Groups, patches: _Groups, reach: float, least_cosine: float
 ) -> Bool[Array, "blocks columns"]:
     """Return which patches may hold a vertex that opposes a point of a block: bounds by intervals.
 
@@ -246,8 +246,7 @@ def _may_oppose(
         c = patch_box.low[axis][None] - box.high[axis][:, None]
         d = patch_box.high[axis][None] - box.low[axis][:, None]
         ahead = ahead + jnp.maximum(jnp.maximum(a * c, a * d), jnp.maximum(b * c, b * d))
-    reach = jnp.pad(reach, (0, patch_box.low.shape[1] - reach.shape[0]))
-    is_near = _gaps(box, patch_box) < (reach * reach)[None]
+    is_near = _gaps(box, patch_box) < reach**2
     return is_near & (cosine <= least_cosine) & (ahead >= 0.0)  # type: ignore[return-value]
 
 

@@ -6,6 +6,9 @@ there and cross nothing. So the body that cloth touches yields by a few millimet
 1. A vertex before a face of another part, to which it turns, keeps a gap from it. Both sides give way by half.
 2. Where faces cross still, at creases, their vertices move towards their neighbours'.
 
+Legs that pass each other within a frame may be apart at both its ends, and cross on straight ways between them.
+So a fast body yields for places beside its frames, too.
+
 Source: Ando 2024, doi 10.1145/3687908, for a body that yields; the way it does so here is the project's own.
 """
 
@@ -34,7 +37,7 @@ _SWEEPS = 40  # of pushes; ten are enough for most frames
 _SHARE = 0.8  # of a push that is done at a time
 _SMOOTHING = 0.3  # share of the way to the neighbours' mean, at a time
 _KEPT = 0.8  # share of the last frame's yielding that a frame begins with, so that it changes gently
-_FAST = 0.02  # [m] in a frame, beyond all parts' common way, from which parts may pass each other between frames
+_FAST = 0.02  # [m] in a frame, beyond the common way, from which parts may pass each other between frames
 _BETWEEN = (0.25, 0.5)  # shares of a straight way at which its end yields, before the other end does
 _ENOUGH = 2e-4  # [m] of a gap that may be lacking
 
@@ -55,6 +58,8 @@ def parted(
     """
     positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
     is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
+    if not is_near.any():
+        return out
     # With the faces around them: these bound how far the others give way.
     is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
     ids, corners = np.unique(faces[is_near], return_inverse=True)
@@ -136,7 +141,7 @@ class _Body(_Mesh):
     def yielding(
         self, places: Sequence[Float[np.ndarray, "vertices 3"]], yielded: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices 3"]:
-        """Return how far every vertex yields [m] so that parts keep their gaps at all places, from a first guess."""
+        """Return how far every vertex yields [m], at several places alike, from a first guess."""
         found = [(posed, *self.looked_for(posed)) for posed in places]
         for _ in range(_SWEEPS):
             before = yielded

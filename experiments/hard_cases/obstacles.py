@@ -69,8 +69,8 @@ NEEDLE = HardCase(
     "needle",
     "a tip of 2 mm finds the gap between vertices 16 mm apart",
     *(_build_needle, _measure_needle, "needle"),
-    limit="the tip holds the sheet by few pairs, whose energy is soft: edges stretch to 1.9 times their length on "
-    "the needle, and to 2.6 times on the thin edge",
+    limit="the tip holds the sheet by few pairs, whose energy is soft: edges stretch to 1.9 times their length "
+    "on the needle, and to 2.6 times on the thin edge",
 )
 
 

@@ -56,9 +56,7 @@ def test_opposing_faces_are_there_for_the_points_that_brute_force_names(spheres)
     normals = numerics.vertex_normals(
         jnp.asarray(positions, jnp.float32), surface.faces, surface.face_incidence
     )
-    body = PosedSurface(
-        jnp.asarray(positions, jnp.float32), normals, jnp.full(len(positions), 0.06, jnp.float32)
-    )
+    body = PosedSurface(jnp.asarray(positions, jnp.float32), normals, 0.06)
     blocks = jnp.asarray(compact_groups(query, 8), jnp.int32)
     face, is_found = jax.jit(opposing_faces, static_argnums=5)(
         jnp.asarray(query, jnp.float32), jnp.asarray(facing, jnp.float32), body, surface, blocks, -0.2

@@ -1,5 +1,7 @@
 """Bodies that pass through themselves make room for cloth; cloth that a pose folds through itself opens."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -22,12 +24,34 @@ def walking(body, tshirt):
 
 def test_a_body_that_crosses_itself_yields_by_millimetres(walking):
     positions, rest, faces = walking
-    made = parted(positions, rest, faces)
+    made = np.concatenate([parted(frame[None], rest, faces) for frame in positions])
     assert all(len(intersecting_pairs(frame, faces)) > 0 for frame in positions)
     assert not any(len(intersecting_pairs(frame, faces)) for frame in made)
     yielded = np.linalg.norm(made - positions, axis=2)
     assert 1e-3 < yielded.max() < 9e-3
     assert np.mean(yielded > 0) < 0.05  # the rest of the body stays where it is
+
+
+def test_legs_that_pass_each_other_between_two_frames_yield_at_both(body):
+    """A kick of 15 cm a frame: at its frames the legs are apart, and on straight ways between them not."""
+    from eslr_jax import load_garment, load_motion, pose_body
+    from eslr_jax.terms.worn import Worn
+
+    poses = pose_body(body, load_motion("cmu_016_29"), num_frames=32)
+    surface = Worn(load_garment("pants", vertices="1k"), poses).surface
+    ids, faces = np.asarray(surface.vertex_ids), np.asarray(surface.faces)
+    positions, rest = np.asarray(poses.positions)[29:32][:, ids], np.asarray(body.rest_positions)[ids]
+
+    def crossing(frames):
+        return [
+            len(intersecting_pairs((1 - s) * a + s * b, faces))
+            for a, b in itertools.pairwise(frames)
+            for s in (0.0, 0.25, 0.5, 0.75)
+        ]
+
+    alone = np.concatenate([parted(frame[None], rest, faces) for frame in positions])
+    assert max(crossing(alone)) > 50
+    assert max(crossing(parted(positions, rest, faces))) == 0
 
 
 def test_a_body_that_crosses_nothing_stays(walking):
