@@ -245,7 +245,7 @@ def _sample_gradient(
     (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(network.params)
     statistics = {}
     if network.statistics:
-        inputs = graph_inputs(problem, slot.state)
+        inputs = graph_inputs(problem, slot.state, network.config.graph)
         graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
         acceleration = _skinned_acceleration(slot, data, index)
         statistics = measure_statistics(network, graph, problem.garment, acceleration)
