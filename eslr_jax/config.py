@@ -115,9 +115,12 @@ class TrainConfig:
     # 0: train a network that works without the solver.
     iterations: int = 0
     batch_size: int = 1  # trajectories per step, spread over the devices (HOOD: 1)
+    vmap_size: int = 1  # of these that a device computes side by side; one is fastest on a CPU, all on a GPU
+    frames: int = 1  # of a trajectory per step, each with its loss; a scan in the compiled step (HOOD: 1)
+    through_time: int = 1  # frames that a gradient goes back through, a divisor of `frames` (HOOD: 1)
     slots_per_garment: int = 4  # trajectories kept alive per garment; more where a batch needs them
     horizon: int = 60  # longest trajectory [frames]
-    horizon_growth: int = 60  # steps until the horizon grows by a frame; with schedule "hood", trajectories
+    horizon_growth: int = 60  # frames trained until it grows by a frame; with schedule "hood", trajectories
     still_probability: float = 0.0  # share of trajectories on a body that stands still
     noise: float = 1e-3  # [m] on the start state; HOOD's 3 mm measured worse
     girth: float = 0.0  # [m] by which a trajectory's body may be thicker or thinner than the bundled one
@@ -144,6 +147,9 @@ class TrainConfig:
             "steps",
             "seeds",
             "batch_size",
+            "vmap_size",
+            "frames",
+            "through_time",
             "slots_per_garment",
             "horizon",
             "horizon_growth",
@@ -161,6 +167,10 @@ class TrainConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.frames % self.through_time:
+            raise ValueError(
+                f"frames = {self.frames} must be a multiple of through_time = {self.through_time}"
+            )
         if self.iterations < 0 or (self.iterations and self.energy_set == "hood"):
             raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
         if self.criterion != "postcvpr" and self.energy_set != "hood":

@@ -8,7 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from eslr_jax.contact.search import PosedSurface, face_corners, nearest_faces, opposing_faces
+from eslr_jax.contact.search import (
+    PosedSurface,
+    face_corners,
+    nearest_faces,
+    nearest_vertices,
+    opposing_faces,
+)
 from eslr_jax.contact.triangle import point_triangle
 from eslr_jax.numerics import Vector3, components, in_memory, safe_norm, safe_normalize, vertex_normals
 from eslr_jax.types import BodySurface, Contacts, Garment
@@ -148,6 +154,29 @@ def find_both_sides(
     is_facing = jnp.sum(opposing.normals * contacts.next_normals, axis=-1) < _OPPOSED
     is_outside = opposing.distances > -_TOUCHING
     return contacts, opposing.replace(is_near=opposing.is_near & is_found & is_facing & is_outside)
+
+
+def find_near_vertices(
+    position: Float[Array, "vertices 3"],
+    body: Float[Array, "surface_vertices 3"],
+    next_body: Float[Array, "surface_vertices 3"],
+    surface: BodySurface,
+    count: int,
+) -> Contacts:
+    """Pair every garment vertex with the `count` nearest body vertices at t, and carry these to t + 1.
+
+    Returns:
+        Contacts of count * vertices rows: all vertices with their nearest, then all with their second nearest.
+
+    Arguments are those of `find_contacts`.
+    """
+    vertex = nearest_vertices(*jax.lax.stop_gradient((position, body)), count).reshape(-1)
+    entry, size = surface.face_incidence[vertex, 0], surface.faces.shape[0]
+    first, second, third = ((entry // size == k).astype(position.dtype) for k in range(3))
+    query = jnp.tile(position, (count, 1))
+    squared = jnp.sum(jnp.square(query - body[vertex]), axis=1)
+    step = _surface_step(body, next_body, surface)
+    return _contacts_at(SurfacePoint(entry % size, (first, second, third), squared), query, step, surface)
 
 
 class _SurfaceStep(NamedTuple):

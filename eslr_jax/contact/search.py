@@ -103,6 +103,27 @@ def nearest_faces(
     return jnp.zeros(query.shape[0], jnp.int32).at[blocks].set(face)
 
 
+def nearest_vertices(
+    query: Float[Array, "rows 3"], positions: Float[Array, "surface_vertices 3"], count: int
+) -> Int[Array, "count rows"]:
+    """Return the nearest surface vertices of every query point [m], the nearest first.
+
+    All pairs are measured, in one matrix product. Of vertices whose distances differ by less than a thousandth
+    either may come first.
+    """
+    origin = jnp.mean(positions, axis=0)  # near which the product loses no digits
+    here, there = query - origin[None], positions - origin[None]
+    squared = (
+        jnp.sum(here * here, axis=1)[:, None] + jnp.sum(there * there, axis=1)[None] - 2 * here @ there.T
+    )
+    size = positions.shape[0]
+    keys = _with_index(jnp.maximum(squared, 0.0), jnp.arange(size, dtype=jnp.int32)[None], size)
+    found = [jnp.min(keys, axis=1)]
+    for _ in range(count - 1):
+        found.append(jnp.min(jnp.where(keys > found[-1][:, None], keys, _INFINITY), axis=1))
+    return jnp.stack(found) & _index_mask(size)
+
+
 def opposing_faces(
     query: Float[Array, "vertices 3"],
     facing: Float[Array, "vertices 3"],

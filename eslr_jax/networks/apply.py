@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import jraph
 from jaxtyping import Array, Bool, Float
 
+from eslr_jax.contact.nearest import find_near_vertices
 from eslr_jax.networks import features, normalizer
 from eslr_jax.networks.build import (
     COARSE_SETS,
+    GraphKind,
     Rows,
     Topology,
     build_frame_graph,
@@ -124,8 +126,8 @@ def merge_statistics(network: Network, measured: Statistics) -> Network:
     return network.replace(statistics={**seen, **merged})
 
 
-def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
-    """Return what the graph is built from; pinned vertices already carry their next target (HOOD)."""
+def graph_inputs(problem: FrameProblem, state: ClothState, kind: GraphKind) -> GraphInputs:
+    """Return what a graph of a kind is built from; pinned vertices already carry their next target (HOOD)."""
     position = pin(problem, state.position)
     velocity = state.velocity * problem.timestep
     if problem.pin_targets is not None:
@@ -133,6 +135,10 @@ def graph_inputs(problem: FrameProblem, state: ClothState) -> GraphInputs:
         velocity = jnp.where(is_pinned, position - state.position, velocity)
     touched = problem.data_of(Collision)
     contacts = None if touched is None else touched.nearest
+    body, others = problem.body, kind.world_edges - 1
+    if contacts is not None and body is not None and others:
+        near = find_near_vertices(position, body.start, body.end, body.surface, others)
+        contacts = jax.tree.map(lambda *rows: jnp.concatenate(rows), contacts, near)
     return GraphInputs(
         position=position,
         velocity=velocity,
@@ -149,7 +155,7 @@ def predict_acceleration(network: Network, problem: FrameProblem, state: ClothSt
 
     Source: the paper's method section, Q' = Q + A dt and X' = X + Q' dt, in HOOD's per-frame units.
     """
-    inputs = graph_inputs(problem, state)
+    inputs = graph_inputs(problem, state, network.config.graph)
     graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
     output = apply_model(network, graph, problem.garment)
     velocity = inputs.velocity + scale_output(network, output)
@@ -171,7 +177,7 @@ def refine(network: Network, problem: FrameProblem, state: ClothState, *, detach
             trained to do its best from where it begins.
     """
     garment, material, config = problem.garment, problem.material, network.config
-    inputs = graph_inputs(problem, state)
+    inputs = graph_inputs(problem, state, config.graph)
     graph = build_frame_graph(garment, material, inputs, config.graph)
     guess = initial_guess(problem)
     zeros = jnp.zeros_like(guess.position)

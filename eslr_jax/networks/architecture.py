@@ -24,7 +24,7 @@ from eslr_jax.networks.network import Example, Network, Prediction, Statistics, 
 from eslr_jax.terms.problem import FrameProblem
 from eslr_jax.types import ClothState, CoarseEdges
 
-CORRECTION_GAIN = 0.02  # a new network hardly moves the guess that it corrects
+START_GAIN = 0.02  # a new network hardly moves what it corrects or accelerates
 _MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
 
 
@@ -32,13 +32,15 @@ _MAY_BE_ZERO = ("smoothing_steps", "attention_blocks", "hidden_layers", "seed")
 class Architecture(System, abc.ABC):
     """Options of every network on a garment's graph.
 
-    Without `correction_scale` it reads HOOD's features and predicts an acceleration, as in the paper. With it, it
-    reads scaled features with the potential's gradient, and moves the solver's initial guess.
+    Without `correction_scale` it predicts an acceleration, as in the paper, from `features`: HOOD's, or these and
+    the state that it integrates. With it, it reads scaled features with the potential's gradient, and moves the
+    solver's initial guess.
     """
 
     latent_size: int = 128  # channels of vertices and edges (HOOD)
     hidden_layers: int = 2  # hidden layers of every MLP (HOOD)
     correction_scale: float | None = None  # [m] per unit of output that moves the solver's guess
+    features: Literal["hood", "state"] = "hood"  # of an acceleration, see `networks.features`
     world_edge_radius: float = 0.03  # [m] (HOOD)
     precision: Literal["float32", "bfloat16"] = "float32"  # operands of the large products
     # What a backward pass computes again: whole layers, all but their products, or nothing.
@@ -67,9 +69,14 @@ class Architecture(System, abc.ABC):
         return self.correction_scale is not None
 
     @property
+    def reads_state(self) -> bool:
+        """Whether strain, relative velocity and signed distance are among the inputs of an acceleration."""
+        return self.features == "state" and not self.reads_gradient
+
+    @property
     def graph(self) -> GraphKind:
         """What the network reads of a frame."""
-        return GraphKind(self.reads_gradient, world_edge_radius=self.world_edge_radius)
+        return GraphKind(self.reads_gradient, self.reads_state, world_edge_radius=self.world_edge_radius)
 
     @property
     @abc.abstractmethod
@@ -220,7 +227,7 @@ def make_decoder(config: Architecture, num_branches: int = 1) -> MLP:
         5 if config.has_gates else 3,
         config.hidden_layers,
         norm=False,
-        output_gain=CORRECTION_GAIN if config.reads_gradient else 1.0,
+        output_gain=START_GAIN if config.reads_gradient or config.reads_state else 1.0,
         precision=config.precision,
     )
 

@@ -1,21 +1,23 @@
-"""A garment's state as a `jraph.GraphsTuple`: mesh edges, and world edges to the nearest body points.
+"""A garment's state as a `jraph.GraphsTuple`: mesh edges, and world edges to near body points.
 
 Nodes, edges, senders and receivers are dictionaries:
 
-- nodes "garment" [vertices, features] and, beside a body, "body" [vertices, features];
+- nodes "garment" [vertices, features] and, beside a body, "body" [world_edges, features];
 - edges "mesh" [edges, features] in both directions, sorted by receiver;
 - with `GraphKind.has_coarse_edges`, edges "coarse0" to "coarse2" [coarse_edges, features] of the coarse levels;
-- beside a body, edges "world" [vertices, features] from body to garment, and with `GraphKind.has_reverse_edges`
-  "world_reverse" [vertices, features] from garment to body.
+- beside a body, edges "world" [world_edges, features] from body to garment, and with
+  `GraphKind.has_reverse_edges` "world_reverse" [world_edges, features] from garment to body.
 
-World edge w joins body row w to garment vertex w, so layers pair the rows and gather nothing. Vertices
-beyond `GraphKind.world_edge_radius` have rows of zeros, and `globals["world_mask"]` leaves them out.
+All vertices have as many world edges (`GraphKind.world_edges`). The first is to the nearest point of the body's
+surface, the others are to the nearest of its vertices. World edge w joins body row w to garment vertex w, modulo
+the vertices, so layers pair the rows and gather nothing. What lies beyond `GraphKind.world_edge_radius` has rows
+of zeros, and `globals["world_mask"]` leaves it out; with "state" a vertex inside the body keeps its first edge.
 Messages along mesh edges follow `senders["mesh"]`, `receivers["mesh"]` and the two tables in `globals` that
 go with them: `Topology` names all entries of `globals`.
 
-Garment and body have as many rows: `n_node` holds that number, shape [1], and `n_edge` one such array for every
-set of edges. jraph's own functions, such as `jraph.batch`, know one set of edges and no tables: `edge_set` gives
-them a graph of one set. Networks map over scenes with `jax.vmap` in the place of a batch.
+`n_node` holds the number of vertices, shape [1], and `n_edge` one such array for every set of edges. jraph's own
+functions, such as `jraph.batch`, know one set of edges and no tables: `edge_set` gives them a graph of one set.
+Networks map over scenes with `jax.vmap` in the place of a batch.
 """
 
 from __future__ import annotations
@@ -44,9 +46,11 @@ class GraphKind(NamedTuple):
     """What a network reads of a frame; static."""
 
     reads_gradient: bool  # scaled features with the potential's gradient, in the place of HOOD's
+    reads_state: bool = False  # beside HOOD's: relative velocities, strains, signed distances
     has_coarse_edges: bool = False
     has_reverse_edges: bool = False  # from garment to body, for networks that update body rows
     world_edge_radius: float = 0.03  # [m] (HOOD)
+    world_edges: int = 1  # of a vertex, at most
 
 
 class Topology(TypedDict, total=False):
@@ -57,8 +61,8 @@ class Topology(TypedDict, total=False):
     coarse: tuple[CoarseEdges, ...]  # coarse levels, finest first; hierarchical networks
     edge_length: Float[Array, ""]  # mean rest edge length [m]; features "gradient"
     garment_type: Int[Array, " vertices"]  # HOOD's vertex type; features "hood"
-    body_type: Int[Array, " vertices"]  # the same of the body rows
-    world_mask: Bool[Array, " vertices"]  # vertices with a world edge
+    body_type: Int[Array, " world_edges"]  # the same of the body rows
+    world_mask: Bool[Array, " world_edges"]  # that are within reach
 
 
 def build_graph(
@@ -80,6 +84,12 @@ def build_frame_graph(
 ) -> jraph.GraphsTuple:
     """Return the graph with the features that stay for a whole frame: all of HOOD's. `kind` is static."""
     is_hood = not kind.reads_gradient
+
+    def hood_edges(level: Garment | CoarseEdges) -> Array:
+        rows = features.hood_edge_features(garment, material, inputs, level)
+        state = [features.state_edge_features(garment, inputs, level)] if kind.reads_state else []
+        return jnp.concatenate([*state, rows], axis=1)  # columns that are not normalised stay last
+
     topology: Topology = {
         "reverse_edges": garment.reverse_edges,
         "incoming_edges": incoming_edges(garment.neighbor_mask, garment.receivers.shape[0]),
@@ -88,7 +98,7 @@ def build_frame_graph(
     if is_hood:
         topology["garment_type"] = jnp.where(garment.is_pinned, features.TYPE_PINNED, features.TYPE_GARMENT)
         nodes = {"garment": features.hood_garment_features(garment, material, inputs)}
-        edges = {"mesh": features.hood_edge_features(garment, material, inputs, garment)}
+        edges = {"mesh": hood_edges(garment)}
     else:
         spacing = topology["edge_length"] = features.mean_edge_length(garment, garment)
         nodes = {"garment": features.frame_node_features(garment, material, inputs, spacing)}
@@ -101,7 +111,7 @@ def build_frame_graph(
         topology["coarse"] = garment.coarse
         for name, level in zip(COARSE_SETS, garment.coarse, strict=True):
             edges[name] = (
-                features.hood_edge_features(garment, material, inputs, level)
+                hood_edges(level)
                 if is_hood
                 else features.frame_mesh_features(
                     garment, inputs.position, level, features.mean_edge_length(garment, level)
@@ -110,25 +120,32 @@ def build_frame_graph(
             senders[name], receivers[name] = level.senders, level.receivers
     if inputs.contacts is not None:
         # A contact of thrown cloth is measured on its path; HOOD's edges join what is near now.
-        away = inputs.contacts.distances
-        if is_hood:
-            away = safe_norm(inputs.contacts.points - inputs.position)
-        mask = (jnp.abs(away) <= kind.world_edge_radius) & garment.vertex_mask
+        signed, count = inputs.contacts.distances, garment.vertex_mask.shape[0]
+        away = jnp.abs(signed)
+        if kind.reads_state:  # a vertex deep in the body needs its edge to the surface most
+            away = jnp.concatenate([signed[:count], away[count:]])
+        elif is_hood:
+            position = features.per_world_edge(inputs.position, inputs.contacts)
+            away = safe_norm(inputs.contacts.points - position)
+        mask = (away <= kind.world_edge_radius) & jnp.tile(garment.vertex_mask, kind.world_edges)
         topology["world_mask"] = mask
         contacts, velocity = inputs.contacts, required(inputs, "body_velocity")
         if is_hood:
             topology["body_type"] = jnp.full(mask.shape, features.TYPE_BODY)
             body = features.hood_body_features(velocity, contacts.normals, inputs.timestep)
             world = features.hood_world_features(contacts, inputs)
+            if kind.reads_state:
+                world = jnp.concatenate([world, features.state_world_features(contacts, inputs)], axis=1)
         else:
             inertial_guess = required(inputs, "inertial_guess")
             body = features.frame_body_features(velocity, contacts, inputs.timestep)
             world = features.frame_world_features(inputs.position, contacts, inertial_guess)
         nodes["body"], edges["world"] = _mask_rows(body, mask), _mask_rows(world, mask)
-        senders["world"] = receivers["world"] = jnp.arange(mask.shape[0])
+        senders["world"] = jnp.arange(mask.shape[0])
+        receivers["world"] = senders["world"] % count
         if kind.has_reverse_edges:
             edges["world_reverse"] = features.reverse_world_features(edges["world"])
-            senders["world_reverse"] = receivers["world_reverse"] = senders["world"]
+            senders["world_reverse"], receivers["world_reverse"] = receivers["world"], senders["world"]
     return jraph.GraphsTuple(
         nodes=nodes,
         edges=edges,
@@ -199,8 +216,8 @@ def feature_sizes(kind: GraphKind) -> dict[str, int]:
         return {
             "garment": features.HOOD_NODE_SIZE,
             "body": features.HOOD_NODE_SIZE,
-            "mesh": features.HOOD_MESH_SIZE,
-            "world": features.HOOD_WORLD_SIZE,
+            "mesh": features.HOOD_MESH_SIZE + kind.reads_state * features.STATE_MESH_SIZE,
+            "world": features.HOOD_WORLD_SIZE + kind.reads_state * features.STATE_WORLD_SIZE,
         }
     return {
         "garment": features.NODE_FRAME_SIZE + features.NODE_REFINEMENT_SIZE,

@@ -1,9 +1,10 @@
-"""What a graph is built from, and its features: HOOD's, or scaled ones with the potential's gradient.
+"""What a graph is built from, and its features: HOOD's, these with the state, or scaled ones with the gradient.
 
-HOOD's features are raw, and the model normalises them by running statistics. Features of the kind
-"gradient" are divided by fixed physical scales. What grows with the mesh spacing is divided by the
-garment's mean rest edge length, so that one model serves a garment at 1k and at 4k vertices. They are
-clipped at `CLIP`: a vertex thrown far away gives a large input, but a bounded one.
+HOOD's features are raw, and the model normalises them by running statistics. They leave strain, how neighbours
+move against each other and the depth in the body to products of inputs; the kind "state" has these too. Features
+of the kind "gradient", of the potential, are divided by fixed physical scales. What grows with the mesh spacing
+is divided by the garment's mean rest edge length, so that one model serves a garment at 1k and at 4k vertices.
+They are clipped at `CLIP`: a vertex thrown far away gives a large input, but a bounded one.
 
 Source: HOOD's `models/baselines.py` and `utils/connectivity.py` for the first kind.
 """
@@ -43,6 +44,7 @@ HOOD_NODE_SIZE = 11  # + 9 embedding columns = 20
 HOOD_NODE_STATIC = 3  # last columns, which are not normalised
 HOOD_MESH_SIZE, HOOD_MESH_STATIC = 12, 3
 HOOD_WORLD_SIZE = 9
+STATE_MESH_SIZE, STATE_WORLD_SIZE = 5, 2  # columns of the kind "state" beside HOOD's
 
 
 @struct.dataclass
@@ -52,16 +54,17 @@ class GraphInputs:
     Lengths are in metres. Velocities are in metres per frame, the unit of HOOD's features. Pinned vertices
     already have their next target as `position`, and their way to it as `velocity`.
 
-    `contacts` and `body_velocity` are None in a scene without a body. Only features of the kind "gradient" read
-    the fields from `inertial_guess` on. `correction` and `previous_gradient` are None or zero at the first
-    refinement step of a frame.
+    `contacts` and `body_velocity` are None in a scene without a body. They have a row per world edge, and all
+    vertices have as many world edges: all their first ones, then all their second ones. Only features of the kind
+    "gradient" read the fields from `inertial_guess` on. `correction` and `previous_gradient` are None or zero at
+    the first refinement step of a frame.
     """
 
     position: Float[Array, "vertices 3"]  # [m]
     velocity: Float[Array, "vertices 3"]  # [m per frame]
     timestep: Float[Array, ""]  # [s]
     contacts: Contacts | None = None
-    body_velocity: Float[Array, "vertices 3"] | None = None  # of the nearest body points [m per frame]
+    body_velocity: Float[Array, "world_edges 3"] | None = None  # of the nearest body points [m per frame]
     inertial_guess: Float[Array, "vertices 3"] | None = None  # where inertia alone leads [m]
     guess: Float[Array, "vertices 3"] | None = None  # what the step corrects [m]
     gradient: Float[Array, "vertices 3"] | None = None  # of the potential at `guess` [N]
@@ -145,6 +148,11 @@ def material_inputs(garment: Garment, material: Material) -> Float[Array, "verti
     )
 
 
+def per_world_edge(rows: Float[Array, "vertices _"], contacts: Contacts) -> Float[Array, "world_edges _"]:
+    """Return the row of every world edge's vertex; see `GraphInputs`."""
+    return jnp.tile(rows, (contacts.points.shape[0] // rows.shape[0], 1))
+
+
 def log_positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Return the logarithm, and zero where `x` is not positive (a padded vertex has no mass)."""
     return jnp.log(jnp.where(x > 0, x, 1))
@@ -214,12 +222,28 @@ def hood_edge_features(
     )
 
 
+def state_edge_features(
+    garment: Garment, inputs: GraphInputs, edges: Garment | CoarseEdges
+) -> Float[Array, "edges 5"]:
+    """Return sender's velocity less receiver's 3 [m per frame], strain now, and where velocity alone leads."""
+    now, moving = (_edge_vectors(edges, rows) for rows in (inputs.position, inputs.velocity))
+    rest_length = safe_norm(_edge_vectors(edges, garment.sewn_positions), keepdims=True)
+    return jnp.concatenate([moving, _strain(now, rest_length), _strain(now + moving, rest_length)], axis=1)
+
+
+def state_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 2"]:
+    """Return signed distances: from the body point now; from its next plane, of where velocity alone leads."""
+    later = plane_distance(per_world_edge(inputs.position + inputs.velocity, contacts), contacts)
+    return clip(jnp.concatenate([contacts.distances[:, None], later], axis=1) / DISTANCE_SCALE)
+
+
 def hood_world_features(contacts: Contacts, inputs: GraphInputs) -> Float[Array, "world_edges 9"]:
     """Return body point minus vertex 3 [m], its norm, the same with the body's next frame 4, timestep [s].
 
     As on mesh edges, that is sender minus receiver.
     """
-    now, later = contacts.points - inputs.position, contacts.next_points - inputs.position
+    position = per_world_edge(inputs.position, contacts)
+    now, later = contacts.points - position, contacts.next_points - position
     return jnp.concatenate(
         [
             now,
@@ -362,9 +386,10 @@ def _strain(vector: Float[Array, "edges 3"], rest_length: Float[Array, "edges 1"
 
 
 def frame_world_features(
-    position: Float[Array, "world_edges 3"], contacts: Contacts, inertial_guess: Float[Array, "world_edges 3"]
+    position: Float[Array, "vertices 3"], contacts: Contacts, inertial_guess: Float[Array, "vertices 3"]
 ) -> Float[Array, "world_edges 10"]:
     """Return the offset from the body point now 4 and at the next frame 4, with norms; signed distances 2."""
+    position, inertial_guess = (per_world_edge(rows, contacts) for rows in (position, inertial_guess))
     now, later = position - contacts.points, position - contacts.next_points
     return clip(
         jnp.concatenate(
@@ -382,10 +407,10 @@ def frame_world_features(
 
 
 def refinement_world_features(
-    guess: Float[Array, "world_edges 3"], contacts: Contacts
+    guess: Float[Array, "vertices 3"], contacts: Contacts
 ) -> Float[Array, "world_edges 2"]:
     """Return the guess's signed distance to the body's next tangent plane, coarse and in contact widths."""
-    distance = plane_distance(guess, contacts)
+    distance = plane_distance(per_world_edge(guess, contacts), contacts)
     return clip(jnp.concatenate([distance / DISTANCE_SCALE, distance / CONTACT_SCALE], axis=1))
 
 

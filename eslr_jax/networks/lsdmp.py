@@ -35,11 +35,13 @@ from eslr_jax.networks.operators import (
 
 
 class WorldLatents(NamedTuple):
-    """Latents around the body. Row w belongs to garment vertex w."""
+    """Latents around the body. Row w belongs to garment vertex w, modulo the vertices."""
 
-    body: Float[Array, "vertices latent"]
-    edges: Float[Array, "vertices latent"]  # from body to garment
-    reverse: Float[Array, "vertices latent"] | None  # from garment to body; None where body rows are constant
+    body: Float[Array, "world_edges latent"]
+    edges: Float[Array, "world_edges latent"]  # from body to garment
+    reverse: (
+        Float[Array, "world_edges latent"] | None
+    )  # from garment to body; None where body rows are constant
 
 
 class Latents(NamedTuple):
@@ -55,7 +57,7 @@ class LayerTables(NamedTuple):
     """What is the same in every layer."""
 
     mesh: MeshTables
-    world_mask: Float[Array, "vertices 1"]  # one where a vertex has a world edge; zeros without a body
+    world_mask: Float[Array, "world_edges 1"]  # one within reach; zeros without a body
 
 
 class LsdmpLayer(nn.Module):
@@ -98,9 +100,9 @@ class LsdmpLayer(nn.Module):
         hidden = vertex.start(garment, 0, bias=True) + vertex.start(message_sum, size)
         if world is not None:
             edge = self.world_mlp
-            ends = edge.start(garment, 0) + edge.start(world.body, size)
+            ends = to_world_edges(edge.start(garment, 0), world) + edge.start(world.body, size)
             to_garment = edge.finish(ends + edge.start(world.edges, 2 * size, bias=True))
-            hidden = hidden + vertex.start(to_garment, 2 * size) * tables.world_mask
+            hidden = hidden + sum_world_edges(vertex.start(to_garment, 2 * size) * tables.world_mask, garment)
             world = self._pass_to_body(garment, world)._replace(edges=world.edges + to_garment)
         return Latents(
             garment + vertex.finish(hidden), latents.mesh + messages, latents.mesh_sum + message_sum, world
@@ -111,7 +113,7 @@ class LsdmpLayer(nn.Module):
         if world.reverse is None:
             return world
         size, edge, vertex = self.config.latent_size, self.world_mlp, self.vertex_mlp
-        ends = edge.start(world.body, 0) + edge.start(garment, size)
+        ends = edge.start(world.body, 0) + to_world_edges(edge.start(garment, size), world)
         messages = edge.finish(ends + edge.start(world.reverse, 2 * size, bias=True))
         hidden = vertex.start(world.body, 0, bias=True) + vertex.start(messages, 2 * size)
         return world._replace(body=world.body + vertex.finish(hidden), reverse=world.reverse + messages)
@@ -134,9 +136,23 @@ def make_mlp(config: Architecture, input_size: int) -> MLP:
     return MLP(input_size, size, size, config.hidden_layers, precision=config.precision)
 
 
+def to_world_edges(
+    rows: Float[Array, "vertices features"], world: WorldLatents
+) -> Float[Array, "world_edges features"]:
+    """Return the row of every world edge's vertex."""
+    return jnp.tile(rows, (world.body.shape[0] // rows.shape[0], 1))
+
+
+def sum_world_edges(
+    rows: Float[Array, "world_edges features"], garment: Float[Array, "vertices latent"]
+) -> Float[Array, "vertices features"]:
+    """Sum over the world edges of every vertex of the garment."""
+    return jnp.sum(rows.reshape(-1, garment.shape[0], rows.shape[1]), axis=0)
+
+
 def propagate(
     latents: Latents, tables: LayerTables, num_steps: int
-) -> tuple[Float[Array, "vertices latent"], Float[Array, "vertices latent"] | None]:
+) -> tuple[Float[Array, "vertices latent"], Float[Array, "world_edges latent"] | None]:
     """Smooth vertex latents: p_i = 1 / |N(i)| sum_(j in N(i)) (p_j + e_ij), `num_steps` times.
 
     The mean of e_ij is the same in every step and computed once. A vertex without neighbours keeps its latent. A
@@ -150,9 +166,9 @@ def propagate(
     garment, world = latents.garment, latents.world
     degree, edge_sum = tables.mesh.degree, latents.mesh_sum
     if world is not None:
-        degree = degree + tables.world_mask
+        degree = degree + sum_world_edges(tables.world_mask, garment)
         arriving = world.edges + world.body if world.reverse is None else world.edges
-        edge_sum = edge_sum + arriving * tables.world_mask
+        edge_sum = edge_sum + sum_world_edges(arriving * tables.world_mask, garment)
     inverse = jnp.where(degree > 0, 1 / jnp.maximum(degree, 1), 0)
     edge_mean = edge_sum * inverse
     body = None
@@ -162,7 +178,7 @@ def propagate(
     else:
         body = world.body
         for _ in range(num_steps):
-            total = sum_neighbors(garment, tables.mesh) + body * tables.world_mask
-            body = garment + world.reverse
+            total = sum_neighbors(garment, tables.mesh) + sum_world_edges(body * tables.world_mask, garment)
+            body = to_world_edges(garment, world) + world.reverse
             garment = total * inverse + edge_mean
     return jnp.where(degree > 0, garment, latents.garment), body

@@ -23,6 +23,7 @@ from eslr_jax.terms import Term
 from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
 
 SCENES = "scenes"  # axis of the device mesh
+_SIDE_BY_SIDE = 64  # scenes on a GPU: there 64 T-shirts take 1.6 times as long as one
 
 
 def simulate_batch(
@@ -36,13 +37,13 @@ def simulate_batch(
     integrator: Integrator = "euler",
     substeps: int = 1,
     starts_at_rest: bool = False,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     devices: Sequence[Any] | None = None,
 ) -> list[Trajectory]:
     """Simulate garment i on motion i for every i; scenes of like size share one compiled rollout.
 
-    Garments are padded to the bucket of their vertex count, and those of one bucket are simulated together. A
-    scene whose buffers were too small is simulated again by itself.
+    Garments are padded to the bucket of their vertex count, and those of one bucket are simulated together, see
+    `simulate_scenes`.
 
     Args:
         params: A network, or None.
@@ -55,7 +56,7 @@ def simulate_batch(
         integrator: How time is stepped.
         substeps: Number of equal parts in which a frame is simulated.
         starts_at_rest: Frame 0 stands still; else it moves as the body does.
-        batch_size: Scenes per step on a device, see `rollout_scenes`.
+        batch_size: Scenes per step on a device, see `rollout_scenes`; by default what is fast there.
         devices: Of `jax.devices()`, to spread the scenes over; by default the first alone.
 
     Returns:
@@ -76,8 +77,6 @@ def simulate_batch(
             f"{len(garments)} garments, {len(poses)} motions and {len(materials)} fabrics; give one motion for "
             "each garment, and one fabric for all or one for each"
         )
-    devices = list(devices or [])
-    mesh = Mesh(np.array(devices), (SCENES,)) if devices else None
     done: dict[int, Trajectory] = {}
     for group in _group_alike(garments, poses):
         scenes = prepare_scenes(
@@ -89,17 +88,8 @@ def simulate_batch(
             substeps=substeps,
             starts_at_rest=starts_at_rest,
         )
-        for scene in scenes:
-            check_scene(scene)
-        # Devices get equal shares: the last scene is repeated, and what is simulated twice is dropped.
-        missing = -len(scenes) % max(len(devices), 1)
-        stacked = stack_scenes(scenes + scenes[-1:] * missing)
-        together = rollout_scenes(params, stacked, config, batch_size=batch_size, mesh=mesh)
-        for row, (i, scene) in enumerate(zip(group, scenes, strict=True)):
-            one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
-            if (larger := enlarge_buffers(scene, one)) is not None:
-                one = simulate(params, larger, config=config, raises=False).trajectory
-                one = hold_last(one, scene.num_frames)  # it ends where something else goes wrong
+        together = simulate_scenes(params, scenes, config=config, batch_size=batch_size, devices=devices)
+        for i, one in zip(group, together, strict=True):
             count = garments[i].vertex_mask.shape[0]  # without the rows that padding added
             done[i] = one.replace(
                 positions=one.positions[:, :count],
@@ -107,6 +97,58 @@ def simulate_batch(
                 friction_loads=one.friction_loads[:, :count],
             )
     return [done[i] for i in range(len(garments))]
+
+
+def simulate_scenes(
+    params: Network | None,
+    scenes: Sequence[Scene],
+    *,
+    config: SimConfig | None = None,
+    batch_size: int | None = None,
+    devices: Sequence[Any] | None = None,
+) -> list[Trajectory]:
+    """Simulate scenes; those of the same shapes share one compiled rollout and go through it together.
+
+    Args:
+        params: A network, or None.
+        scenes: Of `prepare_scene` or `prepare_scenes`.
+        config: Iterations and tolerance; the solver alone by default.
+        batch_size: Scenes per step on a device, see `rollout_scenes`; by default what is fast there.
+        devices: Of `jax.devices()`, to spread the scenes over; by default the first alone.
+
+    Returns:
+        Trajectories in the order given; their status is not checked. A scene whose buffers were too small is
+        simulated again by itself.
+
+    Raises:
+        MotionError: A scene has fewer than two frames.
+        ConfigError: `params` is no network; or a fabric, a constant or a timestep is out of its physical range.
+        CheckpointError: The weights are for another architecture.
+    """
+    config, devices = config or SimConfig(), list(devices or [])
+    check_network(params)
+    for scene in scenes:
+        check_scene(scene)
+    if batch_size is None:
+        batch_size = 1 if jax.default_backend() == "cpu" else _SIDE_BY_SIDE
+    mesh = Mesh(np.array(devices), (SCENES,)) if devices else None
+    groups: dict[Any, list[int]] = {}
+    for i, scene in enumerate(scenes):
+        key = jax.tree.structure(scene), *(np.shape(leaf) for leaf in jax.tree.leaves(scene))
+        groups.setdefault(key, []).append(i)
+    done: dict[int, Trajectory] = {}
+    for group in groups.values():
+        # Devices get equal shares: the last scene is repeated, and what is simulated twice is dropped.
+        missing = -len(group) % max(len(devices), 1)
+        stacked = stack_scenes([scenes[i] for i in group + group[-1:] * missing])
+        together = rollout_scenes(params, stacked, config, batch_size=batch_size, mesh=mesh)
+        for row, i in enumerate(group):
+            one = jax.tree.map(lambda leaf, row=row: leaf[row], together)
+            if (larger := enlarge_buffers(scenes[i], one)) is not None:
+                one = simulate(params, larger, config=config, raises=False).trajectory
+                one = hold_last(one, scenes[i].num_frames)  # it ends where something else goes wrong
+            done[i] = one
+    return [done[i] for i in range(len(scenes))]
 
 
 def _group_alike(garments: Sequence[Garment], poses: Sequence[BodyMotion]) -> list[list[int]]:
@@ -155,7 +197,8 @@ def rollout_scenes(
     """
 
     def run(params: Network | None, scenes: Scene) -> Trajectory:
-        return jax.lax.map(lambda scene: rollout_scene(params, scene, config), scenes, batch_size=batch_size)
+        size = None if batch_size == 1 else batch_size  # of one, lax.map would make a batch all the same
+        return jax.lax.map(lambda scene: rollout_scene(params, scene, config), scenes, batch_size=size)
 
     if mesh is None:
         return run(params, scenes)

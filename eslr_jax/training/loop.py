@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import json
+import math
 import os
 import sys
 import time
@@ -51,6 +52,7 @@ def train(
     earlier: Mapping[str, Any] | None = None,
     datasets: tuple[TrainingData, ...],
     on_progress: Progress = lambda done, total, metrics: None,
+    most_seconds: float = math.inf,
 ) -> TrainState:
     """Train a network, or go on with a run.
 
@@ -67,19 +69,23 @@ def train(
         earlier: Training record of that network, whose steps and core-hours the exported one counts too. A run
             that is resumed knows it.
         on_progress: Called with steps done, steps in all, and the latest line of metrics of the first seed.
+        most_seconds: Of clock time after which this part of the run ends with a checkpoint, as by Ctrl-C; of one
+            process.
 
     Returns:
         The last state; of several seeds stacked, see `stack_seeds`.
 
     Raises:
         CheckpointError: `out` holds another run, or none to resume; or `initial` does not fit `config.model`.
-        ConfigError: Several seeds would be spread over devices.
+        ConfigError: Several seeds would be spread over devices, or several processes would end by their clocks.
         NonFiniteError: Too many updates in a row had to be skipped; the last good checkpoint is kept.
         CapacityError: Self-contact needed more room than its buffers have.
     """
     mesh = make_mesh(config)
     if config.seeds > 1 and mesh is not None:
         raise ConfigError(f"seeds = {config.seeds} share one device; take batch_size = 1, or seeds = 1")
+    if most_seconds < math.inf and jax.process_count() > 1:
+        raise ConfigError("processes have clocks of their own; leave out --minutes, and end them by SIGTERM")
     _check_run(config, out, resume)
     if initial is not None:
         config.model.check(initial)
@@ -132,7 +138,7 @@ def train(
                 _check_skipped(state, config, checkpoints, out, earlier)
             if done % config.checkpoint_every == 0 or done == config.steps:
                 checkpoints.save(state)
-            is_stopping = stop.is_wanted
+            is_stopping = stop.is_wanted or time.perf_counter() - began > most_seconds
             if jax.process_count() > 1:  # several stop after the same step, as jax.distributed agrees on
                 is_stopping = multihost_utils.reached_preemption_sync_point(done)
             if is_stopping:

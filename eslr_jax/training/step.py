@@ -117,11 +117,11 @@ def replicate(tree: Any, mesh: Mesh | None) -> Any:
 
 
 class _Sample(NamedTuple):
-    """What one trajectory's frame contributes."""
+    """What one trajectory's frames contribute."""
 
     slot: Slot
     metrics: dict[str, Array]
-    statistics: dict[str, Normalizer]
+    statistics: dict[str, Normalizer]  # of every frame
 
 
 def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = None) -> Callable:
@@ -142,7 +142,9 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         indices = (turn * size + jnp.arange(size)) % count
         key, start_key = jax.random.split(jax.random.wrap_key_data(state.key))
         slots = jax.tree.map(lambda leaf: leaf[indices], pool)
-        batch = _Entry(indices, jax.random.split(start_key, size), slots)
+        windows = config.frames // config.through_time
+        keys = jax.random.split(start_key, size * windows).reshape(size, windows)
+        batch = _Entry(indices, keys, slots)
         run = partial(_batch_gradient, config=config)
         if mesh is not None:
             run = jax.shard_map(
@@ -161,9 +163,12 @@ def make_train_step(config: TrainConfig, resolution: int, mesh: Mesh | None = No
         gradient = jax.tree.map(lambda g: jnp.where(is_good, g, 0.0), gradient)
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer, network.params)
         trained = optax.apply_updates(network.params, updates)
+        graphs = jax.tree.map(
+            lambda leaf: leaf.reshape(size * config.frames, *leaf.shape[2:]), samples.statistics
+        )
         seen = network
-        for sample in range(size if samples.statistics else 0):
-            seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[sample], samples.statistics))  # noqa: B023
+        for graph in range(size * config.frames if graphs else 0):
+            seen = merge_statistics(seen, jax.tree.map(lambda leaf: leaf[graph], graphs))  # noqa: B023
         network = network.replace(
             params=_choose(is_learning, trained, network.params),
             statistics=_choose(is_good, seen.statistics, network.statistics),
@@ -195,7 +200,7 @@ class _Entry(NamedTuple):
     """One trajectory of a batch."""
 
     index: Int[Array, ""]  # in the pool
-    key: Array  # of the random numbers with which it starts anew
+    key: Array  # of the random numbers with which it starts anew, one for every window of frames
     slot: Slot
 
 
@@ -208,17 +213,18 @@ def _batch_gradient(
     config: TrainConfig,
     axis: str | None = None,
 ) -> tuple[Any, _Sample]:
-    """Return the mean gradient over a batch, or over all devices' parts of it, and every sample's share.
+    """Return the mean gradient over a batch, or over all devices' parts of it, and every sample's share."""
+    run = partial(_sample_gradient, network, data, step, config=config)
+    if config.vmap_size == 1:
 
-    The samples go one after the other: on a device of its own, one garment fills the machine.
-    """
+        def add(total, entry):
+            gradient, sample = run(entry)
+            return jax.tree.map(jnp.add, total, gradient), sample
 
-    def add(total, entry):
-        gradient, sample = _sample_gradient(network, data, step, entry, config=config)
-        return jax.tree.map(jnp.add, total, gradient), sample
-
-    zeros = jax.tree.map(jnp.zeros_like, network.params)
-    total, samples = jax.lax.scan(add, zeros, batch)
+        total, samples = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, network.params), batch)
+    else:
+        gradients, samples = jax.lax.map(run, batch, batch_size=config.vmap_size)
+        total = jax.tree.map(partial(jnp.sum, axis=0), gradients)
     if axis is not None:
         total = jax.lax.psum(total, axis)
     return jax.tree.map(lambda leaf: leaf / config.batch_size, total), samples
@@ -227,38 +233,81 @@ def _batch_gradient(
 def _sample_gradient(
     network: Network, data: TrainingData, step: Int[Array, ""], entry: _Entry, *, config: TrainConfig
 ) -> tuple[Any, _Sample]:
-    """Return one trajectory's gradient, and move it on by a frame.
+    """Return one trajectory's gradient, the mean over its next frames, and move it on by these.
 
-    Where loss or gradient is not finite it stays as it was, to be looked at, until it starts anew.
+    A scan over windows of frames: a gradient goes back to its window's start. Where loss or gradient is not
+    finite, the trajectory stays as it was, to be looked at, until it starts anew.
     """
     index = entry.index % data.num_garments
-    slot = _living_slot(entry, data, index, config)
-    problem = slot_problem(slot, data, index, config)
-    progress = curriculum(config, step)
+    num_windows = config.frames // config.through_time
+    progress = curriculum(config, step * config.frames)
+
+    def window(carry: tuple[Any, Slot], key: Array):
+        total, slot = carry
+        start = _living_slot(entry._replace(key=key, slot=slot), data, index, config)
+
+        def loss_of(trained):
+            slot, frames = start, []
+            for _ in range(
+                config.through_time
+            ):  # unrolled: a gradient through a scan of one frame costs more
+                trial = network.replace(params=trained)
+                slot, *frame = _frame(trial, data, index, progress, slot, start, config)
+                frames.append(frame)
+            losses, metrics, statistics = jax.tree.map(lambda *rows: jnp.stack(rows), *frames)
+            return jnp.mean(losses), (slot, metrics, statistics)
+
+        (loss, (moved, metrics, statistics)), gradient = jax.value_and_grad(loss_of, has_aux=True)(
+            network.params
+        )
+        is_good = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
+        slot = _choose(is_good, moved, start.replace(is_done=jnp.ones((), bool)))
+        metrics["resets"] = jnp.where(is_good, metrics["resets"], 1.0)
+        return (jax.tree.map(jnp.add, total, gradient), slot), (metrics, statistics)
+
+    zeros = jax.tree.map(jnp.zeros_like, network.params)
+    keys = entry.key.reshape(num_windows)
+    (total, slot), (metrics, statistics) = jax.lax.scan(window, (zeros, entry.slot), keys)
+    gradient = jax.tree.map(lambda leaf: leaf / num_windows, total)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(config.frames, *leaf.shape[2:]), statistics)
+    return gradient, _Sample(slot, jax.tree.map(jnp.mean, metrics), flat)
+
+
+def _frame(
+    network: Network,
+    data: TrainingData,
+    index: Int[Array, ""],
+    progress: Progress,
+    slot: Slot,
+    start: Slot,
+    config: TrainConfig,
+) -> tuple[Slot, Float[Array, ""], dict[str, Array], dict[str, Normalizer]]:
+    """Return a trajectory moved on by a frame, the frame's loss, what it shows, and statistics of its graph.
+
+    Where the trajectory is done within its window, it waits: the frame is that of the window's start, and its
+    loss is zero.
+    """
+    is_live = ~slot.is_done
+    here = _choose(is_live, slot, start)
+    problem = slot_problem(here, data, index, config)
     terms_of = potential_terms
     if config.energy_set == "hood":
-        terms_of = _hood_terms(slot, data, progress.num_samples, config.criterion)
-
-    def loss_of(trained):
-        return physics_loss(network.replace(params=trained), problem, slot.state, config, terms_of)
-
-    (loss, report), gradient = jax.value_and_grad(loss_of, has_aux=True)(network.params)
+        terms_of = _hood_terms(here, data, progress.num_samples, config.criterion)
+    loss, report = physics_loss(network, problem, here.state, config, terms_of)
     statistics = {}
     if network.statistics:
-        inputs = graph_inputs(problem, slot.state)
+        inputs = graph_inputs(problem, here.state, network.config.graph)
         graph = build_graph(problem.garment, problem.material, inputs, network.config.graph)
-        acceleration = _skinned_acceleration(slot, data, index)
+        acceleration = _skinned_acceleration(here, data, index)
         statistics = measure_statistics(network, graph, problem.garment, acceleration)
-    moved, is_astray = _advance(slot, problem, report, data, config, progress.horizon)
-    is_good = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
-    slot = _choose(is_good, moved, slot.replace(is_done=jnp.ones((), bool)))
+    moved, is_astray = _advance(here, problem, report, data, config, progress.horizon)
     metrics = {
         "loss": loss,
         "inertial_energy": report.inertial_energy,
-        "resets": (is_astray | ~is_good).astype(jnp.float32),
+        "resets": (is_astray & is_live).astype(jnp.float32),
         **report.energies,
     }
-    return gradient, _Sample(slot, metrics, statistics)
+    return _choose(is_live, moved, slot), jnp.where(is_live, loss, 0.0), metrics, statistics
 
 
 def _living_slot(entry: _Entry, data: TrainingData, index: Int[Array, ""], config: TrainConfig) -> Slot:
@@ -303,7 +352,7 @@ def slot_problem(slot: Slot, data: TrainingData, index: Int[Array, ""], config: 
         terms=scene_terms(Collision(stiffness=config.collision_stiffness), without=(Ground, Contact)),
     )
     inputs = FrameInput(body, data.skinned(index, later, slot.shape))
-    return jax.lax.stop_gradient(frame_problem(scene, slot.state, inputs))
+    return frame_problem(scene, slot.state, inputs)
 
 
 def _hood_terms(
@@ -343,7 +392,7 @@ class Progress(NamedTuple):
 
 
 def curriculum(config: TrainConfig, step: Int[Array, ""] | int) -> Progress:
-    """Return how far a run is after some optimiser steps; a batch counts as one trajectory.
+    """Return how far a run is after some optimiser steps of one frame each; a batch counts as one trajectory.
 
     The horizon grows by a frame after every `horizon_growth` steps, or with the schedule "hood" after as many
     trajectories, as HOOD's does: there n frames take n times as many steps.

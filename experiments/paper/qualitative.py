@@ -20,10 +20,9 @@ from jaxtyping import Array, Float
 from eslr_jax.pipeline.assets import load_body, load_splits
 from eslr_jax.pipeline.pictures import color_scale, render_frame, side_by_side, write_png
 from eslr_jax.pipeline.report.report import environment
-from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.stretch import stretch_energy
 from eslr_jax.types import Scene
-from paper.rollouts import OPTIMUM, RESULTS, read_system, scenes_of
+from paper.rollouts import OPTIMUM, RESULTS, read_system, roll
 from paper.worn import Setting, Worn, check_optimum, not_finite
 
 GARMENTS = ("tshirt", "dress")
@@ -95,8 +94,7 @@ def main() -> None:
     broken = dict.fromkeys(models, 0.0)
     for name in models:
         system = read_system(name)
-        for worn, network in scenes_of(system, setting):
-            trajectory = rollout_scene(network, worn.scene, system.config)
+        for worn, _, trajectory in roll(system, setting):
             if name == OPTIMUM:
                 check_optimum(trajectory, worn.garment)
             broken[name] += not_finite(trajectory) / len(garments)

@@ -22,6 +22,7 @@ from eslr_jax.pipeline.report.evaluate import distance_mm
 from eslr_jax.pipeline.report.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pose.lbs import skin_garment
+from eslr_jax.simulation.batch import simulate_scenes
 from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms.hood import HoodParameters
 from eslr_jax.types import Scene, Trajectory
@@ -149,6 +150,19 @@ def scenes_of(system: System, setting: Setting) -> Iterator[tuple[Worn, Network 
         yield worn, network
 
 
+def roll(system: System, setting: Setting) -> list[tuple[Worn, Network | None, Trajectory]]:
+    """Return every garment on every clip with the system's network and its free rollout.
+
+    A network for all scenes goes through them together, see `simulate_scenes`.
+    """
+    worn = list(scenes_of(system, setting))
+    if system.network_on is None:
+        found = simulate_scenes(system.network, [one.scene for one, _ in worn], config=system.config)
+    else:
+        found = [rollout_scene(network, one.scene, system.config) for one, network in worn]
+    return [(*pair, trajectory) for pair, trajectory in zip(worn, found, strict=True)]
+
+
 def find_references(setting: Setting) -> list[Reference]:
     """Return the near-optimal rollout of every scene, and the optima from its states.
 
@@ -157,8 +171,7 @@ def find_references(setting: Setting) -> list[Reference]:
     """
     system = read_system(OPTIMUM)
     found = []
-    for worn, network in scenes_of(system, setting):
-        trajectory = rollout_scene(network, worn.scene, system.config)
+    for worn, _, trajectory in roll(system, setting):
         check_optimum(trajectory, worn.garment)
         gap = trajectory_gap(trajectory, worn.scene, every=_gap_every(setting))
         found.append(Reference(trajectory, gap))
@@ -179,9 +192,8 @@ def measure_system(
     system, every = read_system(name), _gap_every(setting)
     measured: dict[str, list[dict[str, float]]] = {}
     gaps: dict[str, list[np.ndarray]] = {}
-    for (worn, network), (reference, gap) in zip(scenes_of(system, setting), references, strict=True):
+    for (worn, network, trajectory), (reference, gap) in zip(roll(system, setting), references, strict=True):
         garment, scene, _ = worn
-        trajectory = rollout_scene(network, scene, system.config)
         row = measure(trajectory, scene, worn.root_height())
         row["distance_mm"] = distance_mm(trajectory, reference, scene)
         row["not_finite"] = not_finite(trajectory)

@@ -9,6 +9,7 @@ from eslr_jax.contact.nearest import (
     CONTACT_RADIUS,
     find_both_sides,
     find_contacts,
+    find_near_vertices,
     nearest_point,
 )
 from eslr_jax.mesh.closest import closest_points
@@ -60,6 +61,23 @@ def test_contact_point_moves_with_the_body(sphere):
     contacts = find(query, vertices, vertices + offset, surface)
     np.testing.assert_allclose(contacts.next_points - contacts.points, offset, atol=1e-6)
     np.testing.assert_allclose(contacts.next_normals, contacts.normals, atol=1e-6)
+
+
+def test_near_vertices_are_the_nearest_ones(sphere):
+    _, vertices, surface = sphere
+    generator = np.random.default_rng(0)
+    direction = generator.standard_normal((200, 3))
+    radius = generator.uniform(0.2, 0.3, (200, 1))
+    query = jnp.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius, jnp.float32)
+    offset = jnp.array([[0.1, -0.05, 0.02]])
+    found = jax.jit(find_near_vertices, static_argnums=4)(query, vertices, vertices + offset, surface, 3)
+    away = np.linalg.norm(np.asarray(query)[:, None] - np.asarray(vertices)[None], axis=2)
+    expected = np.sort(away, axis=1)[:, :3].T.ravel()
+    np.testing.assert_allclose(np.abs(found.distances), expected, rtol=1e-3)
+    side = np.sum((np.tile(query, (3, 1)) - found.points) * found.normals, axis=1)
+    np.testing.assert_array_equal(found.distances > 0, side > 0)
+    assert all((np.asarray(vertices) == point).all(axis=1).any() for point in np.asarray(found.points))
+    np.testing.assert_allclose(found.next_points - found.points, np.tile(offset, (600, 1)), atol=1e-6)
 
 
 def test_cloth_between_two_limbs_sees_both():

@@ -164,9 +164,9 @@ def broken_rollouts(monkeypatch):
             return iter((self.garment, self.scene, None))
 
     rows = [(Row(**vars(worn)), None) for _ in states]
-    found = iter(SimpleNamespace(status=int(bits), first_bad_frame=3, demands={}) for bits in states)
+    found = [SimpleNamespace(status=int(bits), first_bad_frame=3, demands={}) for bits in states]
     monkeypatch.setattr(rollouts, "scenes_of", lambda *_: rows)
-    monkeypatch.setattr(rollouts, "rollout_scene", lambda *_: next(found))
+    monkeypatch.setattr(rollouts, "simulate_scenes", lambda *_, **__: found)
     monkeypatch.setattr(rollouts, "trajectory_gap", lambda *_, **__: gap)
     monkeypatch.setattr(rollouts, "stepped_potentials", lambda *_: np.ones(2))
     monkeypatch.setattr(rollouts, "distance_mm", lambda *_: 0.0)
@@ -197,6 +197,20 @@ def test_the_papers_script_stops_where_a_training_was_stopped(tmp_path):
     ended = subprocess.run(["bash", script, "small", tmp_path / "out"], env=path, check=False)
     assert ended.returncode == 1
     assert (tmp_path / "calls").read_text().split() == ["eslr"]
+
+
+def test_the_papers_form_is_trained_by_equal_recipes_and_in_pieces(tmp_path):
+    program = tmp_path / "eslr"
+    program.write_text(f'#!/bin/sh\necho "$@" >> "{tmp_path}/calls"\nmkdir -p "$5/checkpoints/1"\n')
+    program.chmod(0o755)
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "MINUTES": "120"}
+    script = Path(rollouts.__file__).with_name("reproduce.sh")
+    for _ in range(2):
+        subprocess.run(["bash", script, "acceleration", tmp_path / "out"], env=path, check=False)
+    first, second = (tmp_path / "calls").read_text().splitlines()
+    assert "1k-acceleration.toml" in first
+    assert first.endswith("--set=model.base=eslr-5 --set=seed=0 --minutes 120")
+    assert second == f"train --out {tmp_path}/out/eslr-5-s0 --resume --minutes 120"
 
 
 def test_the_papers_script_trains_every_network_twice_and_tabulates_the_second(tmp_path):

@@ -14,6 +14,7 @@ from eslr_jax.networks.features import mean_edge_length
 
 HOOD = GraphKind(reads_gradient=False, has_reverse_edges=True)
 GRADIENT = GraphKind(reads_gradient=True)
+STATE = GraphKind(reads_gradient=False, reads_state=True, has_reverse_edges=True)
 
 
 BOTH = [pytest.param(HOOD, id="hood", marks=pytest.mark.slow), pytest.param(GRADIENT, id="gradient")]
@@ -32,6 +33,11 @@ def scene():
 @pytest.fixture(scope="module")
 def hood_graph(scene):
     return build(HOOD, scene)
+
+
+@pytest.fixture(scope="module")
+def state_graph(scene):
+    return build(STATE, scene)
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +107,39 @@ def test_hood_world_features_and_the_rows_beyond_the_radius(scene, hood_graph):
     np.testing.assert_allclose(hood_graph.nodes["body"], body, atol=1e-6)
 
 
+def test_the_state_stands_beside_hoods_features(scene, hood_graph, state_graph):
+    garment, _, inputs = (to_float64(tree) for tree in scene)
+    contacts = inputs.contacts
+    np.testing.assert_array_equal(state_graph.nodes["garment"], hood_graph.nodes["garment"])
+    np.testing.assert_array_equal(state_graph.edges["mesh"][:, 5:], hood_graph.edges["mesh"])
+    rows = []
+    for sender, receiver in zip(garment.senders, garment.receivers, strict=True):
+        length = np.linalg.norm(garment.rest_positions[sender] - garment.rest_positions[receiver])
+        now = inputs.position[sender] - inputs.position[receiver]
+        moving = inputs.velocity[sender] - inputs.velocity[receiver]
+        strains = [np.clip((np.linalg.norm(x) / length - 1) / 0.1, -5, 5) for x in (now, now + moving)]
+        rows.append([*moving, *strains])
+    np.testing.assert_allclose(state_graph.edges["mesh"][:, :5], rows, atol=1e-4)
+    ahead = np.sum((inputs.position + inputs.velocity - contacts.next_points) * contacts.next_normals, axis=1)
+    expected = np.clip(np.stack([contacts.distances, ahead], axis=1) / 0.01, -5, 5)
+    expected[contacts.distances > 0.03] = 0
+    for name in ("world", "world_reverse"):
+        np.testing.assert_array_equal(state_graph.edges[name][:, :-2], hood_graph.edges[name])
+        np.testing.assert_allclose(state_graph.edges[name][:, -2:], expected, atol=1e-4)
+
+
+def test_with_the_state_a_vertex_deep_in_the_body_keeps_its_first_world_edge(scene):
+    garment, material, inputs = scene
+    deep = inputs.contacts.replace(distances=jnp.full_like(inputs.contacts.distances, -0.2))
+    twice = jax.tree.map(lambda rows: jnp.concatenate([rows, rows]), deep)
+    inputs = inputs.replace(contacts=twice, body_velocity=jnp.tile(inputs.body_velocity, (2, 1)))
+    graph = build(STATE._replace(world_edges=2), (garment, material, inputs))
+    first, second = np.asarray(graph.globals["world_mask"]).reshape(2, -1)
+    assert first.all()
+    assert not second.any()
+    np.testing.assert_array_equal(graph.receivers["world"][len(first) :], np.arange(len(first)))
+
+
 def test_gradient_node_features(scene, gradient_graph):
     garment, _, inputs = (to_float64(tree) for tree in scene)
     rest = garment.rest_positions
@@ -154,7 +193,7 @@ def test_gradient_world_features(scene, gradient_graph):
     np.testing.assert_allclose(gradient_graph.edges["world"], expected, atol=2e-4)
 
 
-@pytest.mark.parametrize("config", [HOOD, GRADIENT], ids=["hood", "gradient"])
+@pytest.mark.parametrize("config", [HOOD, STATE, GRADIENT], ids=["hood", "state", "gradient"])
 def test_feature_sizes_are_those_of_the_graph(config, scene):
     graph = jax.eval_shape(lambda *scene: build_graph(*scene, config), *scene)
     sizes = {name: rows.shape[1] for name, rows in {**graph.nodes, **graph.edges}.items()}

@@ -25,7 +25,7 @@ from eslr_jax import (
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.rest_shape import with_rest_positions
-from eslr_jax.simulation.batch import _group_alike, rollout_scenes, stack_scenes
+from eslr_jax.simulation.batch import _group_alike, rollout_scenes, simulate_scenes, stack_scenes
 from eslr_jax.simulation.plan import shared_surface
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.terms import CLOTH, Damping, Ground
@@ -65,6 +65,22 @@ def test_a_batch_equals_one_by_one_with_its_own_vertices(batch, garments, poses)
     np.testing.assert_allclose(batch[padded].positions, alone.positions, atol=1e-5)
     # Loads are 3 k a d^2 [N]: two micrometres, by which two programs differ, are a hundredth of them.
     np.testing.assert_allclose(batch[padded].friction_loads, alone.friction_loads, atol=1e-3)
+
+
+def test_scenes_of_any_shape_come_back_in_order(garments, poses):
+    """Those of one shape go together; and one by one, bit by bit, where they don't share a step."""
+    heavy = COTTON.replace(density=np.float32(0.4))
+    given = ((3, COTTON), (2, COTTON), (3, heavy))
+    motions = {count: drifting_ball(count) for count, _ in given}
+    scenes = [
+        prepare_scene(garments[0], motions[count], material=fabric, terms=CLOTH) for count, fabric in given
+    ]
+    found = simulate_scenes(None, scenes, config=QUICK, batch_size=1)
+    assert [one.num_frames for one in found] == [3, 2, 3]
+    for place in (0, 2):
+        alone = rollout_scene(None, scenes[place], QUICK)
+        np.testing.assert_array_equal(found[place].positions, alone.positions)
+    assert not np.array_equal(found[0].positions, found[2].positions)
 
 
 def test_bundled_garments_form_a_group(poses):

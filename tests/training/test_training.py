@@ -78,8 +78,9 @@ def test_weights_move_as_far_as_adam_takes_them(finished, config):
 
 
 @pytest.mark.slow
-def test_interrupted_at_ten_points_it_ends_bit_by_bit_as_the_whole(config, small_data, tmp_path):
-    config = dataclasses.replace(config, steps=12, log_every=1, checkpoint_every=4)
+@pytest.mark.parametrize("frames", [1, 3])
+def test_interrupted_at_ten_points_it_ends_bit_by_bit_as_the_whole(frames, config, small_data, tmp_path):
+    config = dataclasses.replace(config, steps=12, log_every=1, checkpoint_every=4, frames=frames)
     whole = train(config, tmp_path / "whole", datasets=(small_data,))
     points = []
 
@@ -95,6 +96,13 @@ def test_interrupted_at_ten_points_it_ends_bit_by_bit_as_the_whole(config, small
     assert points == list(range(1, 11))
     resumed = train(config, tmp_path / "part", datasets=(small_data,), resume=True)
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
+
+
+def test_a_part_of_a_run_ends_by_the_clock(config, small_data, tmp_path):
+    part = train(config, tmp_path, datasets=(small_data,), most_seconds=0.0)
+    assert int(part.step) == 1
+    assert Checkpoints(tmp_path).restore(part).step == 1
+    assert not (tmp_path / "model.npz").exists()
 
 
 def test_a_folder_in_use_is_not_overwritten(finished, config):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,8 @@ class Train:
     keys: bool = False
     # Go on from the newest checkpoint of the folder; --set steps=N extends a run to N steps.
     resume: bool = False
+    # End after this many minutes with a checkpoint, from which --resume goes on.
+    minutes: float | None = None
     # Name of a bundled network or an exported file whose weights to start from.
     start_from: str | None = None
     # Write event files for TensorBoard too.
@@ -87,6 +90,7 @@ class Train:
                 initial=initial,
                 earlier=earlier,
                 on_progress=show,
+                most_seconds=math.inf if self.minutes is None else 60 * self.minutes,
             )
         if not is_first_process():
             return

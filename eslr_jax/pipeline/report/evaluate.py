@@ -20,10 +20,11 @@ from eslr_jax.pipeline.report.gap import ITERATIONS, GapOptions, OptimalityGap, 
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pipeline.report.report import mean_energies
 from eslr_jax.pose.motion import back_and_forth, pose_body, still_motion
+from eslr_jax.simulation.batch import simulate_scenes
 from eslr_jax.simulation.plan import prepare_scene, shared_surface
-from eslr_jax.simulation.simulate import good_frames, hold_last, simulate
+from eslr_jax.simulation.simulate import good_frames, hold_last, raise_for_status
 from eslr_jax.terms import FAST
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Garment, Scene, Trajectory
 
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
@@ -39,7 +40,7 @@ def evaluate(
     iterations: int = 0,
     on_scene: Callable[[int, int, str], None] = lambda done, total, label: None,
 ) -> dict[str, Any]:
-    """Evaluate a network.
+    """Evaluate a network; a garment's rollouts on all clips go together, see `simulate_scenes`.
 
     `iterations` are those of the solver behind the network. `on_scene` is called after each garment and clip
     with the count, the total and a label.
@@ -67,27 +68,28 @@ def evaluate(
         network = control_network(options.control, network)
         cloths = [control_garment(options.control, cloth) for cloth in cloths]
     surface = shared_surface(cloths, body)
+    motions = [load_motion(clip) for clip in clips]
+
+    def scenes_of(cloth: Garment, num_frames: int) -> list[Scene]:
+        tracks = [back_and_forth(motion, num_frames) for motion in motions]
+        poses = [pose_body(body, track, num_frames=num_frames) for track in tracks]
+        return [prepare_scene(cloth, one, surface=surface, terms=FAST) for one in poses]
+
     for garment, cloth in zip(garments, cloths, strict=True):
-        for clip in clips:
-            motion = load_motion(clip)
-
-            def scene_of(num_frames: int, motion=motion, cloth=cloth):
-                poses = pose_body(body, back_and_forth(motion, num_frames), num_frames=num_frames)
-                return prepare_scene(cloth, poses, surface=surface, terms=FAST)
-
-            if options.gap_frames:
-                scene = scene_of(options.gap_frames)
-                compared = GapOptions(every=options.every, refined=(config.iterations,))
-                truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
-                # From the optimum's states, and from those of the network's own rollout.
-                for stepper, steps, gaps in ((None, truth, forced), (network, config, policy)):
-                    trajectory = _roll(stepper, scene, steps)
+        if options.gap_frames:
+            worn = scenes_of(cloth, options.gap_frames)
+            compared = GapOptions(every=options.every, refined=(config.iterations,))
+            truth = SimConfig(iterations=_TRUTH_ITERATIONS, tolerance=0.0)
+            # From the optimum's states, and from those of the network's own rollout.
+            for stepper, steps, gaps in ((None, truth, forced), (network, config, policy)):
+                for scene, trajectory in zip(worn, _roll(stepper, worn, steps), strict=True):
                     gaps.append(jax.device_get(measure_gap(network, trajectory, scene, compared)))
-            scene = scene_of(options.rollout_frames)
-            free = _roll(network, scene, config)
-            optimum = _roll(None, scene, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
-            apart = distance_mm(free, optimum, scene)
-            row = {"garment": garment, "clip": clip, **measure_rollout(free, scene), "distance_mm": apart}
+        worn = scenes_of(cloth, options.rollout_frames)
+        free = _roll(network, worn, config)
+        optima = _roll(None, worn, SimConfig(iterations=_REFERENCE_ITERATIONS, tolerance=0.0))
+        for clip, scene, one, optimum in zip(clips, worn, free, optima, strict=True):
+            apart = distance_mm(one, optimum, scene)
+            row = {"garment": garment, "clip": clip, **measure_rollout(one, scene), "distance_mm": apart}
             scenes.append(row | {"optimum": measure_rollout(optimum, scene)})
             on_scene(len(scenes), total, f"{garment} {clip}")
         still = still_motion(body, _STILL_FRAMES, arm_angle=_STILL_ARM_ANGLE)
@@ -106,10 +108,13 @@ def evaluate(
     }
 
 
-def _roll(network: Network | None, scene: Scene, config: SimConfig) -> Trajectory:
-    """Simulate all frames of a scene; a network's rollout that goes wrong stands still from there on."""
-    simulation = simulate(network, scene, config=config, raises=network is None)
-    return hold_last(simulation.trajectory, scene.num_frames)
+def _roll(network: Network | None, scenes: list[Scene], config: SimConfig) -> list[Trajectory]:
+    """Simulate all frames of scenes; a network's rollout that goes wrong stands still from there on."""
+    trajectories = simulate_scenes(network, scenes, config=config)
+    if network is None:
+        for trajectory in trajectories:
+            raise_for_status(trajectory)
+    return [hold_last(one, scene.num_frames) for one, scene in zip(trajectories, scenes, strict=True)]
 
 
 def _summarize(measured: list[OptimalityGap]) -> dict[str, Any]:
@@ -158,7 +163,7 @@ def _drift(network: Network, scene: Scene, config: SimConfig) -> float | None:
 
     None where the rollout went wrong: it stands still from there on.
     """
-    trajectory = _roll(network, scene, config)
+    (trajectory,) = _roll(network, [scene], config)
     if Status(int(trajectory.status)) != Status.OK:
         return None
     areas = np.asarray(scene.garment.vertex_areas)
