@@ -59,7 +59,7 @@ DRAPES = {
     "denim-woven": 0.6,
     "crepe-woven": 0.72,
     "suiting-woven": 0.81,
-    "silk-woven": 0.28,
+    "silk-woven": 0.27,
     "cotton-woven": 0.71,
     "wool-woven": 0.63,
     "raw-denim-woven": 0.82,

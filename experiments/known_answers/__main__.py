@@ -61,9 +61,9 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     if drapes:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
     if rotations := result.get("rotations"):
-        figure, axes = plt.subplots(figsize=(7, 12), layout="constrained")
-        _draw_errors(axes, [_worst(rotations, case) for case in dict.fromkeys(map(_case, rotations))], 4)
-        axes.set_title("large rotations: the worst of all loads")
+        figure, axes = plt.subplots(figsize=(10, 9), layout="constrained")
+        _draw_errors(axes, [_worst(rotations, case) for case in dict.fromkeys(map(_case, rotations))], 5)
+        axes.set_title("large rotations, the worst of all loads")
         figure.savefig(path.with_name("known_rotations.png"), dpi=100)
         plt.close(figure)
     figure, (left, others, right) = plt.subplots(1, 3, figsize=(18, 10), layout="constrained")
