@@ -20,7 +20,6 @@ import jax
 import numpy as np
 from flax import struct
 from harness import EXPERIMENTS, RESULTS, parser
-from known_answers.drape import hang
 from other_bodies import child
 from PIL import Image, ImageDraw
 
@@ -29,12 +28,13 @@ from eslr_jax.fabric.materials import WOVEN, fabric_names
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
 from eslr_jax.pipeline.assets.garments import MEAN_SHAPE
+from eslr_jax.pipeline.drape import hang
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.outfit import wear_together
 from eslr_jax.pipeline.dressing.panels import join_panels
 from eslr_jax.pipeline.dressing.sewing import pattern_posture
-from eslr_jax.pipeline.fabrics import garment_material
+from eslr_jax.pipeline.fabrics import describe_fabric, garment_material
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import read_garment_source
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequences
@@ -204,9 +204,9 @@ def fabrics(frames: int) -> np.ndarray:
     size = {"spacing": 0.03, "frames": frames} if frames == _SMOKE_FRAMES else {}
     pictures = []
     for name in names:
-        end, _, faces, _ = hang(name, **size)
-        picture = render_frames(None, None, end[None], faces, camera=_CAMERA, size=(190, 110), zoom=1.1)
-        pictures.append(next(picture))
+        hung = hang(describe_fabric(name), **size)
+        shown = {"camera": _CAMERA, "size": (190, 110), "zoom": 1.1}
+        pictures.append(next(render_frames(None, None, hung.positions[None], hung.faces, **shown)))
     return side_by_side(pictures, names, columns=4)
 
 

@@ -15,7 +15,7 @@ CORE = [
     "solver", "networks", "simulation", "training",
 ]  # fmt: skip
 PIPELINE = [
-    "extras", "formats", "rigs", "dressing", "fabrics", "assets", "pictures", "report", "page", "cli",
+    "extras", "formats", "rigs", "dressing", "fabrics", "drape", "assets", "pictures", "report", "page", "cli",
 ]  # fmt: skip
 ROOMS = [*CORE, *(f"pipeline.{room}" for room in PIPELINE)]
 KERNELS = {

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.terms.bending import RIGIDITY_PER_STIFFNESS
+from eslr_jax.terms.gravity import Gravity
 from eslr_jax.terms.stretch import stretch_stiffness
 from eslr_jax.types import Material
 
@@ -59,8 +60,7 @@ FABRICS: dict[str, Fabric] = {
         342.8,
         3e-6,
         "crepe de chine of 16 momme",
-        "estimate: 1 momme = 4.340 g/m^2; bending of 0.03 gf cm^2/cm, the order that the Kawabata system gives "
-        "for dress silk; stretch as the satin's",
+        "class: 1 momme = 4.340 g/m^2; a bending length of 1 cm; stretch as the satin's",
     ),
 }
 """Fabrics besides cotton. Measured sheets are anisotropic and stiffen: these are their values at small strain,
@@ -103,6 +103,25 @@ def _woven(name: str, stretch: tuple[float, float, float, float], bending: tuple
     return Woven(fabric.density, Weave(stiffness, (along, across)), fabric.what, fabric.source)
 
 
+def rigidity_of(bending_length: float, density: float) -> float:
+    """Return the flexural rigidity [N m] of a bending length c [m]: D = w c^3, with w the weight per area.
+
+    Args:
+        bending_length: Peirce's: half of the overhang whose end lies 41.5 degrees below its edge.
+        density: [kg/m^2].
+
+    Source: Peirce 1930, doi 10.1080/19447023008661529.
+    """
+    return density * Gravity.acceleration * bending_length**3
+
+
+def _class(density: float, bending_length: float, stretch: float, shear: float, what: str) -> Woven:
+    """Return a fabric that is like its class, alike along warp and weft; see `rigidity_of`."""
+    rigidity = rigidity_of(bending_length, density)
+    weave = Weave((stretch, stretch, 0.0, shear), (rigidity, rigidity))
+    return Woven(density, weave, what, "class: no measurement has all its numbers")
+
+
 WOVEN: dict[str, Woven] = {
     "jersey-woven": _woven("jersey", (16.594, -14.696, 34.477, 36.860), (23.192e-6, 14.268e-6)),
     "rib-knit-woven": _woven("rib-knit", (42.871, -0.2346, 65.166, 83.176), (46.238e-6, 32.244e-6)),
@@ -114,8 +133,32 @@ WOVEN: dict[str, Woven] = {
     "denim-woven": _woven("denim", (205.35, 10.234, 1013.9, 53.387), (64.196e-6, 96.952e-6)),
     "crepe-woven": _woven("crepe", (2002.1, 0.3456, 2027.5, 19.189), (51.714e-6, 31.283e-6)),
     "suiting-woven": _woven("suiting", (2016.6, 9.1705, 2035.0, 104.76), (125.41e-6, 125.41e-6)),
+    "silk-woven": _class(0.0694, 0.0100, 300.0, 15.0, "crepe de chine of 16 momme"),
+    "cotton-woven": _class(0.120, 0.0200, 1000.0, 30.0, "plain shirting"),
+    "wool-woven": _class(0.200, 0.0185, 500.0, 30.0, "worsted suiting"),
+    "raw-denim-woven": _class(0.407, 0.0250, 2000.0, 80.0, "12 oz, not washed"),
+    "leather": _class(0.500, 0.0160, 3000.0, 1000.0, "sheep, 0.8 mm"),
 }
-"""Fabrics along their threads, at small strain."""
+"""Fabrics along their threads, at small strain. The last five are not measured: a class says what they are
+like, and their drape coefficients lie in the bands of their kinds."""
+
+
+def along_threads(fabric: Fabric | Woven) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+    """Return the stiffness [N/m] and the flexural rigidity [N m] of a fabric, as a `Weave` has them.
+
+    An isotropic sheet has the same along both threads. Its rigidity is that of equilateral triangles with HOOD's
+    bending stiffness.
+    """
+    if isinstance(fabric, Woven):
+        return fabric.weave.stiffness, fabric.weave.rigidity  # type: ignore[return-value]: named ones have both
+    stretch, rigidity = fabric.stretch_stiffness, RIGIDITY_PER_STIFFNESS * fabric.bending_stiffness
+    return (stretch, stretch, _POISSON * stretch, stretch / (2.0 * (1.0 + _POISSON))), (rigidity, rigidity)
+
+
+def bending_lengths(fabric: Fabric | Woven) -> tuple[float, float]:
+    """Return the bending length c along warp and weft [m]: (D / w)^(1/3), see `rigidity_of`."""
+    warp, weft = (rigidity / (fabric.density * Gravity.acceleration) for rigidity in along_threads(fabric)[1])
+    return warp ** (1 / 3), weft ** (1 / 3)
 
 
 def isotropic_nearest(weave: Weave, base: Material) -> Material:

@@ -1,11 +1,12 @@
 """Measure what is known of cloth in closed form, and what the error of a walk consists of.
 
-    python experiments/known_answers [--smoke] [--out DIR] [--part answers peers drape walk]
+    python experiments/known_answers [--smoke] [--out DIR] [--part answers rotations peers drape order walk]
 
 Answers: free fall, terminal velocity, energy of a swing, a hanging strip, rigidity of a cantilever and of a
-cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Peers: four
-of these by Newton's solvers (extra `peers`) and Blender's cloth (BLENDER_PYTHON, see peers.py), where they are
-installed. Drape: Cusick's coefficient of woven fabrics. Walk: millimetres by tolerance, timestep and mesh.
+cylinder, a twisted sheet, a buckled one, a slope, a ball; with both integrators where time matters. Rotations:
+strips that bend far, and a plane that turns. Peers: four answers by Newton's solvers (extra `peers`) and
+Blender's cloth (BLENDER_PYTHON, see peers.py), where they are installed. Drape: Cusick's coefficient of the named
+fabrics. Order: of the integrators, without folds. Walk: millimetres by tolerance, timestep and mesh.
 Writes known_answers.json, part by part, and with matplotlib (extra `plot`) known_answers.png and
 known_drapes.png.
 """
@@ -18,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-PARTS = ("answers", "peers", "drape", "walk")
-_DRAPED = ("satin-woven", "jersey-woven", "suiting-woven", "denim-woven", "brocade-woven", "crepe-woven")
+PARTS = ("answers", "rotations", "peers", "drape", "order", "walk")
 
 
 def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
@@ -28,22 +28,27 @@ def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
         from known_answers.cases import answer
 
         yield from ((one.as_dict(), None) for one in answer(is_smoke))
+    elif part == "rotations":
+        from known_answers.rotations import turned
+
+        yield from ((one.as_dict(), None) for one in turned(is_smoke))
     elif part == "peers":
         from known_answers.peers import compare
 
         yield from ((one.as_dict(), None) for one in compare(is_smoke))
+    elif part == "order":
+        from known_answers.order import orders
+
+        yield from ((row._asdict(), None) for row in orders(is_smoke))
     elif part == "walk":
         from known_answers.walk import refine
 
         for row in refine(is_smoke):
             yield row._asdict(), None
     else:
-        from known_answers.drape import drape
+        from known_answers.drape import drapes
 
-        size = {"spacing": 0.03, "frames": 6} if is_smoke else {}
-        for fabric in _DRAPED[:1] if is_smoke else _DRAPED:
-            one = drape(fabric, **size)
-            yield {key: value for key, value in one._asdict().items() if key != "outline"}, one
+        yield from ((row._asdict(), (row, hung)) for row, hung in drapes(is_smoke))
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
@@ -55,6 +60,12 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
 
     if drapes:
         _draw_drapes(drapes, path.with_name("known_drapes.png"))
+    if rotations := result.get("rotations"):
+        figure, axes = plt.subplots(figsize=(10, 9), layout="constrained")
+        _draw_errors(axes, [_worst(rotations, case) for case in dict.fromkeys(map(_case, rotations))], 5)
+        axes.set_title("large rotations, the worst of all loads")
+        figure.savefig(path.with_name("known_rotations.png"), dpi=100)
+        plt.close(figure)
     figure, (left, others, right) = plt.subplots(1, 3, figsize=(18, 10), layout="constrained")
     for axes, part, limit, title in ((left, "answers", 5, "ours"), (others, "peers", 60, "other simulators")):
         _draw_errors(axes, result.get(part, []), limit)
@@ -69,20 +80,38 @@ def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
     plt.close(figure)
 
 
+def _case(row: dict[str, Any]) -> tuple[str, str, str]:
+    """Return what a row of rotations is of, whatever its load: case, mesh and unit."""
+    return row["case"].partition(",")[0], row["setting"], row["unit"]
+
+
+def _worst(rows: list[dict[str, Any]], case: tuple[str, str, str]) -> dict[str, Any]:
+    """Return the row of a case that is farthest off."""
+    worst = max(
+        (row for row in rows if _case(row) == case), key=lambda row: abs(row["found"] / row["known"] - 1)
+    )
+    return {**worst, "case": f"{case[0]}, {case[2]}"}
+
+
 def _draw_drapes(drapes: list, path: Path) -> None:
-    """Draw the shadows of drapes with their coefficients."""
+    """Draw the shadows of drapes at their usual mesh, with their coefficients and bands."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
-    for place, one in enumerate(drapes):
-        rows, columns = one.outline.shape
-        x, y = (place % 3) * columns, -(place // 3) * 1.25 * rows
-        axes.imshow(~one.outline.T, extent=(x, x + columns, y, y + rows), cmap="gray")
-        label = f"{one.fabric} {100 * one.coefficient:.0f} %"
-        axes.text(x + columns / 2, y - 0.1 * rows, label, ha="center", size=9)
+    from eslr_jax.fabric.drapes import BANDS
+
+    figure, axes = plt.subplots(figsize=(12, 9), layout="constrained")
+    usual = [one for one in drapes if one[0].spacing == drapes[0][0].spacing]
+    for place, (row, hung) in enumerate(usual):
+        shadow = hung.shadow()
+        count = len(shadow)
+        x, y = (place % 6) * count, -(place // 6) * 1.35 * count
+        axes.imshow(~shadow.T, extent=(x, x + count, y, y + count), cmap="gray")
+        band = f" ({BANDS[row.fabric].low:g} to {BANDS[row.fabric].high:g})" if row.fabric in BANDS else ""
+        label = f"{row.fabric}\n{100 * row.median:.0f} %{band}"
+        axes.text(x + count / 2, y - 0.02 * count, label, ha="center", va="top", size=9)
     axes.autoscale()
     axes.set_axis_off()
-    axes.set_title("Cusick's drape: shadows and coefficients")
+    axes.set_title("Cusick's drape: shadows of one start, coefficients in the median, bands of their kind")
     figure.savefig(path, dpi=100)
     plt.close(figure)
 

@@ -13,10 +13,10 @@ import sys
 import warnings
 
 from eslr_jax.errors import ConfigError, EslrError
-from eslr_jax.pipeline.cli import assets, batch, foreign, measure, runs, simulate, train
+from eslr_jax.pipeline.cli import assets, batch, fabric, foreign, measure, runs, simulate, train
 from eslr_jax.pipeline.cli.console import EXIT_CODE, app, leave_at_once, say
 
-COMMANDS = (simulate, batch, foreign, runs, assets, train, measure)  # each has registered its own
+COMMANDS = (simulate, batch, foreign, runs, assets, fabric, train, measure)  # each has registered its own
 
 _BROKEN_PIPE = 128 + 13  # as a shell reports the signal SIGPIPE
 _REPEATABLE = {  # and the commands that collect its values

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -87,10 +88,19 @@ class Assets:
 
 def _fabrics() -> dict[str, dict[str, Any]]:
     """Return all fabrics by name, as values of JSON."""
-    from eslr_jax.fabric.materials import FABRICS, WOVEN, describe_cotton
+    from eslr_jax.fabric.drapes import BANDS, DRAPES
+    from eslr_jax.fabric.materials import FABRICS, WOVEN, bending_lengths, describe_cotton
 
     everything = {"cotton": describe_cotton(), **FABRICS, **WOVEN}
-    return {name: dataclasses.asdict(fabric) for name, fabric in everything.items()}
+    return {
+        name: {
+            **dataclasses.asdict(fabric),
+            "drape": DRAPES.get(name),
+            "drape_band": BANDS[name]._asdict() if name in BANDS else None,
+            "bending_lengths": bending_lengths(fabric),
+        }
+        for name, fabric in everything.items()
+    }
 
 
 def _export_body(path: Path, name: str) -> None:
@@ -113,28 +123,37 @@ def _export_body(path: Path, name: str) -> None:
 
 
 def _print_fabrics() -> None:
-    """Print the fabrics as tables: those of one stiffness, and those by threads."""
-    from eslr_jax.fabric.materials import FABRICS, WOVEN, describe_cotton
+    """Print the fabrics as one table."""
+    from eslr_jax.fabric.drapes import BANDS, DRAPES
+    from eslr_jax.fabric.materials import FABRICS, WOVEN, along_threads, bending_lengths, describe_cotton
 
-    table = Table("fabric", "kg/m2", "stretch N/m", "bending J", "what", "source", box=None)
-    for name, fabric in {"cotton": describe_cotton(), **FABRICS}.items():
+    columns = ("fabric", "g/m2", "drape %", "of its kind", "length cm", "E N/m", "B uN m", "G N/m")
+    table = Table(*columns, "what", "source", box=None)
+    for name, fabric in {"cotton": describe_cotton(), **FABRICS, **WOVEN}.items():
+        band, (stiffness, rigidity) = BANDS.get(name), along_threads(fabric)
         numbers = (
-            f"{fabric.density:.3f}",
-            f"{fabric.stretch_stiffness:.0f}",
-            f"{fabric.bending_stiffness:.1e}",
+            f"{1e3 * fabric.density:.0f}",
+            f"{100 * DRAPES[name]:.0f}",
+            f"{band.low:g} to {band.high:g}" if band else "",
+            _pair([100 * length for length in bending_lengths(fabric)], ".1f"),
+            _pair(stiffness[:2], ".0f"),
+            _pair([1e6 * number for number in rigidity], ".1f"),
+            f"{stiffness[3]:.0f}",
         )
         table.add_row(name, *numbers, fabric.what, fabric.source)
     Console().print(table, markup=False)
-    table = Table(
-        "by threads", "kg/m2", "warp N/m", "weft N/m", "shear N/m", "warp N m", "weft N m", "source", box=None
+    print(
+        "two numbers are along warp and weft; length is the bending length of a cantilever (Peirce); E, B and G "
+        "are stretch, bending and shear as the FAST system has them; drape coefficients are simulated"
     )
-    for name, woven in WOVEN.items():
-        warp, weft, _, shear = woven.weave.stiffness or (0.0,) * 4
-        numbers = [f"{woven.density:.3f}", *(f"{number:.0f}" for number in (warp, weft, shear))]
-        table.add_row(
-            name, *numbers, *(f"{number:.1e}" for number in woven.weave.rigidity or ()), woven.source
-        )
-    Console().print(table, markup=False)
+    for source in sorted({band.source for band in BANDS.values()}):
+        print(f"of its kind: {source}")
+
+
+def _pair(values: Sequence[float], form: str) -> str:
+    """Return two numbers, or one where they are the same."""
+    first, second = (format(value, form) for value in values)
+    return first if first == second else f"{first}, {second}"
 
 
 @app.command(name="info")
