@@ -22,13 +22,14 @@ from flax import struct
 from harness import EXPERIMENTS, RESULTS, parser
 from other_bodies import child
 from PIL import Image, ImageDraw
+from scipy.spatial import Delaunay
 
 from eslr_jax import SimConfig, load_body, load_motion, pose_body, prepare_scene, simulate
 from eslr_jax.fabric.materials import WOVEN, fabric_names
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
 from eslr_jax.pipeline.assets.garments import MEAN_SHAPE
-from eslr_jax.pipeline.drape import hang
+from eslr_jax.pipeline.drape import TABLE, hang
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions
 from eslr_jax.pipeline.dressing.outfit import wear_together
@@ -206,7 +207,10 @@ def fabrics(frames: int) -> np.ndarray:
     for name in names:
         hung = hang(describe_fabric(name), **size)
         shown = {"camera": _CAMERA, "size": (190, 110), "zoom": 1.1}
-        pictures.append(next(render_frames(None, None, hung.positions[None], hung.faces, **shown)))
+        held = np.flatnonzero(np.hypot(hung.flat[:, 0], hung.flat[:, 2]) < TABLE)  # the ring that lies inside
+        over = held[Delaunay(hung.flat[held][:, [0, 2]]).simplices]
+        faces = np.concatenate([hung.faces, over])
+        pictures.append(next(render_frames(None, None, hung.positions[None], faces, **shown)))
     return side_by_side(pictures, names, columns=4)
 
 

@@ -141,7 +141,7 @@ def test_woven_fabrics_bear_their_coupling(name):
     along, across, coupling, shear = weave.stiffness
     assert coupling**2 < along * across
     assert shear > 0
-    assert all(1e-6 < rigidity < 5e-5 for rigidity in weave.rigidity)  # [N m], of clothes
+    assert all(5e-7 < rigidity < 1e-4 for rigidity in weave.rigidity)  # [N m], light silk to raw denim
     assert WOVEN[name].source
 
 

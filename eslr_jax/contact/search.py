@@ -38,7 +38,7 @@ class PosedSurface(NamedTuple):
 
     positions: Float[Array, "surface_vertices 3"]  # [m]
     normals: Float[Array, "surface_vertices 3"]
-    reach: float  # [m] within which a vertex may oppose another
+    reach: Float[Array, ""] | float  # [m] within which a vertex may oppose another
 
 
 class _Groups(NamedTuple):
@@ -251,7 +251,7 @@ def _gaps(blocks: _Boxes, patches: _Boxes) -> Float[Array, "blocks patches"]:
 
 
 def _may_oppose(
-    blocks: _Groups, patches: _Groups, reach: float, least_cosine: float
+    blocks: _Groups, patches: _Groups, reach: Float[Array, ""] | float, least_cosine: float
 ) -> Bool[Array, "blocks columns"]:
     """Return which patches may hold a vertex that opposes a point of a block: bounds by intervals.
 
