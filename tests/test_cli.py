@@ -209,6 +209,8 @@ def test_info_takes_the_networks_that_simulate_takes(tmp_path, monkeypatch):
 
     assert shown("eslr-small")["config"]["refinement_steps"] == 14  # also an architecture, of twelve steps
     assert shown("eslr-small:4")["config"]["refinement_steps"] == 4
+    assert "4 a frame" in shown("eslr-small:4")["form"]
+    assert "acceleration" in shown("eslr-5")["form"]  # the paper's
     bundled = find_asset("model", "eslr-small")
     (tmp_path / "mine").write_bytes(bundled.read_bytes())
     (tmp_path / "mine.json").write_bytes(bundled.with_suffix(".json").read_bytes())

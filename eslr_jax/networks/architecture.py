@@ -64,6 +64,13 @@ class Architecture(System, abc.ABC):
                 raise ValueError(f"{name} must be positive, got {value}")
 
     @property
+    def form(self) -> str:
+        """What it predicts, in words."""
+        if self.correction_scale is None:
+            return "an acceleration, which Euler integrates (the paper's form)"
+        return f"corrections of the solver's guess, {self.refinement_steps} a frame"
+
+    @property
     def reads_gradient(self) -> bool:
         """Whether the potential's gradient is among the inputs."""
         return self.correction_scale is not None

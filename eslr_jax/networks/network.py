@@ -50,6 +50,7 @@ class System:
     apply: Callable[..., Any]
     init: Callable[..., Any]
     refinement_steps = 1  # predictions a frame, each from the one before
+    form: Any = "positions"  # what it predicts, in words
 
     def new_network(self, seed: int, example: Example) -> Network:
         """Return a network with new weights.

@@ -208,12 +208,13 @@ class Info:
                 raise AssetError(f"{error}; of architectures there are {', '.join(MODELS)}") from error
             network = MODELS[model].new_network()
         values = {
-            "model": model, "parameters": network.num_parameters, "config": describe_system(network.config)
+            "model": model, "form": network.config.form, "parameters": network.num_parameters,
+            "config": describe_system(network.config),
         }  # fmt: skip
         if self.json:
             print(json.dumps(values, indent=2))
             return
-        print(f"{model}: {values['parameters']:,} parameters")
+        print(f"{model}: {values['parameters']:,} parameters; predicts {values['form']}")
         for name, value in values["config"].items():
             print(f"  {name} = {value}")
 
