@@ -135,13 +135,14 @@ def test_a_fabric_that_can_not_be_is_refused_in_one_line(two_fabrics, text, name
 
 @pytest.mark.parametrize("name", list(WOVEN))
 def test_woven_fabrics_bear_their_coupling(name):
-    weave = WOVEN[name].weave
+    weave, is_class = WOVEN[name].weave, WOVEN[name].source.startswith("class")
     assert weave.stiffness
     assert weave.rigidity
     along, across, coupling, shear = weave.stiffness
     assert coupling**2 < along * across
     assert shear > 0
-    assert all(5e-7 < rigidity < 1e-4 for rigidity in weave.rigidity)  # [N m], light silk to raw denim
+    assert all(1e-6 < rigidity < 5e-5 for rigidity in weave.rigidity) or is_class  # [N m], of clothes
+    assert all(5e-7 < rigidity < 1e-4 for rigidity in weave.rigidity)  # light silk to raw denim
     assert WOVEN[name].source
 
 

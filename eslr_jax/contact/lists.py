@@ -214,12 +214,11 @@ def _may_meet(ids: Int[Array, "corners rows"], is_edge: bool, motion: Motion) ->
     """Return which pairs the normal half way does not part all the way; those that share a vertex don't count."""
     p, half, side = corners_of(motion.middle, ids), corners_of(motion.half, ids), signs(is_edge)
     near = closest(p, is_edge)
-    normal: Vector3 = tuple(part / near.distance for part in near.offset)  # type: ignore[assignment]
     ends = [
         tuple(tuple(a + sign * b for a, b in zip(*one, strict=True)) for one in zip(p, half, strict=True))
         for sign in (-1.0, 1.0)
     ]
-    gap = jnp.minimum(*(gap_along(normal, corners, side) for corners in ends))  # type: ignore[arg-type]
+    gap = jnp.minimum(*(gap_along(near.normal, corners, side) for corners in ends))  # type: ignore[arg-type]
     shares_one = functools.reduce(
         jnp.logical_or, [ids[a] == ids[b] for a in range(4) for b in range(a) if side[a] != side[b]]
     )

@@ -57,6 +57,11 @@ class Closest(NamedTuple):
     distance: Float[Array, " rows"]  # [m], not less than `_SHORT`
     weights: tuple[Float[Array, " rows"], ...]  # of the four vertices, whose sum with them is the offset
 
+    @property
+    def normal(self) -> Vector3:
+        """Direction of the offset, which separates the two."""
+        return tuple(part / self.distance for part in self.offset)  # type: ignore[return-value]
+
 
 def signs(is_edge: bool) -> tuple[int, int, int, int]:
     """Return 1 for the vertices of a pair's first primitive, and -1 for those of its second."""
@@ -135,7 +140,7 @@ def _followed(start: tuple[Vector3, ...], end: tuple[Vector3, ...], is_edge: boo
             for here, there in zip(start, end, strict=True)
         )
         near = closest(corners, is_edge)
-        normal: Vector3 = tuple(part / near.distance for part in near.offset)  # type: ignore[assignment]
+        normal = near.normal
         is_first = number == 0
         least = jnp.where(is_first, _LEAST * jnp.minimum(near.distance, GAP), course.least)
         is_parted = is_first

@@ -192,6 +192,11 @@ def describe_cotton() -> Fabric:
     return Fabric(float(_COTTON["density"]), stretch, bending, what, "Santesteban et al. 2022 (SNUG)")
 
 
+def all_fabrics() -> dict[str, Fabric | Woven]:
+    """Return every named fabric: cotton, those of one stiffness, those by threads."""
+    return {"cotton": describe_cotton(), **FABRICS, **WOVEN}
+
+
 def fabric_names() -> tuple[str, ...]:
     """Return the names that `fabric_material` knows."""
     return ("cotton", *FABRICS)

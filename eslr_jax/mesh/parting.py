@@ -64,8 +64,9 @@ def parted(
     is_near = np.isin(faces, np.unique(faces[is_near])).any(axis=1)
     ids, corners = np.unique(faces[is_near], return_inverse=True)
     part, yielded = _Body(rest[ids], corners.reshape(-1, 3)), np.zeros((len(ids), 3))
+    reached = positions[:, ids]
     for frame in range(len(positions)):
-        yielded = part.yielding(_places(positions[:, ids], frame), _KEPT * yielded)
+        yielded = part.yielding(_places(reached, frame), _KEPT * yielded)
         out[frame, ids] += yielded.astype(out.dtype)
     return out
 

@@ -99,10 +99,11 @@ def disc(spacing: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @partial(jax.jit, static_argnums=1)
-def _settle(scene: Scene, config: SimConfig) -> tuple[jax.Array, jax.Array]:
-    """Return where the cloth is after the scene's frames, and how fast."""
+def _settle(scene: Scene, config: SimConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return where the cloth is after the scene's frames [m], its velocities, and their rms [m/s]."""
     trajectory = rollout_scene(None, scene, config)
-    return trajectory.positions[-1], trajectory.velocities[-1]
+    velocity = trajectory.velocities[-1]
+    return trajectory.positions[-1], velocity, jnp.sqrt(jnp.mean(jnp.sum(velocity**2, axis=1)))
 
 
 def hang(
@@ -142,13 +143,12 @@ def hang(
         terms=CLOTH,
         num_frames=length,
     )
-    end, velocity = _settle(scene, _SOLVED)
+    end, velocity, speed = _settle(scene, _SOLVED)
     for _ in range(length, frames, length - 1):
-        if jnp.sqrt(jnp.mean(jnp.sum(velocity**2, axis=1))) < _AT_REST:
+        if speed < _AT_REST:
             break
-        end, velocity = _settle(scene.replace(initial_state=initial_state(end, velocity)), _SOLVED)
-    speed = float(jnp.sqrt(jnp.mean(jnp.sum(velocity**2, axis=1))))
-    return Hung(np.asarray(end), flat, faces, speed)
+        end, velocity, speed = _settle(scene.replace(initial_state=initial_state(end, velocity)), _SOLVED)
+    return Hung(np.asarray(end), flat, faces, float(speed))
 
 
 class Fitted(NamedTuple):

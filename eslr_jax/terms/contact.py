@@ -69,19 +69,21 @@ class NearPairs(NamedTuple):
 
     def offsets(self, x: Vector3) -> Vector3:
         """Return the ways from the second primitives to the first [m], where they were nearest at t."""
-        corners = [
-            (weight, corner)
-            for weight, corner in zip(self.weights, corners_of(x, self.vertices), strict=True)
-        ]
-        return tuple(  # type: ignore[return-value]
-            base + sum(weight * corner[axis] for weight, corner in corners)
-            for axis, base in enumerate(self.base)
-        )
+        own = _weighted(self.weights, corners_of(x, self.vertices))
+        return tuple(base + part for base, part in zip(self.base, own, strict=True))  # type: ignore[return-value]
 
     def depths(self, offset: Vector3) -> Float[Array, " rows"]:
         """Return max(thickness - h, 0) [m], h the height of a pair's first primitive over its second."""
         depth = jnp.maximum(self.thickness - dot3(self.normal, offset), 0.0)
         return jnp.where(self.stiffness > 0, depth, 0.0)
+
+
+def _weighted(weights: Float[Array, "corners rows"], corners: Sequence[Vector3]) -> Vector3:
+    """Return the weighted sums of four corners [m]."""
+    return tuple(  # type: ignore[return-value]
+        sum(weight * corner[axis] for weight, corner in zip(weights, corners, strict=True))
+        for axis in range(3)
+    )
 
 
 class Ends(NamedTuple):
@@ -218,7 +220,6 @@ class Contact(Term):
         areas, ids = problem.garment.vertex_areas, rows.ids
         is_cloth = ids < len(areas)
         near = closest(corners_of(x, ids), is_edge)
-        normal: Vector3 = tuple(part / near.distance for part in near.offset)  # type: ignore[assignment]
         weights = jnp.stack(near.weights)
         others, of_body = corners_of(y, ids), jnp.where(is_cloth, 0.0, weights)
         # Corners of the cloth stand in for those of the body: a first primitive's, or else a second one's.
@@ -233,13 +234,12 @@ class Contact(Term):
             is_counted = is_counted & ~(is_cloth[0] & ~is_cloth[1])
         is_counted = is_counted & (jnp.arange(ids.shape[1]) < rows.count)
         stiffness = self.stiffness * contact_excess(problem.material) * area
-        base = [sum(w * corner[axis] for w, corner in zip(of_body, others, strict=True)) for axis in range(3)]
         near_pairs = NearPairs(
             vertices=vertices,
             weights=own,
-            base=tuple(base),  # type: ignore[arg-type]
+            base=_weighted(of_body, others),
             start=near.offset,
-            normal=normal,
+            normal=near.normal,
             thickness=self.thickness * jnp.maximum(sides, 1.0),
             stiffness=jnp.where(is_counted, stiffness, 0.0),
             rubbing=jnp.zeros_like(area),

@@ -200,7 +200,7 @@ class _Entry(NamedTuple):
     """One trajectory of a batch."""
 
     index: Int[Array, ""]  # in the pool
-    key: Array  # of the random numbers with which it starts anew, one for every window of frames
+    key: Array  # one for every window of frames, of the random numbers with which it starts anew
     slot: Slot
 
 
@@ -239,7 +239,6 @@ def _sample_gradient(
     finite, the trajectory stays as it was, to be looked at, until it starts anew.
     """
     index = entry.index % data.num_garments
-    num_windows = config.frames // config.through_time
     progress = curriculum(config, step * config.frames)
 
     def window(carry: tuple[Any, Slot], key: Array):
@@ -248,9 +247,8 @@ def _sample_gradient(
 
         def loss_of(trained):
             slot, frames = start, []
-            for _ in range(
-                config.through_time
-            ):  # unrolled: a gradient through a scan of one frame costs more
+            # Unrolled: a gradient through a scan of one frame costs more.
+            for _ in range(config.through_time):
                 trial = network.replace(params=trained)
                 slot, *frame = _frame(trial, data, index, progress, slot, start, config)
                 frames.append(frame)
@@ -266,9 +264,8 @@ def _sample_gradient(
         return (jax.tree.map(jnp.add, total, gradient), slot), (metrics, statistics)
 
     zeros = jax.tree.map(jnp.zeros_like, network.params)
-    keys = entry.key.reshape(num_windows)
-    (total, slot), (metrics, statistics) = jax.lax.scan(window, (zeros, entry.slot), keys)
-    gradient = jax.tree.map(lambda leaf: leaf / num_windows, total)
+    (total, slot), (metrics, statistics) = jax.lax.scan(window, (zeros, entry.slot), entry.key)
+    gradient = jax.tree.map(lambda leaf: leaf / entry.key.size, total)
     flat = jax.tree.map(lambda leaf: leaf.reshape(config.frames, *leaf.shape[2:]), statistics)
     return gradient, _Sample(slot, jax.tree.map(jnp.mean, metrics), flat)
 

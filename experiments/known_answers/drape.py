@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eslr_jax.fabric.materials import WOVEN, fabric_names
+from eslr_jax.fabric.materials import all_fabrics
 from eslr_jax.pipeline.drape import DISC, SPACING, Hung, hang
 from eslr_jax.pipeline.fabrics import describe_fabric
 
@@ -39,7 +39,7 @@ def drapes(is_smoke: bool) -> Iterator[tuple[Drape, Hung]]:
     if is_smoke:
         yield drape("satin-woven", starts=1, spacing=0.03, frames=6)
         return
-    for fabric in (*JUDGED, *(name for name in (*fabric_names(), *WOVEN) if name not in JUDGED)):
+    for fabric in (*JUDGED, *(name for name in all_fabrics() if name not in JUDGED)):
         yield drape(fabric, starts=_STARTS if fabric in JUDGED else _FINE_STARTS)
     for spacing in _FINE:
         for fabric in JUDGED:

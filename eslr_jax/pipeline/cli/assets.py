@@ -89,9 +89,8 @@ class Assets:
 def _fabrics() -> dict[str, dict[str, Any]]:
     """Return all fabrics by name, as values of JSON."""
     from eslr_jax.fabric.drapes import BANDS, DRAPES
-    from eslr_jax.fabric.materials import FABRICS, WOVEN, bending_lengths, describe_cotton
+    from eslr_jax.fabric.materials import all_fabrics, bending_lengths
 
-    everything = {"cotton": describe_cotton(), **FABRICS, **WOVEN}
     return {
         name: {
             **dataclasses.asdict(fabric),
@@ -99,7 +98,7 @@ def _fabrics() -> dict[str, dict[str, Any]]:
             "drape_band": BANDS[name]._asdict() if name in BANDS else None,
             "bending_lengths": bending_lengths(fabric),
         }
-        for name, fabric in everything.items()
+        for name, fabric in all_fabrics().items()
     }
 
 
@@ -125,11 +124,11 @@ def _export_body(path: Path, name: str) -> None:
 def _print_fabrics() -> None:
     """Print the fabrics as one table."""
     from eslr_jax.fabric.drapes import BANDS, DRAPES
-    from eslr_jax.fabric.materials import FABRICS, WOVEN, along_threads, bending_lengths, describe_cotton
+    from eslr_jax.fabric.materials import all_fabrics, along_threads, bending_lengths
 
     columns = ("fabric", "g/m2", "drape %", "of its kind", "length cm", "E N/m", "B uN m", "G N/m")
     table = Table(*columns, "what", "source", box=None)
-    for name, fabric in {"cotton": describe_cotton(), **FABRICS, **WOVEN}.items():
+    for name, fabric in all_fabrics().items():
         band, (stiffness, rigidity) = BANDS.get(name), along_threads(fabric)
         numbers = (
             f"{1e3 * fabric.density:.0f}",
