@@ -1,8 +1,7 @@
 """Pytrees that travel through the simulator. SI units, Y up, right-handed.
 
-Padding: arrays are padded to a bucket. The last vertex of a padded garment is a real row with zero area; padded
-faces, hinges and edges point at it and carry zero area, so every sum over them is exactly zero. An index is
-never out of range.
+Padding: arrays are padded to a bucket. Padded faces, hinges and edges point at a garment's last vertex, which may
+be a padded one, and carry zero area, so every sum over them is exactly zero. An index is never out of range.
 """
 
 from __future__ import annotations
@@ -137,6 +136,9 @@ class Body:
     joint_names: tuple[str, ...] = struct.field(pytree_node=False)
     # [m] per entry of R - I of every joint but the root; None: the model has no pose blend shapes
     pose_directions: Float[Array, "body_vertices 3 entries"] | None = None
+
+
+FAR = 1e3  # [m] from the origin along all axes, where padded vertices of a body are
 
 
 @struct.dataclass

@@ -6,12 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from eslr_jax.mesh.topology import face_areas, incidence_table, unique_edges, vertex_areas
+from eslr_jax.mesh.padding import round_up
+from eslr_jax.mesh.topology import face_areas, incidence_table, moved_incidence, unique_edges, vertex_areas
 from eslr_jax.types import BodySurface
 
 _PATCH_SIZE = (
     16  # vertices, faces or edges in a group; more make the first level cheaper and the second dearer
 )
+
+
+# Vertices of a padded surface. A part of a body between the first two numbers is padded to the second: so shirts,
+# shorts and trousers share programs. Larger ones are rounded up, by a quarter at most.
+_SMALL, _SHARED, _STEPS = 1024, 4096, 4
 
 
 def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
@@ -56,4 +62,55 @@ def prepare_surface(
         vertex_areas=jnp.asarray(
             vertex_areas(face_areas(positions, faces), faces, len(positions)), jnp.float32
         ),
+    )
+
+
+def padded_vertices(surface: BodySurface) -> int:
+    """Return the number of vertices that a surface is padded to, so that others share its sizes."""
+    count = len(surface.vertex_ids)
+    if count < _SMALL:
+        return count
+    wanted = round_up(max(count + 1, _SHARED), _STEPS)
+    fits = len(surface.faces) <= 2 * wanted and len(surface.edges) <= 3 * wanted
+    return wanted if fits else count
+
+
+def pad_surface(surface: BodySurface, num_vertices: int) -> BodySurface:
+    """Pad a surface to a number of vertices, of `padded_vertices`, with twice the faces and thrice the edges.
+
+    Padded faces and edges point at the last vertex. What is padded is in groups of its own, which are far away
+    (`types.FAR`), so no search looks into them.
+
+    Args:
+        surface: Of `prepare_surface`.
+        num_vertices: With padded ones, whose `vertex_ids` name no vertex of the body.
+    """
+    have = len(surface.vertex_ids)
+    if num_vertices == have:
+        return surface
+    last, num_faces, num_edges = num_vertices - 1, 2 * num_vertices, 3 * num_vertices
+
+    def longer(values: np.ndarray, rows: int, value: int) -> np.ndarray:
+        values = np.asarray(values)
+        return np.pad(values, [(0, rows - len(values)), *[(0, 0)] * (values.ndim - 1)], constant_values=value)
+
+    def grouped(groups: np.ndarray, first: int, count: int) -> np.ndarray:
+        groups = np.asarray(groups)
+        size = groups.shape[1]
+        added = first + np.arange((-(-count // size) - len(groups)) * size, dtype=groups.dtype)
+        return np.concatenate([groups, np.minimum(added, count - 1).reshape(-1, size)])
+
+    degree = 2 * -(-surface.face_incidence.shape[1] // 2)
+    return BodySurface(
+        vertex_ids=longer(surface.vertex_ids, num_vertices, np.iinfo(np.int32).max),
+        faces=longer(surface.faces, num_faces, last),
+        face_incidence=moved_incidence(
+            np.asarray(surface.face_incidence), 3, len(surface.faces), num_faces, num_vertices, degree
+        ),
+        patch_vertices=grouped(surface.patch_vertices, have, num_vertices),
+        face_blocks=grouped(surface.face_blocks, len(surface.faces), num_faces),
+        edges=longer(surface.edges, num_edges, last),
+        edge_blocks=grouped(surface.edge_blocks, len(surface.edges), num_edges),
+        is_boundary=longer(surface.is_boundary, num_vertices, False),
+        vertex_areas=longer(surface.vertex_areas, num_vertices, 0),
     )

@@ -98,6 +98,26 @@ def incidence_table(
     return table
 
 
+def moved_incidence(
+    table: Int[np.ndarray, "rows degree"],
+    corners: int,
+    num_items: int,
+    padded_items: int,
+    num_rows: int,
+    degree: int | None = None,
+) -> Int[np.ndarray, "padded_rows padded_degree"]:
+    """Return a table of incidence for more rows and items.
+
+    Entry corner * n + item, of n items, becomes corner * m + item, and so does what fills rows, corners * n.
+    """
+    corner, item = np.divmod(table, max(num_items, 1))
+    moved = np.full((num_rows, degree or table.shape[1]), corners * padded_items, table.dtype)
+    is_filled = table == corners * num_items
+    rows, columns = table.shape
+    moved[:rows, :columns] = np.where(is_filled, corners * padded_items, corner * padded_items + item)
+    return moved
+
+
 def _slots(rows: np.ndarray, num_rows: int) -> tuple[np.ndarray, int]:
     """Return the column of every entry of a table, given ascending rows, and the number of columns."""
     degrees = np.bincount(rows, minlength=num_rows)

@@ -15,10 +15,11 @@ from eslr_jax.mesh.padding import choose_bucket, common_bucket
 from eslr_jax.mesh.prepare import pad_alike
 from eslr_jax.pose.motion import check_length
 from eslr_jax.simulation.program import find_program
-from eslr_jax.simulation.scene import Integrator, build_scene, slice_tracks, worn_material
+from eslr_jax.simulation.scene import Integrator, first_state, scene_from, slice_tracks, worn_material
+from eslr_jax.simulation.shapes import share_start
 from eslr_jax.terms import Term, scene_terms
-from eslr_jax.terms.worn import Worn, looseness, surface_near, within
-from eslr_jax.types import Body, BodyMotion, BodySurface, Garment, Material, Scene
+from eslr_jax.terms.worn import Worn, looseness, skinned_frames, surface_near, within
+from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
 
 _SHARED_REACH = 0.15  # [m] of scenes that share a surface, chosen in the rest pose alone
 
@@ -171,14 +172,22 @@ def _build(
     material: Material,
     terms: tuple[Term, ...],
     on_shapes: Callable[[Scene], None],
-    **stepping: Any,
+    *,
+    has_pins: bool,
+    substeps: int,
+    **starting: Any,
 ) -> Scene:
-    """Return the scene of `build_scene`, by a program that is kept."""
-    given = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
-    program = find_program(build_scene, given, **stepping)
-    on_shapes(program.results)
-    # Constants stay as they came: to `jax.jit` a number of Python is of another type than an array.
-    return program.wait()(*given).replace(material=given[2], terms=given[3])
+    """Return the scene of `build_scene`, whose first state comes from a program that is kept and shared."""
+    garment, poses, material, terms = jax.tree.map(jnp.asarray, (garment, poses, material, terms))
+    pins = skinned_frames(garment, poses.joint_transforms) if has_pins else None
+
+    def scene(start: ClothState) -> Scene:
+        return scene_from(start, garment, poses, material, terms, pin_targets=pins, substeps=substeps)
+
+    given = (*jax.tree.map(jnp.asarray, share_start(garment, poses, terms)), terms)
+    program = find_program(first_state, given, **starting)
+    on_shapes(scene(program.results))
+    return scene(program.wait()(*given))
 
 
 def _cleared(poses: BodyMotion, terms: Sequence[Term]) -> BodyMotion:

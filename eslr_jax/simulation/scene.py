@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.terms import Term
-from eslr_jax.types import BodyMotion, ClothState, Garment, Material, Obstacle, PastState, Scene
+from eslr_jax.types import FAR, BodyMotion, ClothState, Garment, Material, Obstacle, PastState, Scene
 
 Integrator = Literal["euler", "bdf2"]
 """Implicit Euler is the paper's, and networks are trained with it. BDF2, of second order, keeps motion alive."""
@@ -29,8 +29,6 @@ def build_scene(
 ) -> Scene:
     """Return the scene of a garment on a moving body.
 
-    Frame 0 is the garment skinned to the first pose, moved out of what the terms forbid.
-
     Args:
         garment: A prepared garment.
         poses: The body in motion, two frames or more; the faces of its surface can be touched.
@@ -41,27 +39,64 @@ def build_scene(
         starts_at_rest: Frame 0 stands still; else it moves as the body does.
         has_pins: Model the garment's pins.
     """
-    skinned = skin_garment(garment, poses.joint_transforms)
-    body = None
-    if any(term.reads_body for term in terms):
-        body = Obstacle(poses.surface, poses.positions[:, poses.surface.vertex_ids])
+    start = first_state(garment, poses, terms, integrator=integrator, starts_at_rest=starts_at_rest)
+    pins = skin_garment(garment, poses.joint_transforms) if has_pins else None
+    return scene_from(start, garment, poses, material, terms, pin_targets=pins, substeps=substeps)
+
+
+def first_state(
+    garment: Garment,
+    poses: BodyMotion,
+    terms: tuple[Term, ...],
+    *,
+    integrator: Integrator,
+    starts_at_rest: bool,
+) -> ClothState:
+    """Return frame 0: the garment skinned to the first pose, moved out of what the terms forbid.
+
+    The arguments are those of `build_scene`. Of the motion it reads the first two frames.
+    """
+    skinned = skin_garment(garment, poses.joint_transforms[:2])
+    body = _obstacle(poses, terms)
     position = skinned[0]
     for term in terms:
         position = term.start(position, garment, body)
     velocity = (skinned[1] - skinned[0]) / poses.timestep
     if starts_at_rest:
         velocity = jnp.zeros_like(velocity)
+    return start_integrator(initial_state(position, velocity), integrator)
+
+
+def scene_from(
+    start: ClothState,
+    garment: Garment,
+    poses: BodyMotion,
+    material: Material,
+    terms: tuple[Term, ...],
+    *,
+    pin_targets: Float[Array, "frames vertices 3"] | None,
+    substeps: int,
+) -> Scene:
+    """Return the scene that begins with a state of `first_state`; see `build_scene`."""
     return Scene(
         garment=garment.replace(material=None),
         material=material,
         terms=terms,
-        initial_state=start_integrator(initial_state(position, velocity), integrator),
+        initial_state=start,
         timestep=poses.timestep,
-        body=body,
-        pin_targets=skinned if has_pins else None,
-        num_frames=skinned.shape[0],
+        body=_obstacle(poses, terms),
+        pin_targets=pin_targets,
+        num_frames=poses.joint_transforms.shape[0],
         substeps=substeps,
     )
+
+
+def _obstacle(poses: BodyMotion, terms: tuple[Term, ...]) -> Obstacle | None:
+    """Return the part of the body that terms read; None where none does."""
+    if not any(term.reads_body for term in terms):
+        return None
+    ids = poses.surface.vertex_ids  # of padded vertices there is none
+    return Obstacle(poses.surface, poses.positions.at[:, ids].get(mode="fill", fill_value=FAR))
 
 
 def worn_material(garment: Garment, material: Material | None) -> Material:

@@ -19,6 +19,7 @@ from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.scene import initial_state, slice_tracks
+from eslr_jax.simulation.shapes import share_shapes
 from eslr_jax.simulation.stepper import make_stepper, past_state
 from eslr_jax.types import ClothState, Scene, Trajectory
 
@@ -117,8 +118,9 @@ def _in_chunks(
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     # The last chunk goes on beyond the last frame, and what it simulates there is dropped: all stands still.
     held = np.minimum(np.arange(scene.num_frames + chunk), total)
-    inputs = frame_inputs(slice_tracks(jax.device_get(scene), held))  # on the host, where it compiles nothing
-    constant = jax.tree.map(jnp.asarray, _without_frames(scene))
+    shared = share_shapes(jax.device_get(scene))  # on the host, where it compiles nothing
+    inputs = frame_inputs(slice_tracks(shared, held))
+    constant = jax.tree.map(jnp.asarray, _without_frames(shared))
 
     def part(first: int) -> FrameInput:
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[first : first + chunk]), inputs)
@@ -220,7 +222,7 @@ def begin_compiling(
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound
 
-    find_program(_scan, jax.eval_shape(first_chunk, params, scene), config=config).begin()
+    find_program(_scan, jax.eval_shape(first_chunk, params, share_shapes(scene)), config=config).begin()
 
 
 def _chunk_of(scene: Scene) -> int:

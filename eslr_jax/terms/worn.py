@@ -26,7 +26,7 @@ _SPACING = 0.1  # [s] between the frames that are looked at to decide what is mo
 _MOST_COMPARED = (
     4000  # vertices of a piece that are compared with each other; a part of a finer one is enough
 )
-_skin = jax.jit(skin_garment)
+skinned_frames = jax.jit(skin_garment)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Worn:
     @functools.cached_property
     def skinned(self) -> Float[np.ndarray, "frames vertices 3"]:
         """The garment carried by the joints [m]."""
-        return np.asarray(_skin(self.garment, self.poses.joint_transforms))
+        return np.asarray(skinned_frames(self.garment, self.poses.joint_transforms))
 
     @property
     def unfolding(self) -> Float[np.ndarray, "vertices 3"]:

@@ -13,8 +13,9 @@ from eslr_jax.contact.nearest import (
     nearest_point,
 )
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.surface import prepare_surface
+from eslr_jax.mesh.surface import pad_surface, prepare_surface
 from eslr_jax.pipeline.assets import load_splits
+from eslr_jax.types import FAR
 
 find = jax.jit(find_contacts)
 
@@ -52,6 +53,24 @@ def test_signed_distance_normal_and_gate(sphere):
     np.testing.assert_allclose(contacts.distances[:2], [0.01, -0.01], atol=1e-3)
     np.testing.assert_allclose(contacts.normals[0], [0.0, 1.0, 0.0], atol=0.05)
     np.testing.assert_array_equal(contacts.is_near, [True, True, False])
+
+
+def test_a_padded_body_is_found_as_the_body_itself(sphere):
+    _, vertices, surface = sphere
+    cloth = jnp.asarray(np.random.default_rng(1).uniform(-0.4, 0.4, (200, 3)), jnp.float32)
+    plain, padded = (
+        jax.jit(find_both_sides)(cloth, places, 1.1 * places, searched, None, cloth + 0.3)
+        for places, searched in (
+            (vertices, surface),
+            (
+                np.pad(vertices, ((0, 700 - len(vertices)), (0, 0)), constant_values=FAR),
+                pad_surface(surface, 700),
+            ),
+        )
+    )
+    for name in plain[0].__dataclass_fields__:
+        for one, other in zip(plain, padded, strict=True):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
 
 
 def test_contact_point_moves_with_the_body(sphere):
