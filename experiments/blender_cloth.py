@@ -33,7 +33,7 @@ from newton_cloth import LAYER_THICKNESS, prepare_cloth, springs, strip_stiffnes
 from eslr_jax.errors import EslrError, MissingExtraError
 from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.point_cache import write_pc2
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness

@@ -44,10 +44,9 @@ from eslr_jax.pipeline.formats.palette import outfit_colors
 from eslr_jax.pipeline.formats.pattern import read_pattern
 from eslr_jax.pipeline.pictures import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.pipeline.report.fields import Field, run_field
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
 from eslr_jax.pipeline.report.gap import gap_medians, trajectory_gap
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, write_run
-from eslr_jax.pipeline.report.score import EVERY
+from eslr_jax.pipeline.report.score import EVERY, foreign_trajectory
 from eslr_jax.pipeline.rigs.rig import make_body
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling

@@ -36,7 +36,7 @@ from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError
 from eslr_jax.pipeline.extras import require
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness, vertex_masses

@@ -30,7 +30,7 @@ from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.assets import load_splits
 from eslr_jax.pipeline.cli.console import use_compile_cache
-from eslr_jax.pipeline.report.referee import intersecting_pairs, judge
+from eslr_jax.pipeline.report.crossing import intersecting_pairs, judge
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.plan import prepare_scenes

@@ -23,11 +23,8 @@ import time
 from pathlib import Path
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-PEERS = {
-    "vbd": (5, 20),
-    "style3d": (2, 20),
-    "xpbd": (None, 1),
-}  # substeps, iterations: in peers.json the least gap on its own rollout
+# Substeps, iterations: in peers.json the least gap on its own rollout.
+PEERS = {"vbd": (5, 20), "style3d": (2, 20), "xpbd": (None, 1)}
 BLENDER = (45, 2)  # steps per frame, rounds of collision per step: likewise
 ITERATIONS = {"physics": 200, "corrected": 20, "network": 0}  # of the solver, per frame
 NETWORKS = ("corrected", "network")

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from eslr_jax.pipeline.report.crossing import judge
 from eslr_jax.pipeline.report.gap import trajectory_states
-from eslr_jax.pipeline.report.referee import judge
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import potential

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError
 from eslr_jax.errors import MissingExtraError
-from eslr_jax.pipeline.cli.actor import is_moving_mesh, load_actor
+from eslr_jax.pipeline.cli.method import is_moving_mesh, load_actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, vertex_normals
 from eslr_jax.pipeline.formats.export import export_trajectory

@@ -12,7 +12,7 @@ from hard_cases.colliders import Sphere
 from hard_cases.measures import depths, mechanical_energy, optimality_gaps, settle, triangle_depths
 
 from eslr_jax import ConfigError, MeshError, Status
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Contact
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hard_cases.build import sheet
 
-from eslr_jax.pipeline.report.referee import intersecting_pairs, judge
+from eslr_jax.pipeline.report.crossing import intersecting_pairs, judge
 
 pytest.importorskip("ipctk")
 

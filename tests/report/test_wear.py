@@ -10,9 +10,9 @@ from draped_ball import RADIUS, ball, drifting_ball, square
 from hard_cases.build import make_cloth, make_scene
 
 from eslr_jax import load_garment, load_motion, pose_body, prepare_scene
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
-from eslr_jax.pipeline.report.referee import judge
+from eslr_jax.pipeline.report.crossing import judge
 from eslr_jax.pipeline.report.report import describe_report, describe_start, start_crossing, trajectory_report
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.pipeline.report.wear import wear_report
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.terms import Contact

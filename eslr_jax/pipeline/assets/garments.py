@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,19 +14,18 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.prepare import prepare_garment, to_device
-from eslr_jax.pipeline.assets.bodies import load_body
 from eslr_jax.pipeline.assets.cache import cached_arrays, cached_struct, content_key
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
+from eslr_jax.pipeline.assets.motions import load_body
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions, Scale
-from eslr_jax.pipeline.dressing.refine import refine
+from eslr_jax.pipeline.dressing.remesh import refine
 from eslr_jax.pipeline.dressing.report import check_wearer, wearer_entry
 from eslr_jax.pipeline.dressing.sewing import sew_pattern
 from eslr_jax.pipeline.dressing.transfer import transfer_garment
 from eslr_jax.pipeline.fabrics import garment_material
 from eslr_jax.pipeline.formats.garment import (
     GarmentFile,
-    GarmentSource,
     garment_arrays,
     garment_from_arrays,
     garment_path,
@@ -44,10 +43,7 @@ from eslr_jax.types import Body, Garment
 MEAN_SHAPE = (-1.6, 0.0, 1.0, 0.0)
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
 _SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
-_REFINED = {
-    "50k": "tq",
-    "200k": "tqq",
-}  # sizes that are made from 4k vertices, see `pipeline.dressing.refine`
+_REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices, see `refine`
 
 
 def load_garment(
@@ -102,11 +98,10 @@ def load_garment_file(
     body: Body | None = None,
     fit: FitOptions | None = None,
     cache: bool = True,
-    on_source: Callable[[GarmentSource], None] | None = None,
 ) -> GarmentFile:
     """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
 
-    Arguments are those of `load_garment`; `on_source` is told of a mesh before it is fitted.
+    Arguments are those of `load_garment`.
     """
     if not is_path(str(name)):
         options = fit or FitOptions()
@@ -129,8 +124,6 @@ def load_garment_file(
     if path.suffix.lower() in suffixes_of("pattern"):
         return sew_pattern_file(path, body, num_vertices=int(vertices[:-1]) * 1000, cache=cache)
     source = read_garment_source(name)
-    if on_source is not None:
-        on_source(source)
     rig, options = load_body() if body is None else body, fit or FitOptions()
     if not cache:
         return fit_garment(source, rig, options)

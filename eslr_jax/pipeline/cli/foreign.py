@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.errors import AssetError, MissingExtraError
-from eslr_jax.pipeline.cli.actor import load_wearer
 from eslr_jax.pipeline.cli.console import app, say, stderr, use_compile_cache, waiting
+from eslr_jax.pipeline.cli.method import load_wearer
 from eslr_jax.pipeline.dressing.options import FitOptions
 
 if TYPE_CHECKING:
@@ -105,21 +105,13 @@ class Fit:
         """Return the garment, fitted to the body or carried to it from the one that it was made for."""
         from eslr_jax.pipeline.assets import asset_names, load_garment_file
         from eslr_jax.pipeline.dressing.fit import fit_garment
-        from eslr_jax.pipeline.dressing.report import describe_cost
         from eslr_jax.pipeline.formats.garment import read_garment_source
 
-        def describe_source(source) -> None:
-            text = describe_cost(len(source.mesh.positions))
-            if text and self.options.edge_length is None:  # else it is remeshed, and its size is chosen
-                say(text)
-
         if self.made_for is None:
-            return load_garment_file(self.garment, body=rig, fit=self.options, on_source=describe_source)
+            return load_garment_file(self.garment, body=rig, fit=self.options)
         if not {self.garment, f"{self.garment}_1k"}.isdisjoint(asset_names("garment")):
             raise AssetError(f"garment {self.garment} is made for the bundled body; leave out --made-for")
-        first = load_wearer(self.made_for)
-        source = read_garment_source(self.garment)
-        describe_source(source)
+        source, first = read_garment_source(self.garment), load_wearer(self.made_for)
         return fit_garment(source, rig, self.options, made_for=first)
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
-from eslr_jax.pipeline.cli.actor import Actor, load_actor
 from eslr_jax.pipeline.cli.console import (
     EXIT_CODE,
     app,
@@ -21,7 +20,7 @@ from eslr_jax.pipeline.cli.console import (
     use_compile_cache,
     waiting,
 )
-from eslr_jax.pipeline.cli.method import Method, choose_method
+from eslr_jax.pipeline.cli.method import Actor, Method, choose_method, load_actor
 from eslr_jax.pipeline.cli.options import Options
 
 if TYPE_CHECKING:
@@ -199,21 +198,12 @@ def _dress(options: Options) -> _Dressed:
     from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
     from eslr_jax.pipeline.assets.garments import check_resolution
     from eslr_jax.pipeline.dressing.outfit import wear_together
-    from eslr_jax.pipeline.dressing.report import describe_cost
     from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 
     names, method = options.garments, choose_method(options)
     check_resolution(names, options.vertices)
     actor = load_actor(options)
-
-    def describe_source(source) -> None:
-        if text := describe_cost(len(source.mesh.positions)):
-            say(text)
-
-    garments = [
-        load_garment_file(name, vertices=options.vertices, body=actor.rig, on_source=describe_source)
-        for name in names
-    ]
+    garments = [load_garment_file(name, vertices=options.vertices, body=actor.rig) for name in names]
     stored = wear_together(garments, names)
     method = method.within_budget(len(stored.rest_positions), options.substeps)
     cloth = prepare_stored(stored, name="+".join(names), **method.garment_options)

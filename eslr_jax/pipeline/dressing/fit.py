@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from eslr_jax.pipeline.dressing.repair import (
     shell_thickness,
     weld,
 )
-from eslr_jax.pipeline.dressing.report import wearer_entry
+from eslr_jax.pipeline.dressing.report import describe_cost, wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape
 from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, first_rows
 from eslr_jax.pose.motion import chest_direction
@@ -39,7 +40,7 @@ _ALONG = 0.2  # of all edges' vertices that are as near to another piece: seams,
 def fit_garment(
     source: GarmentSource, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
 ) -> GarmentFile:
-    """Clean a garment's mesh, put it on the body, and give it skin weights and pins.
+    """Clean a garment's mesh, put it on the body, and give it skin weights and pins; warn if that takes long.
 
     Lengths, areas and angles stay those of the file, unless it is remeshed. Lowering arms and moving vertices
     out of the body change the rest positions, not the sewn shape.
@@ -74,6 +75,10 @@ def fit_garment(
         raise ConfigError(
             f"scale {options.scale} is for a garment of another body; give that body too (eslr fit --made-for)"
         )
+    if options.edge_length is None and (
+        text := describe_cost(len(mesh.positions))
+    ):  # else its size is chosen
+        warnings.warn(text, stacklevel=2)
     worn_by = body if made_for is None else made_for
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
@@ -199,7 +204,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
 
 def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any], list[str]]:
     """Join or drop separate parts as the options say; positions are in metres. Return report and warnings."""
-    chosen, warnings = options.components, []
+    chosen, doubts = options.components, []
     if chosen == "auto":
         gaps = (min(_SEAM, options.join_gap), options.join_gap)
         shares = shares_along_seams(clean.positions, clean.faces, gaps)
@@ -207,18 +212,18 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any],
         chosen = "join" if is_open else "keep"
         if is_near:
             pieces = vertex_components(clean.faces, len(clean.positions))[0]
-            warnings = [
+            doubts = [
                 f"{pieces} pieces whose edges lie within {100 * options.join_gap:g} cm of each other are not "
                 "sewn; give eslr fit --components join, or --components keep if they are apart"
             ]
     if chosen not in ("join", "largest"):
-        return clean, {}, warnings
+        return clean, {}, doubts
     if chosen == "join":
         step = join_components(clean.positions, clean.faces, options.join_gap)
     else:
         step = largest_component(clean.positions, clean.faces)
     if options.components == "auto" and undirected_edges(step.faces)[2].max() > 2:
-        return clean, {}, warnings  # an edge of three pieces, such as a pocket's on a seam
+        return clean, {}, doubts  # an edge of three pieces, such as a pocket's on a seam
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1
     left = vertex_components(step.faces, len(step.positions))[0]
     joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from eslr_jax.errors import AssetError, MeshError, MotionError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 from eslr_jax.files.npz import check_layout
+from eslr_jax.mesh import topology
 from eslr_jax.pipeline.formats.palette import GARMENT_COLORS, Color
 
 _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
@@ -63,9 +64,8 @@ class AnimatedMesh:
     velocities: np.ndarray | None = None  # [frames, vertices, 3] [m/s]
     rest_positions: np.ndarray | None = None  # [vertices, 3] [m], what `skin` moves
     skin: Skin | None = None  # joints that move it, exactly or nearly
-    parts: Mapping[str, np.ndarray] = dataclasses.field(
-        default_factory=dict
-    )  # which faces a part has [faces]
+    # Which faces a part has [faces].
+    parts: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
@@ -156,22 +156,13 @@ def split_seams(
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the area-weighted face normals around each vertex; faces are counter-clockwise seen from outside.
+    """Return `topology.vertex_normals` as files have them.
 
     Returns:
         Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
     """
-    corners = positions[faces].astype(np.float64)
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = np.stack(
-        [
-            np.bincount(faces.reshape(-1), np.repeat(face_normals[:, axis], 3), minlength=len(positions))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+    normals = topology.vertex_normals(positions.astype(np.float64), faces)
+    return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0]).astype(np.float32)
 
 
 def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:

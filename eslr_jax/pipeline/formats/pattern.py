@@ -33,9 +33,8 @@ class Seam(NamedTuple):
     """Two edges that are sewn to each other."""
 
     sides: tuple[Side, Side]
-    is_parallel: (
-        bool  # they run the same way along the seam, right side to wrong side, and not against each other
-    )
+    # They run the same way along the seam, right side to wrong side, and not against each other.
+    is_parallel: bool
 
     def __str__(self) -> str:
         return " to ".join(f"{panel} edge {edge}" for panel, edge in self.sides)
@@ -228,9 +227,8 @@ def _crossing_segments(outline: np.ndarray) -> tuple[int, int] | None:
         (x, y), (u, v) = (end - start).T[:, :, None], (points[None] - start[:, None]).transpose(2, 0, 1)
         return np.sign(x * v - y * u)
 
-    is_split = (
-        sides(start) * sides(end) < 0
-    )  # the second segment's ends lie on both sides of the first's line
+    # The second segment's ends lie on both sides of the first's line.
+    is_split = sides(start) * sides(end) < 0
     is_crossing = is_split & is_split.T
     if not is_crossing.any():
         return None

@@ -20,7 +20,7 @@ from eslr_jax.pipeline.formats.animated import Skin
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_npz, write_garment_npz
 from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.simulation.archive import read_tree, save_scene
 from eslr_jax.types import Body, BodyMotion, Scene, Trajectory
 
