@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -125,11 +125,15 @@ def load_garment_file(
         return sew_pattern_file(path, body, num_vertices=int(vertices[:-1]) * 1000, cache=cache)
     source = read_garment_source(name)
     rig, options = load_body() if body is None else body, fit or FitOptions()
+    parts = ("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
+    return _kept(lambda: fit_garment(source, rig, options), source.name, parts, cache=cache)
+
+
+def _kept(make: Callable[[], GarmentFile], name: str, parts: Iterable[Any], *, cache: bool) -> GarmentFile:
+    """Return a garment that was made of these parts before, or make it; see `content_key`."""
     if not cache:
-        return fit_garment(source, rig, options)
-    key = content_key("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
-    arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
-    return garment_from_arrays(arrays, source.name)
+        return make()
+    return garment_from_arrays(cached_arrays(content_key(*parts), lambda: garment_arrays(make())), name)
 
 
 def sew_pattern_file(
@@ -150,20 +154,14 @@ def sew_pattern_file(
     if all(np.array_equal(*pair) for pair in zip(_body_arrays(rig), _body_arrays(source), strict=True)):
         source = rig
 
-    def sew() -> dict[str, np.ndarray]:
-        pattern, name = read_pattern(path), Path(path).name
-        return garment_arrays(
-            sew_pattern(pattern, rig, source, num_vertices=num_vertices, pin=pin, name=name)
-        )
+    def sew() -> GarmentFile:
+        name = Path(path).name
+        return sew_pattern(read_pattern(path), rig, source, num_vertices=num_vertices, pin=pin, name=name)
 
-    if not cache:
-        return garment_from_arrays(sew(), path)
     with parsing(path, "pattern") as file:
         given = file.read_bytes()
     bodies = (rig.joint_names, *_body_arrays(rig), source.joint_names, *_body_arrays(source))
-    return garment_from_arrays(
-        cached_arrays(content_key("sew", given, num_vertices, pin, *bodies), sew), path
-    )
+    return _kept(sew, str(path), ("sew", given, num_vertices, pin, *bodies), cache=cache)
 
 
 def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
@@ -189,15 +187,10 @@ def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: boo
         and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)
     ):
         return dataclasses.replace(stored, metadata=stored.metadata | wearer_entry(own))  # its run keeps it
-    if not cache:
-        return transfer_garment(stored, own, body, scale=scale)
     bends = () if body.pose_directions is None else (np.asarray(body.pose_directions),)
     arrays = [array for _, array in sorted(garment_arrays(stored).items())]
-    key = content_key(
-        "transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends
-    )
-    carried = cached_arrays(key, lambda: garment_arrays(transfer_garment(stored, own, body, scale=scale)))
-    return garment_from_arrays(carried, "garment")
+    parts = ("transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends)
+    return _kept(lambda: transfer_garment(stored, own, body, scale=scale), "garment", parts, cache=cache)
 
 
 def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:

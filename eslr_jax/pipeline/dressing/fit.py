@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.mesh.topology import face_areas, face_cross_products, undirected_edges, vertex_components
+from eslr_jax.mesh.topology import face_areas, undirected_edges, vertex_components
 from eslr_jax.mesh.validate import check_arrays, validate_mesh
 from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
@@ -98,12 +98,7 @@ def fit_garment(
         )
     # Faces are turned that disagree with neighbours, and parts that face the body.
     turn = consistent_orientation(clean.positions, clean.faces)
-    crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
-    _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
-    outward = np.einsum("fx,fx->f", crosses, posture.normals[posture.touchable[nearest]])
-    _, component = vertex_components(clean.faces, len(clean.positions))
-    owner = component[clean.faces[:, 0]]
-    is_turned = turn ^ (np.bincount(owner, weights=outward) < 0)[owner]
+    is_turned = turn ^ posture.is_turned_in(clean.positions, _turn(clean.faces, turn))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.closest import closest_points
-from eslr_jax.mesh.topology import boundary_loops, face_areas, face_cross_products
+from eslr_jax.mesh.topology import boundary_loops, face_areas, face_cross_products, undirected_edges
 from eslr_jax.mesh.validate import validate_mesh
 from eslr_jax.pipeline.dressing.repair import consistent_orientation
 from eslr_jax.pipeline.extras import require
@@ -122,11 +122,8 @@ def refine(faces: Int[np.ndarray, "faces 3"], num_vertices: int, scheme: str) ->
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return unique edges, the edge behind corner k of every face (from k to k + 1), and which are boundary."""
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    edges, inverse, counts = np.unique(
-        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return edges, inverse.reshape(-1, 3), counts == 1
+    edges, behind, counts = undirected_edges(faces)
+    return edges, behind.reshape(-1, 3), counts == 1
 
 
 def _matrix(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> csr_matrix:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.errors import AssetError, EslrError, MeshError, MotionError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 from eslr_jax.files.npz import check_layout
 from eslr_jax.mesh import topology
@@ -68,6 +68,24 @@ class AnimatedMesh:
     parts: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
+def check_moving(
+    positions: np.ndarray,
+    faces: np.ndarray,
+    *,
+    what: str,
+    remedy: str,
+    not_finite: type[EslrError] = MeshError,
+) -> None:
+    """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
+    arrays, layout = {"positions": positions, "faces": faces}, dict(list(_LAYOUT.items())[:2])
+    check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
+    if 0 in positions.shape or not len(faces):
+        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+    is_finite = np.isfinite(positions).all((1, 2))
+    if not is_finite.all():
+        raise not_finite(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+
+
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
     """Raise a MeshError or a MotionError unless meshes can be written as one scene with this timestep [s]."""
     if not np.isfinite(timestep) or timestep <= 0:
@@ -84,11 +102,7 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
         if mesh.skin is not None:
             arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
         check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
-        if 0 in arrays["positions"].shape or not len(arrays["faces"]):
-            raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
-        is_finite = np.isfinite(arrays["positions"]).all((1, 2))
-        if not is_finite.all():
-            raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+        check_moving(arrays["positions"], arrays["faces"], what=what, remedy=remedy)
         if mesh.skin is None:
             continue
         if mesh.rest_positions is None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.files.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.files.parsing import split_name
+from eslr_jax.mesh.topology import unique_edges
 from eslr_jax.pipeline.formats.mesh import MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.pipeline.formats.mesh_sequence import MeshSequence
 from eslr_jax.pipeline.formats.registry import find_reader, suffixes_of
@@ -266,5 +267,5 @@ def in_outfit_order(
 
 def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:
     """Return one number for every edge between known vertices."""
-    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique((ends @ [count, 1])[ends[:, 0] >= 0])
+    ends = unique_edges(faces + 1) - 1  # none is negative on the way
+    return (ends @ [count, 1])[ends[:, 0] >= 0]
