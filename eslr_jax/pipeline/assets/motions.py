@@ -183,10 +183,10 @@ def _bundled_motion(text: str) -> Motion:
     else:
         path, clip = find_asset("motion", text), text
         clips = _motion_archive(path, path.stat().st_mtime)
-    return Motion(clip, *clips[clip])
+    return clips[clip]
 
 
 @lru_cache(maxsize=4)
-def _motion_archive(path: Path, modified: float):
+def _motion_archive(path: Path, modified: float) -> dict[str, Motion]:
     del modified  # part of the key: a changed file is read again
     return read_motion_archive(path)

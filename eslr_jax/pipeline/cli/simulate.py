@@ -321,7 +321,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
 
     from eslr_jax.pipeline.fabrics import worn_fabrics
     from eslr_jax.pipeline.report.report import describe_model, environment, trajectory_report
-    from eslr_jax.pipeline.report.run import ClothTrack, write_run
+    from eslr_jax.pipeline.report.run import write_run
     from eslr_jax.pipeline.report.wear import wear_report
     from eslr_jax.pose.lbs import skin_garment
     from eslr_jax.pose.motion import first_poses
@@ -379,10 +379,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
             **environment(),
         }
     with waiting("writing files"):
-        track = ClothTrack(
-            trajectory.positions, trajectory.velocities, trajectory.friction_loads, trajectory.residuals
-        )
-        write_run(out, track, scene, (rig, poses, stored), report=report)
+        write_run(out, trajectory, scene, (rig, poses, stored), report=report)
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / UNFINISHED).unlink(missing_ok=True)

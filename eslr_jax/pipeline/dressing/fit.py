@@ -28,7 +28,8 @@ from eslr_jax.pipeline.dressing.repair import (
 )
 from eslr_jax.pipeline.dressing.report import describe_cost, wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape
-from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, first_rows
+from eslr_jax.pipeline.formats.garment import GarmentFile, first_rows
+from eslr_jax.pipeline.formats.mesh import MeshFile
 from eslr_jax.pose.motion import chest_direction
 from eslr_jax.types import Body
 
@@ -38,7 +39,7 @@ _ALONG = 0.2  # of all edges' vertices that are as near to another piece: seams,
 
 
 def fit_garment(
-    source: GarmentSource, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
+    mesh: MeshFile, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
 ) -> GarmentFile:
     """Clean a garment's mesh, put it on the body, and give it skin weights and pins; warn if that takes long.
 
@@ -46,7 +47,7 @@ def fit_garment(
     out of the body change the rest positions, not the sewn shape.
 
     Args:
-        source: Garment of `read_garment_source`.
+        mesh: Garment of `read_garment_source`.
         body: The body in its rest pose.
         options: Settings that replace what is recognised from the mesh.
         made_for: The body that it was modelled on, if that is another one: it is put on that body first and
@@ -61,7 +62,7 @@ def fit_garment(
         ConfigError: An option contradicts the garment.
     """
     options = options or FitOptions()
-    mesh, name = source.mesh, source.name
+    name = mesh.name
     check_arrays(mesh.positions, mesh.faces, name=name)
     largest = float(np.abs(mesh.positions).max())
     if largest > _MAX_COORDINATE:
@@ -84,7 +85,7 @@ def fit_garment(
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
     facing = chest_direction(worn_by)
     placement = find_placement(
-        clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
+        clean.positions, clean.faces, postures, options, is_metric=mesh.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
     clean, joined, doubts = _join(
@@ -106,14 +107,14 @@ def fit_garment(
     file_pins = np.zeros(len(sewn), bool)
     if options.edge_length is None:
         vertex_map, joined_rows, face_source = clean.vertex_map, None, clean.face_source
-        if source.is_pinned is not None:
-            held = vertex_map[source.is_pinned]
+        if mesh.is_pinned is not None:
+            held = vertex_map[mesh.is_pinned]
             file_pins[held[held >= 0]] = True
         if mesh.rows is not None:
             vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
         uvs = None if uvs is None else _turn(uvs[face_source], is_turned)
     else:
-        lost = _lost_pins(source, options)
+        lost = _lost_pins(mesh, options)
         sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
         vertex_map, joined_rows, face_source = np.arange(len(sewn)), None, clean.face_source[nearest]
         file_pins, uvs = np.zeros(len(sewn), bool), None
@@ -232,7 +233,7 @@ def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     return result
 
 
-def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
+def _lost_pins(mesh: MeshFile, options: FitOptions) -> list[str]:
     """Return a warning of pins of the file, whose vertices remeshing replaces; raise if a number names them."""
     counted = [text for text in options.pin if text.startswith("vertices:")]
     if counted:
@@ -240,7 +241,7 @@ def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
             f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
             "a region or a loop"
         )
-    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
+    if "none" in options.pin or mesh.is_pinned is None or not mesh.is_pinned.any():
         return []
     return [
         "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "

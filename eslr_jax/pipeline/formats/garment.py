@@ -84,16 +84,6 @@ def split_outfit(
     return garments
 
 
-@dataclasses.dataclass(frozen=True)
-class GarmentSource:
-    """A garment of a user that is not fitted to a body yet."""
-
-    mesh: MeshFile
-    name: str
-    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # if the file tells
-    is_metric: bool = False  # the format prescribes metres and Y up
-
-
 def is_garment_file(path: str | Path) -> bool:
     """Tell whether a file is a fitted garment, and not a mesh that has to be fitted first."""
     return Path(path).suffix.lower() == ".npz" and "skin_weights" in read_arrays(path, content="garment")
@@ -105,7 +95,7 @@ def garment_path(text: str | Path) -> Path:
     return Path(file if Path(file).suffix.lower() in suffixes_of("garment") else text)
 
 
-def read_garment_source(text: str | Path) -> GarmentSource:
+def read_garment_source(text: str | Path) -> MeshFile:
     """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
 
     Args:
@@ -122,8 +112,7 @@ def read_garment_source(text: str | Path) -> GarmentSource:
     path = garment_path(text)
     if path.suffix.lower() in suffixes_of("garment"):
         return find_reader("garment", path)(path, split_name(text)[1])
-    mesh = read_mesh_file(path)
-    return GarmentSource(mesh, path.stem, is_metric=mesh.is_metric)
+    return dataclasses.replace(read_mesh_file(path), name=path.stem)
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:

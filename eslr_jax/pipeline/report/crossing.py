@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import ModuleType
 from typing import NamedTuple
 
@@ -74,26 +73,6 @@ def _regions(
     numbers = np.zeros(num_vertices, np.int64)
     numbers[is_small] = np.unique(region[is_small], return_inverse=True)[1] + 1
     return numbers
-
-
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """How much intersects in one frame."""
-
-    cloth_cloth: int  # pairs of cloth triangles
-    cloth_body: int  # pairs of a cloth and a body triangle
-
-
-def judge(
-    cloth: Float[np.ndarray, "vertices 3"],
-    cloth_faces: Int[np.ndarray, "faces 3"],
-    body: Float[np.ndarray, "body_vertices 3"] | None = None,
-    body_faces: Int[np.ndarray, "body_faces 3"] | None = None,
-) -> Verdict:
-    """Count intersecting pairs of triangles; the arguments are those of `intersecting_pairs`."""
-    pairs = intersecting_pairs(cloth, cloth_faces, body, body_faces)
-    is_body = (pairs >= len(cloth_faces)).any(axis=1)
-    return Verdict(cloth_cloth=int(np.sum(~is_body)), cloth_body=int(np.sum(is_body)))
 
 
 def intersecting_pairs(
