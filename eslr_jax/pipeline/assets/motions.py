@@ -17,7 +17,7 @@ from eslr_jax.files.npz import read_arrays
 from eslr_jax.files.parsing import parsing, split_name
 from eslr_jax.mesh.validate import validate_body
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
-from eslr_jax.pipeline.formats.bundled import read_body, read_motion_archive
+from eslr_jax.pipeline.formats.bundled import pick_clip, read_body, read_motion_archive
 from eslr_jax.pipeline.formats.gltf_rig import GLTF_SUFFIXES, gltf_clip_names
 from eslr_jax.pipeline.formats.registry import find_reader
 from eslr_jax.pipeline.rigs.procedural import PROCEDURAL, make_procedural
@@ -170,23 +170,11 @@ def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
 
 def _bundled_motion(text: str) -> Motion:
     """Load a clip by name, or from an archive in the bundled format."""
-    if is_path(text):
-        file, clip = split_name(text)
-        if not Path(file).exists():
-            raise AssetError(f"motion file {file} doesn't exist; check the path")
-        clips = _motion_archive(Path(file), Path(file).stat().st_mtime)
-        if not clip and len(clips) > 1:
-            raise MotionError(f"{file} holds {len(clips)} clips; name one, as in {file}#{next(iter(clips))}")
-        clip = clip or next(iter(clips))
-        if clip not in clips:
-            raise MotionError(f"{file} has no clip {clip!r}; it has {', '.join(clips)}")
-    else:
-        path, clip = find_asset("motion", text), text
-        clips = _motion_archive(path, path.stat().st_mtime)
-    return clips[clip]
+    if not is_path(text):
+        return _bundled_clips(find_asset("motion", text))[text]
+    file, clip = split_name(text)
+    clips = read_motion_archive(file)
+    return clips[pick_clip(file, list(clips), clip)]
 
 
-@lru_cache(maxsize=4)
-def _motion_archive(path: Path, modified: float) -> dict[str, Motion]:
-    del modified  # part of the key: a changed file is read again
-    return read_motion_archive(path)
+_bundled_clips = lru_cache(maxsize=4)(read_motion_archive)  # several of a file are loaded one after the other

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from eslr_jax.pipeline.formats.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
+    from eslr_jax.types import BodyMotion, Garment, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
 _KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
@@ -86,11 +86,9 @@ class Simulate(Options):
 class _Setting(NamedTuple):
     """What is simulated, and how."""
 
-    names: tuple[str, ...]  # of the garments
     garments: list[GarmentFile]  # each of them as the body wears it; none where a simulation goes on
     stored: GarmentFile  # all of them together
     actor: Actor
-    material: Material
     method: Method
     settle: int  # frames before frame 0
     scene: Scene  # with these frames
@@ -157,9 +155,9 @@ def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
                 f"{_typed(value)}; leave out all options but --out to go on, or start in another folder without "
                 "--resume"
             )
-    stored, garments = read_garment_npz(given.out / "garment.npz"), own.garments
+    stored = read_garment_npz(given.out / "garment.npz")
     method = choose_method(own).within_budget(len(stored.rest_positions), own.substeps)
-    setting = _Setting(garments, [], stored, actor, scene.material, method, settle, scene)
+    setting = _Setting([], stored, actor, method, settle, scene)
     return dataclasses.replace(given, **vars(own)), setting, done
 
 
@@ -226,7 +224,6 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     from eslr_jax.terms.worn import surface_near
 
     actor, garments, stored, cloth, method, settle, settling = _dress(options)
-    material = garment_material(options.fabric, cloth, stored)
     begin = partial(begin_compiling, method.params, config=method.config, is_paced=method.pace is not None)
     surface = None
     if near is not None:
@@ -234,7 +231,7 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     scene = prepare_scene(
         cloth,
         settling,
-        material=material,
+        material=garment_material(options.fabric, cloth, stored),
         terms=options.terms(),
         integrator=options.integrator or ("bdf2" if method.config.iterations > 0 else "euler"),
         substeps=options.substeps,
@@ -244,7 +241,7 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     if scene.body is not None:
         vertices = np.asarray(scene.body.surface.vertex_ids)
         check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
-    return _Setting(options.garments, garments, stored, actor, material, method, settle, scene)
+    return _Setting(garments, stored, actor, method, settle, scene)
 
 
 def _announce(options: Options, setting: _Setting) -> None:
@@ -259,14 +256,14 @@ def _announce(options: Options, setting: _Setting) -> None:
         if method.model != method.network and options.iterations is None:
             say(f"a frame is solved by {method.model}; --iterations 0 is the network alone")
         # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
-        unseen = beyond_training(setting.material)
+        unseen = beyond_training(scene.material)
         if unseen and method.tolerance is None:
             say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     crossing = start_crossing(scene, parts=(stored.face_parts, stored.part_names))
     start = describe_start(crossing, is_put_on=begins_at_rest(setting.settle, setting.actor.rig))
     if start is not None:
         say(start)
-    for name, worn in zip(setting.names, setting.garments, strict=True):
+    for name, worn in zip(options.garments, setting.garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))
         if "sewing" in worn.metadata:
@@ -356,7 +353,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
         is_kept = keeps_tolerance(bounds, residuals, method.config.tolerance)
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
-            "garment": "+".join(setting.names),
+            "garment": "+".join(options.garments),
             "fabric": list(worn_fabrics(options.fabric, stored)) or ["cotton"],
             "motion": motion,
             "motion_start_s": motion_start,

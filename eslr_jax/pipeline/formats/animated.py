@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -276,19 +276,15 @@ def write_frames(
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):
         raise AssetError(f"{target} exists already; name a new folder for the sequence")
-    ensure_output_dir(target.parent)
-    parts = target.with_name(f".{target.name}.part")
-    shutil.rmtree(parts, ignore_errors=True)  # of an export that was killed
     digits = max(4, len(str(len(mesh.positions) - 1)))
-    try:
-        ensure_output_dir(parts)
-        for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
-            with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
-                temporary.write_bytes(content(positions))
-        if target.is_dir():
-            target.rmdir()
-        os.replace(parts, target)
-    except OSError as error:
-        raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
-    finally:
-        shutil.rmtree(parts, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=ensure_output_dir(target.parent)) as name:
+        parts = ensure_output_dir(Path(name) / target.name)
+        try:
+            for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
+                with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
+                    temporary.write_bytes(content(positions))
+            if target.is_dir():
+                target.rmdir()
+            os.replace(parts, target)
+        except OSError as error:
+            raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -95,6 +96,15 @@ def read_motion_archive(path: str | Path) -> dict[str, Motion]:
             tuple(map(str, arrays["joint_names"])),
         )
     return clips
+
+
+def pick_clip(path: str | Path, names: Sequence[str], clip: str) -> str:
+    """Return the clip of a file that is asked for, or its only one where that is ""; raise a MotionError else."""
+    if not clip and len(names) > 1:
+        raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
+    if clip and clip not in names:
+        raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+    return clip or names[0]
 
 
 def read_number(array: np.ndarray, what: str) -> float:
