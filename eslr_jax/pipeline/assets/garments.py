@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.prepare import prepare_garment, to_device
-from eslr_jax.pipeline.assets.cache import cached_arrays, cached_struct, content_key
+from eslr_jax.pipeline.assets.cache import cached, content_key
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
 from eslr_jax.pipeline.assets.motions import load_body
 from eslr_jax.pipeline.dressing.fit import fit_garment
@@ -35,6 +36,7 @@ from eslr_jax.pipeline.formats.garment import (
 )
 from eslr_jax.pipeline.formats.pattern import read_pattern
 from eslr_jax.pipeline.formats.registry import suffixes_of
+from eslr_jax.simulation.archive import read_tree, write_tree
 from eslr_jax.types import Body, Garment
 
 # Of the bundled body, on which patterns for GarmentCode's mean body stretch little: 1.69 m tall, bust and hips
@@ -133,7 +135,7 @@ def _kept(make: Callable[[], GarmentFile], name: str, parts: Iterable[Any], *, c
     """Return a garment that was made of these parts before, or make it; see `content_key`."""
     if not cache:
         return make()
-    return garment_from_arrays(cached_arrays(content_key(*parts), lambda: garment_arrays(make())), name)
+    return garment_from_arrays(cached(content_key(*parts), lambda: garment_arrays(make())), name)
 
 
 def sew_pattern_file(
@@ -260,7 +262,9 @@ def prepare_stored(
 
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
     key = content_key("prepare", pad, sorted(options.items()), *own)
-    garment = cached_struct(key, Garment, make) if cache else make()
+    read = partial(read_tree, kind=Garment, content="garment", remedy="make it again")
+    write = partial(write_tree, content="garment")
+    garment = cached(key, make, write=write, read=read) if cache else make()
     if has_coarse_edges:
         garment = add_coarse_edges(garment)
     if stored.metadata.get("fabrics"):
