@@ -59,7 +59,7 @@ def find_simulator(arguments: argparse.Namespace):
     """
     from eslr_jax.errors import ConfigError
     from eslr_jax.pipeline.assets import load_model
-    from hard_cases import network_simulator, solver_simulator
+    from hard_cases.case import network_simulator, solver_simulator
 
     name = arguments.simulator
     stepping = {

@@ -6,8 +6,9 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard_cases import CASES, CaseScene, Measure, Run, Simulator, find_case, run_case, solver_simulator
+from hard_cases import CASES, CaseScene, Measure, Run, Simulator, find_case, run_case
 from hard_cases.build import FRAME, hanging_sheet, make_cloth, make_scene, sheet
+from hard_cases.case import solver_simulator
 from hard_cases.colliders import Sphere
 from hard_cases.measures import depths, mechanical_energy, optimality_gaps, settle, triangle_depths
 
