@@ -16,7 +16,7 @@ Criterion = Literal["postcvpr", "cvpr", "metric"]
 """Readings of HOOD's losses, see `terms.hood`."""
 
 Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
-"""What a network may be deprived of, see `pipeline.report.controls`."""
+"""What a network may be deprived of, see `pipeline.report.evaluate`."""
 
 MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 

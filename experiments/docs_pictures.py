@@ -44,10 +44,9 @@ from eslr_jax.pipeline.formats.palette import outfit_colors
 from eslr_jax.pipeline.formats.pattern import read_pattern
 from eslr_jax.pipeline.pictures import add_color_bar, color_scale, render_frames, side_by_side
 from eslr_jax.pipeline.report.fields import Field, run_field
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
 from eslr_jax.pipeline.report.gap import gap_medians, trajectory_gap
-from eslr_jax.pipeline.report.run import ClothTrack, read_run, write_run
-from eslr_jax.pipeline.report.score import EVERY
+from eslr_jax.pipeline.report.run import read_run, write_run
+from eslr_jax.pipeline.report.score import EVERY, foreign_trajectory
 from eslr_jax.pipeline.rigs.rig import make_body
 from eslr_jax.pose.lbs import skin_garment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
@@ -265,9 +264,8 @@ def score(frames: int) -> np.ndarray:
 
 def field_of(shot: Shot, name: str) -> Field:
     """Return a field of a scene, as `eslr render --color` shows it."""
-    track = ClothTrack(shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads)
     with tempfile.TemporaryDirectory() as folder:
-        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
+        write_run(Path(folder), shot.trajectory, shot.scene, (shot.body, shot.poses, shot.stored), report={})
         return run_field(read_run(Path(folder)), name)
 
 
@@ -279,9 +277,8 @@ def colored(shot: Shot, field: Field, high: float) -> np.ndarray:
 def studio(frames: int) -> np.ndarray:
     """An outfit on a walk, drawn from its Alembic file: meshes alone."""
     shot = shoot(("pants", "tshirt"), frames)
-    track = ClothTrack(shot.trajectory.positions, shot.trajectory.velocities, shot.trajectory.friction_loads)
     with tempfile.TemporaryDirectory() as folder:
-        write_run(Path(folder), track, shot.scene, (shot.body, shot.poses, shot.stored), report={})
+        write_run(Path(folder), shot.trajectory, shot.scene, (shot.body, shot.poses, shot.stored), report={})
         run = read_run(Path(folder)).trajectory
         path = export_trajectory(run, Path(folder) / "run.abc", garment=shot.stored)
         *cloths, body = read_mesh_sequences(path)

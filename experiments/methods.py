@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -73,15 +71,3 @@ def quantiles(
         {str(count): float(np.median(values)) for count, values in joined.items()},
         {str(count): float(np.quantile(values, 0.99)) for count, values in joined.items()},
     )
-
-
-def interpolate_gap(curve: Mapping[Any, float], place: float) -> float:
-    """Return a curve's gap at a place: between measurements its logarithm is linear, beyond them it stays.
-
-    Args:
-        curve: Relative gap by iterations or by milliseconds; keys are numbers, or their text as JSON has it.
-        place: The same.
-    """
-    keys = sorted(curve, key=float)
-    values = [np.log(max(curve[key], 1e-7)) for key in keys]
-    return float(np.exp(np.interp(place, [float(key) for key in keys], values)))

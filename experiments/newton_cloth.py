@@ -35,13 +35,15 @@ from hard_cases import Simulator
 from jaxtyping import Float, Int
 
 from eslr_jax.errors import EslrError
+from eslr_jax.mesh.topology import undirected_edges
 from eslr_jax.pipeline.extras import require
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Collision, Friction, Gravity
 from eslr_jax.terms.contact import keeps_layers
 from eslr_jax.terms.problem import contact_thickness, vertex_masses
 from eslr_jax.types import ClothState, Garment, Material, Scene, Trajectory
 
+LABELS = {"vbd": "VBD", "style3d": "Style3D", "xpbd": "XPBD"}
 LAYER_THICKNESS = 3e-3  # [m] that layers keep from each other (ContourCraft)
 _REACH = 0.1  # [m] by which cloth and body may approach within a frame and still find each other
 _LEAST_GAP = 0.01  # [m]; Newton's default
@@ -63,7 +65,8 @@ class Setting:
         return f"Newton {LABELS[self.solver]}"
 
 
-LABELS = {"vbd": "VBD", "style3d": "Style3D", "xpbd": "XPBD"}
+BEST = (Setting("vbd", 5, 20), Setting("style3d", 2, 20), Setting("xpbd", None, 1))
+"""In peers.json those of the least gap on their own rollout."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,11 +126,9 @@ def prepare_cloth(garment: Garment, material: Material) -> Cloth:
 
 def springs(cloth: Cloth) -> tuple[Int[np.ndarray, "edges 2"], Float[np.ndarray, " edges"]]:
     """Return the edges and their stiffness as springs [N/m]: the sum of E h A over the faces beside it / l^2."""
-    corners = cloth.faces
-    sides = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    edges, which = np.unique(sides, axis=0, return_inverse=True)
+    edges, which, _ = undirected_edges(cloth.faces)
     weight = strip_stiffness(cloth.shear, cloth.area_stiffness) * cloth.areas
-    total = np.bincount(which.ravel(), np.tile(weight, 3), len(edges))
+    total = np.bincount(which, np.repeat(weight, 3), len(edges))
     squared = np.sum((cloth.rest[edges[:, 1]] - cloth.rest[edges[:, 0]]) ** 2, axis=1)
     return edges, total / squared
 

@@ -19,7 +19,7 @@ from eslr_jax.mesh.topology import is_on_boundary
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
 from eslr_jax.pipeline.dressing.outfit import combine_garments
 from eslr_jax.pipeline.formats.garment import GarmentFile
-from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 
 OUTFITS = (("pants", "tshirt"), ("shorts", "dress"), ("underskirt", "skirt"), ("tank", "longsleeve"))

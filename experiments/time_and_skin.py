@@ -30,7 +30,7 @@ from eslr_jax.mesh.closest import nearest_places
 from eslr_jax.mesh.topology import vertex_normals
 from eslr_jax.pipeline.assets import load_splits
 from eslr_jax.pipeline.cli.console import use_compile_cache
-from eslr_jax.pipeline.report.referee import intersecting_pairs, judge
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 from eslr_jax.simulation.plan import prepare_scenes
@@ -111,14 +111,14 @@ def judge_frame(scene: Scene, positions: np.ndarray, frame: int, crossings: np.n
     """
     cloth, (body, faces) = scene.garment, _body(scene, frame)
     own = np.asarray(cloth.faces)[np.asarray(cloth.rest_areas) > 0]
-    verdict = judge(positions, own, body, faces)
+    is_body = (intersecting_pairs(positions, own, body, faces) >= len(own)).any(axis=1)
     real = positions[np.asarray(cloth.vertex_mask)]
     place = nearest_places(real, body, faces, vertex_normals(body, faces))
     depth = -np.einsum("px,px->p", place.offsets, place.normals)
     nearest = cKDTree(real).query(crossings)[0] if len(crossings) else np.array([np.inf])
     return {
-        "cloth_body": verdict.cloth_body,
-        "cloth_cloth": verdict.cloth_cloth,
+        "cloth_body": int(np.sum(is_body)),
+        "cloth_cloth": int(np.sum(~is_body)),
         "is_pinched": bool(nearest.min() < PINCH),
         "depth_mm": round(1e3 * max(float(np.quantile(depth, 0.999)), 0.0), 3),
     }

@@ -16,7 +16,7 @@ from harness import EXPERIMENTS, keep, machine, parser
 
 from eslr_jax import load_body, load_motion, pose_body, prepare_scene
 from eslr_jax.pipeline.assets import split_clips
-from eslr_jax.pipeline.assets.training import load_training_data
+from eslr_jax.pipeline.assets.models import load_training_data
 from eslr_jax.pipeline.report.scene_parts import take_turns
 from eslr_jax.simulation.frame import frame_inputs, frame_problem
 from eslr_jax.terms import FAST

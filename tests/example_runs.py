@@ -4,8 +4,9 @@ import numpy as np
 
 from eslr_jax import pose_body, prepare_scene, save_scene
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
+from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.garment import write_garment_npz
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, write_trajectory
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, write_trajectory
 from eslr_jax.pose.motion import still_motion
 
 
@@ -20,7 +21,8 @@ def write_run(folder, body, name, scale=1.0, **options):
     shrunk = rest * [0.9, 1, 0.9]  # into the body
     others = [rest + np.array([0, 0.02, 0]), rest, shrunk, shrunk - np.array([0, 1e-3, 0])]
     frames = np.stack([rest, rest * [1.1 * scale, 1, 1], *others])
-    track = BodyTrack(*map(np.array, (poses.positions, body.faces, body.rest_positions)))
+    moving, faces, rest = map(np.array, (poses.positions, body.faces, body.rest_positions))
+    track = AnimatedMesh("body", moving, faces, rest_positions=rest)
     velocities = np.gradient(frames, 1 / 30, axis=0)
     write_trajectory(
         folder / "trajectory.npz",

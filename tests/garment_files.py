@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.pipeline.assets.catalog import find_asset
-from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, read_garment_npz
+from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_npz
 from eslr_jax.pipeline.formats.mesh import MeshFile
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # Y up facing Z -> Z up facing -Y
@@ -17,8 +17,8 @@ def bundled(name: str) -> GarmentFile:
     return read_garment_npz(find_asset("garment", name))
 
 
-def source(positions: np.ndarray, faces: np.ndarray, **fields) -> GarmentSource:
-    return GarmentSource(MeshFile(positions, faces), "test", **fields)
+def source(positions: np.ndarray, faces: np.ndarray, **fields) -> MeshFile:
+    return MeshFile(positions, faces, name="test", **fields)
 
 
 def dent(garment: GarmentFile, body, depth: float) -> tuple[np.ndarray, int]:

@@ -16,7 +16,6 @@ from hard_cases.free import BAD_START, FREE_FALL, HANG, PULL, TWIST
 from hard_cases.layers import LAYERS
 from hard_cases.limbs import FAST_LIMB, PINCH, TURNED
 from hard_cases.obstacles import NEEDLE, SLOPE
-from hard_cases.simulators import network_simulator, solver_simulator
 
 _ORDER = (
     *(FREE_FALL, TURNED, HANG, DROP, FAST_LIMB, START_INSIDE, BAD_START, PULL, STEPS_AND_FABRICS),
@@ -40,5 +39,5 @@ def find_case(name: str) -> HardCase:
 
 __all__ = [
     "CASES", "CaseScene", "HardCase", "Measure", "Outcome", "Run",
-    "Simulator", "drop_scene", "find_case", "network_simulator", "run_case", "solver_simulator",
+    "Simulator", "drop_scene", "find_case", "run_case",
 ]  # fmt: skip

@@ -23,12 +23,7 @@ import time
 from pathlib import Path
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-PEERS = {
-    "vbd": (5, 20),
-    "style3d": (2, 20),
-    "xpbd": (None, 1),
-}  # substeps, iterations: in peers.json the least gap on its own rollout
-BLENDER = (45, 2)  # steps per frame, rounds of collision per step: likewise
+PEERS = ("vbd", "style3d", "xpbd", "blender")
 ITERATIONS = {"physics": 200, "corrected": 20, "network": 0}  # of the solver, per frame
 NETWORKS = ("corrected", "network")
 DEFAULT_MODEL = "eslr-small"
@@ -39,7 +34,7 @@ def parse_arguments() -> argparse.Namespace:
     import harness
 
     parser = harness.parser(__doc__, "one case")
-    parser.add_argument("simulator", nargs="?", default="corrected", choices=[*ITERATIONS, *PEERS, "blender"])
+    parser.add_argument("simulator", nargs="?", default="corrected", choices=[*ITERATIONS, *PEERS])
     parser.add_argument("--model", default=DEFAULT_MODEL)
     parser.add_argument("--iterations", type=int, help="of the solver per frame; physics: 200, corrected: 20")
     parser.add_argument("--integrator", choices=["euler", "bdf2"], default="euler", help="of physics")
@@ -64,7 +59,7 @@ def find_simulator(arguments: argparse.Namespace):
     """
     from eslr_jax.errors import ConfigError
     from eslr_jax.pipeline.assets import load_model
-    from hard_cases import network_simulator, solver_simulator
+    from hard_cases.case import network_simulator, solver_simulator
 
     name = arguments.simulator
     stepping = {
@@ -87,12 +82,12 @@ def find_simulator(arguments: argparse.Namespace):
     if arguments.iterations is not None:
         raise ConfigError(f"--iterations is for this package's simulators; {name} has its own effort")
     if name == "blender":
-        from blender_cloth import blender_simulator
+        from blender_cloth import BEST, blender_simulator
 
-        return blender_simulator(BLENDER)
-    from newton_cloth import Setting, newton_simulator
+        return blender_simulator(BEST)
+    import newton_cloth
 
-    return newton_simulator(Setting(name, *PEERS[name]))
+    return newton_cloth.newton_simulator(next(one for one in newton_cloth.BEST if one.solver == name))
 
 
 def run(arguments: argparse.Namespace) -> None:

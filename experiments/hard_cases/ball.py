@@ -12,10 +12,9 @@ from eslr_jax.fabric.materials import COTTON
 from eslr_jax.pipeline.report.gap import trajectory_states
 from eslr_jax.types import Material
 from hard_cases.build import FRAME, icosphere, make_cloth, make_scene, sheet
-from hard_cases.case import CaseScene, HardCase, Measure, Runs, Scenes
+from hard_cases.case import CaseScene, HardCase, Measure, Runs, Scenes, solver_simulator
 from hard_cases.colliders import Sphere
 from hard_cases.measures import MM, depths, largest_stretch, optimality_gaps, quantile_depth, speeds
-from hard_cases.simulators import solver_simulator
 
 _RADIUS = 0.25  # [m] of the ball
 _SWING_START = 0.5  # [s]

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from eslr_jax import Network, SimConfig, Trajectory, simulate
 from eslr_jax.errors import EslrError, Status
 from eslr_jax.simulation.scene import Integrator, start_integrator
-from eslr_jax.types import Scene, Trajectory
+from eslr_jax.types import Scene
 from hard_cases.colliders import Collider
 
 Colliders = Callable[[int], Sequence[Collider]]
@@ -41,6 +42,31 @@ class Simulator:
         """Return a case's scene with what this simulator models."""
         start = start_integrator(scene.initial_state, self.integrator)
         return scene.replace(initial_state=start, substeps=self.substeps)
+
+
+def solver_simulator(
+    iterations: int = 200, integrator: Integrator = "euler", *, substeps: int = 1
+) -> Simulator:
+    """Return the L-BFGS solver as a simulator, see `Simulator`."""
+
+    def run(scene: Scene) -> Trajectory:
+        return simulate(None, scene, config=SimConfig(iterations=iterations), raises=False).trajectory
+
+    parts = ["physics", integrator * (integrator != "euler")]
+    parts += [f"{substeps} substeps" * (substeps > 1), f"{iterations} iterations"]
+    name = ", ".join(filter(None, parts))
+    return Simulator(name, run, integrator=integrator, substeps=substeps)
+
+
+def network_simulator(name: str, network: Network, iterations: int = 0) -> Simulator:
+    """Return a network as a simulator, with so many iterations of the solver behind it."""
+
+    def run(scene: Scene) -> Trajectory:
+        config = SimConfig(iterations=iterations)
+        return simulate(network, scene, config=config, raises=False).trajectory
+
+    label = f"{name}, {iterations} iterations" if iterations else name
+    return Simulator(label, run, network.garment_options)
 
 
 @dataclasses.dataclass(frozen=True)

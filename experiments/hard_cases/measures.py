@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.pipeline.report.gap import trajectory_states
-from eslr_jax.pipeline.report.referee import judge
 from eslr_jax.simulation.frame import frame_problem
 from eslr_jax.solver.guess import initial_guess
 from eslr_jax.solver.potential import potential
@@ -173,4 +173,4 @@ def _gaps(trajectory: Trajectory, scene: Scene, every: int) -> Float[Array, " fr
 
 def count_crossings(run: Run, frames: list[int]) -> list[int]:
     """Return how many pairs of cloth triangles intersect in some frames."""
-    return [judge(run.positions[frame], run.faces).cloth_cloth for frame in frames]
+    return [len(intersecting_pairs(run.positions[frame], run.faces)) for frame in frames]

@@ -24,7 +24,7 @@ from eslr_jax.simulation.rollout import rollout_scene
 from eslr_jax.terms import FAST
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Body, Scene
-from inverse.search import descend, gradient_cost, search_simplex
+from inverse.search import race
 from inverse.sheet import RESULTS
 
 BAR = 1.08  # largest principal stretch
@@ -77,16 +77,8 @@ def main() -> None:
         over = jnp.average(jnp.maximum(stretch - BAR, 0.0) ** 2, weights=garment.rest_areas)
         return over + PRICE * jnp.sum(parameters**2), (worn, stretch)
 
-    both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
-
-    def value_and_grad(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        (value, _), gradient = slope(parameters)
-        return 1e4 * value, 1e4 * gradient
-
     start = np.zeros(len(BANDS))
-    cost = gradient_cost(both, slope, start, turns)
-    by_gradient = descend(value_and_grad, start, steps)
-    simplex = search_simplex(lambda parameters: 1e4 * both(parameters)[0], start, round(cost * steps))
+    both, cost, evaluations, by_gradient, simplex = race(loss, start, steps, turns, unit=1e-4)
     shirts = {"tight": start, "lbfgs": by_gradient.best, "nelder_mead": simplex.best}
     worn = {name: both(jnp.asarray(best, jnp.float32))[1] for name, best in shirts.items()}
     areas = np.asarray(garment.rest_areas)
@@ -94,7 +86,7 @@ def main() -> None:
         "bar": BAR,
         "bands": BANDS,
         "gradient_in_evaluations": round(cost, 2),
-        "evaluations": round(cost * steps),
+        "evaluations": evaluations,
         "refused": by_gradient.refused,
         "let_out_mm": {name: np.round(1e3 * UNIT * best, 1) for name, best in shirts.items()},
         "stretch_99": {name: stretch_below(0.99, stretch, areas) for name, (_, stretch) in worn.items()},

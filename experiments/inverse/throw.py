@@ -17,7 +17,7 @@ from harness import keep, parser
 from eslr_jax.config import SimConfig
 from eslr_jax.pipeline.report.report import environment
 from eslr_jax.simulation.rollout import rollout_scene
-from inverse.search import descend, gradient_cost, search_simplex
+from inverse.search import race
 from inverse.sheet import RESULTS, TIMESTEP, held_scene, square
 
 SIDE, SIZE = 7, 0.24  # vertices, [m]
@@ -64,16 +64,7 @@ def loss(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
 def main() -> None:
     options = parser(__doc__, "a few steps", RESULTS).parse_args()
     steps, turns = (3, 1) if options.smoke else (30, 25)
-    both, slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
-
-    def value_and_grad(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        (value, _), gradient = slope(parameters)
-        return value, gradient
-
-    rest = np.zeros(3 * KNOTS)
-    cost = gradient_cost(both, slope, rest, turns)
-    by_gradient = descend(value_and_grad, rest, steps)
-    simplex = search_simplex(lambda parameters: both(parameters)[0], rest, round(cost * steps))
+    both, cost, _, by_gradient, simplex = race(loss, np.zeros(3 * KNOTS), steps, turns)
     throws = [np.asarray(both(jnp.asarray(run.best, jnp.float32))[1]) for run in (by_gradient, simplex)]
     result = {
         "target_m": TARGET,

@@ -13,42 +13,25 @@ known_drapes.png.
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-PARTS = ("answers", "rotations", "peers", "drape", "order", "walk")
+PARTS = {  # each with the module and function that yields its rows
+    "answers": ("cases", "answer"), "rotations": ("rotations", "turned"), "peers": ("peers", "compare"),
+    "drape": ("drape", "drapes"), "order": ("order", "orders"), "walk": ("walk", "refine"),
+}  # fmt: skip
 
 
 def measure(part: str, is_smoke: bool) -> Iterator[tuple[dict[str, Any], Any]]:
     """Yield a part's rows, each with its drape for the picture or None."""
-    if part == "answers":
-        from known_answers.cases import answer
-
-        yield from ((one.as_dict(), None) for one in answer(is_smoke))
-    elif part == "rotations":
-        from known_answers.rotations import turned
-
-        yield from ((one.as_dict(), None) for one in turned(is_smoke))
-    elif part == "peers":
-        from known_answers.peers import compare
-
-        yield from ((one.as_dict(), None) for one in compare(is_smoke))
-    elif part == "order":
-        from known_answers.order import orders
-
-        yield from ((row._asdict(), None) for row in orders(is_smoke))
-    elif part == "walk":
-        from known_answers.walk import refine
-
-        for row in refine(is_smoke):
-            yield row._asdict(), None
-    else:
-        from known_answers.drape import drapes
-
-        yield from ((row._asdict(), (row, hung)) for row, hung in drapes(is_smoke))
+    module, name = PARTS[part]
+    for found in getattr(importlib.import_module(f"known_answers.{module}"), name)(is_smoke):
+        row = found[0] if part == "drape" else found
+        yield getattr(row, "as_dict", row._asdict)(), found if part == "drape" else None
 
 
 def draw(result: dict[str, Any], drapes: list, path: Path) -> None:
@@ -137,7 +120,7 @@ def main() -> None:
     import harness
 
     parser = harness.parser(__doc__, "the smallest of every part")
-    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--part", nargs="*", choices=list(PARTS), default=list(PARTS))
     arguments = parser.parse_args()
 
     from eslr_jax.pipeline.report.report import environment

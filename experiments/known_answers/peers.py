@@ -5,32 +5,27 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from blender_cloth import blender_simulator
+import newton_cloth
+from blender_cloth import BEST, blender_simulator
 from hard_cases import Simulator
-from newton_cloth import Setting, newton_simulator
 
 from eslr_jax.errors import MissingExtraError
 from known_answers.cases import FOR_PEERS, Answer, slope
 
-_NEWTON = {
-    "Newton VBD 5x20": Setting("vbd", 5, 20),
-    "Newton Style3D 2x20": Setting("style3d", 2, 20),
-    "Newton XPBD": Setting("xpbd", None, 1),
-}
-_BLENDER = (45, 2)  # steps per frame, rounds of collision per step
 _SLOPES = (35.0, 60.0)  # [degrees]
 
 
 def peers() -> Iterator[Simulator]:
     """Yield the simulators that are installed."""
-    for name, setting in _NEWTON.items():
+    for setting in newton_cloth.BEST:
+        effort = f" {setting.substeps}x{setting.iterations}" if setting.substeps else ""
         try:
-            yield dataclasses.replace(newton_simulator(setting), name=name)
+            yield dataclasses.replace(newton_cloth.newton_simulator(setting), name=setting.name + effort)
         except MissingExtraError as error:
             print(f"left out: {error}")
             break
     try:
-        yield dataclasses.replace(blender_simulator(_BLENDER), name="Blender {}x{}".format(*_BLENDER))
+        yield dataclasses.replace(blender_simulator(BEST), name="Blender {}x{}".format(*BEST))
     except MissingExtraError as error:
         print(f"left out: {error}")
 

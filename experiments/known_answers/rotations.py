@@ -51,9 +51,8 @@ def elastica(weight: float, load: float, along: float = 0.0) -> Curve:
     """
     arc = np.linspace(0, 1, 201)
     state = np.stack([0.5 * np.pi * arc, np.full(201, 0.5 * np.pi)]) if along else np.zeros((2, 201))
-    for share in np.linspace(0, 1, 2 + int((weight + load) / 5))[
-        1:
-    ]:  # from the level on, so that it converges
+    # From the level on, so that it converges.
+    for share in np.linspace(0, 1, 2 + int((weight + load) / 5))[1:]:
 
         def slopes(s, t, share=share):
             down = share * (weight * (1 - s) + load)

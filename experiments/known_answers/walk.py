@@ -41,8 +41,7 @@ def run(garment: str, vertices: str, frames: int, *, iterations: int, steps: int
 
 def _apart(found: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Return the distance of the same vertices [mm], rms and for 99 %, without frame 0."""
-    distance = 1e3 * np.linalg.norm(found[1:] - reference[1:], axis=-1)
-    return float(np.sqrt(np.mean(distance**2))), float(np.quantile(distance, 0.99))
+    return _summary(np.linalg.norm(found[1:] - reference[1:], axis=-1))
 
 
 def _off_surface(found: np.ndarray, reference: np.ndarray, faces: np.ndarray) -> tuple[float, float]:
@@ -51,9 +50,12 @@ def _off_surface(found: np.ndarray, reference: np.ndarray, faces: np.ndarray) ->
     for points, surface in zip(found[1:], reference[1:], strict=True):
         nearest, weights = closest_points(points, surface, faces)
         at = np.einsum("pk,pkx->px", weights, surface[faces[nearest]])
-        distances.append(1e3 * np.linalg.norm(points - at, axis=1))
-    distance = np.array(distances)
-    return float(np.sqrt(np.mean(distance**2))), float(np.quantile(distance, 0.99))
+        distances.append(np.linalg.norm(points - at, axis=1))
+    return _summary(np.array(distances))
+
+
+def _summary(distance: np.ndarray) -> tuple[float, float]:
+    return 1e3 * float(np.sqrt(np.mean(distance**2))), 1e3 * float(np.quantile(distance, 0.99))
 
 
 def refine(is_smoke: bool, garment: str = "tshirt") -> Iterator[Refinement]:

@@ -17,8 +17,13 @@ from eslr_jax.networks.network import Network
 from eslr_jax.pipeline.assets.budget import SOLVER
 from eslr_jax.pipeline.assets.models import model_record
 from eslr_jax.pipeline.report.calibrate import simulator_of
-from eslr_jax.pipeline.report.controls import EMBEDDING_CONTROLS, Control, control_garment, control_network
-from eslr_jax.pipeline.report.evaluate import distance_mm
+from eslr_jax.pipeline.report.evaluate import (
+    EMBEDDING_CONTROLS,
+    Control,
+    control_garment,
+    control_network,
+    distance_mm,
+)
 from eslr_jax.pipeline.report.gap import OptimalityGap, stepped_potentials, trajectory_gap
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pose.lbs import skin_garment
@@ -59,7 +64,7 @@ def read_system(name: str) -> System:
     Args:
         name: `OPTIMUM`; `GUESS`, the solver's own guess untouched; or a bundled network or exported file, as
             NAME[:STEPS][+ITERATIONS][~CHANGE]. STEPS are refinement steps, ITERATIONS the solver's behind it.
-            CHANGE is a control of `pipeline.report.controls` or another mode of the geodesic embedding.
+            CHANGE is a control of `pipeline.report.evaluate` or another mode of the geodesic embedding.
             SYSTEM@FOLDER is one of `posed.SYSTEMS`, "ssch" or "mat" with the networks that were trained there.
             Their control is `SKINNED`, the garment carried by the joints; mat's is "mat@FOLDER~untrained".
     """

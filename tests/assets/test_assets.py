@@ -22,7 +22,7 @@ from eslr_jax.networks.weights import write_network
 from eslr_jax.pipeline.assets import asset_names, load_garment_file, load_splits
 from eslr_jax.pipeline.assets.catalog import is_intact, list_assets
 from eslr_jax.pipeline.assets.garments import check_resolution
-from eslr_jax.pipeline.cli.actor import is_moving_mesh, load_wearer
+from eslr_jax.pipeline.cli.method import is_moving_mesh, load_wearer
 from eslr_jax.pose.motion import Motion, still_motion
 
 

@@ -10,15 +10,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from flax import struct
 from garment_files import bundled, scanned_tshirt
 
 from eslr_jax import load_garment
 from eslr_jax.pipeline.assets import cache, garments, load_garment_file
 from eslr_jax.pipeline.assets.cache import (
     cache_folder,
-    cached_arrays,
-    cached_struct,
+    cached,
     content_key,
     trim_folder,
 )
@@ -50,29 +48,6 @@ def test_second_load_computes_nothing(empty_cache, scan, body, monkeypatch):
         load_garment(scan, body=body, fit=FitOptions(pin=("loop:top",)))  # other options, another entry
     with pytest.raises(TypeError):
         load_garment(scan, body=body.replace(rest_positions=body.rest_positions * 1.01))  # another body
-
-
-@struct.dataclass
-class Labelled:
-    """A pytree with a static field of every kind."""
-
-    values: np.ndarray
-    absent: np.ndarray | None = None
-    is_marked: bool = struct.field(pytree_node=False, default=False)
-    count: int = struct.field(pytree_node=False, default=0)
-    scale: float = struct.field(pytree_node=False, default=1.0)
-    name: str | None = struct.field(pytree_node=False, default=None)
-    parts: tuple = struct.field(pytree_node=False, default=())
-
-
-def test_static_fields_keep_their_types(empty_cache):
-    made = Labelled(np.ones(2), None, True, 3, 0.1, "it's", ("a", (2, None)))
-    for make in (lambda: made, None):  # stored, then read
-        kept = cached_struct("key", Labelled, make)
-        assert jax.tree.structure(kept) == jax.tree.structure(made)
-        assert hash(jax.tree.structure(kept)) == hash(jax.tree.structure(made))
-        for field in dataclasses.fields(Labelled)[2:]:
-            assert type(getattr(kept, field.name)) is type(getattr(made, field.name))
 
 
 def test_a_garment_from_the_cache_has_the_structure_of_one_that_is_new(empty_cache):
@@ -113,7 +88,7 @@ def test_an_entry_tells_the_joints_of_its_own_body(empty_cache, scan, body):
 def test_unwritable_cache_costs_only_time(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert cached_arrays(content_key("x"), lambda: {"a": np.ones(2)})["a"].tolist() == [1, 1]
+    assert cached(content_key("x"), lambda: {"a": np.ones(2)})["a"].tolist() == [1, 1]
 
 
 def test_keys_tell_contents_apart():
@@ -135,9 +110,9 @@ def test_keys_tell_contents_apart():
 @pytest.mark.slow
 def test_two_processes_may_make_the_same_entry(empty_cache):
     code = (
-        "import numpy as np; from eslr_jax.pipeline.assets.cache import cached_arrays\n"
+        "import numpy as np; from eslr_jax.pipeline.assets.cache import cached\n"
         "for k in range(40):\n"
-        "    a = cached_arrays(f'{k:064d}', lambda: {'a': np.full((200, 200), k, float)})['a']\n"
+        "    a = cached(f'{k:064d}', lambda: {'a': np.full((200, 200), k, float)})['a']\n"
         "    assert a.shape == (200, 200) and (a == k).all()"
     )
     workers = [subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE) for _ in range(2)]

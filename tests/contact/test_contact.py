@@ -7,7 +7,7 @@ from cloth import grid_faces, make_garment
 from draped_ball import TIMESTEP, drifting_ball, square
 
 from eslr_jax import SimConfig, prepare_scene, rollout_scene, scene_terms, simulate
-from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 from eslr_jax.terms import Damping, Friction
 
 

@@ -134,8 +134,7 @@ def test_inside_out_and_mixed_faces_are_turned_with_their_texture(body, shirt):
     faces = shirt.faces.copy()
     faces[5:] = faces[5:, ::-1]
     uvs = np.arange(faces.size * 2, dtype=float).reshape(-1, 3, 2)
-    mesh = dataclasses.replace(source(shirt.rest_positions, faces).mesh, corner_uvs=uvs)
-    fitted = fit_garment(dataclasses.replace(source(shirt.rest_positions, faces), mesh=mesh), body)
+    fitted = fit_garment(source(shirt.rest_positions, faces, corner_uvs=uvs), body)
     np.testing.assert_array_equal(fitted.faces[5:], shirt.faces[5:])
     np.testing.assert_array_equal(fitted.corner_uvs[5:], uvs[5:, ::-1])
     np.testing.assert_array_equal(fitted.corner_uvs[:5], uvs[:5])
@@ -221,10 +220,7 @@ def test_fitted_garment_has_the_pins_of_file_and_options(body, shirt):
 
 def test_pins_by_region_part_and_edge(body, shirt):
     parts = (np.arange(len(shirt.faces)) < 3).astype(int)
-    plain = source(shirt.rest_positions, shirt.faces)
-    cloth = dataclasses.replace(
-        plain, mesh=dataclasses.replace(plain.mesh, face_parts=parts, part_names=("body", "hem"))
-    )
+    cloth = source(shirt.rest_positions, shirt.faces, face_parts=parts, part_names=("body", "hem"))
     x, y, _ = shirt.rest_positions.T
 
     def pinned(text):

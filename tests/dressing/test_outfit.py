@@ -14,7 +14,7 @@ from eslr_jax.pipeline.assets import prepare_stored
 from eslr_jax.pipeline.dressing.outfit import LAYER_GAP, combine_garments
 from eslr_jax.pipeline.fabrics import garment_material, worn_fabrics
 from eslr_jax.pipeline.formats.garment import GarmentFile
-from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 
 MOST = (0, 0, 1, 1)  # intersecting pairs; without edges against edges the last two have up to 4 and 8
 

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from eslr_jax import AssetError
 from eslr_jax.errors import MissingExtraError
-from eslr_jax.pipeline.cli.actor import is_moving_mesh, load_actor
+from eslr_jax.pipeline.cli.method import is_moving_mesh, load_actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, vertex_normals
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_source
 from eslr_jax.pipeline.formats.gltf import TOLERANCE
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence, read_mesh_sequences
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile
 
 alembic3d = pytest.importorskip("alembic3d")
 import imath  # noqa: E402
@@ -104,11 +104,11 @@ def test_it_comes_back_exactly(scene):
     assert read_mesh_sequence(f"{scene}#body", fps=15.0).fps == 15.0
     garment = read_garment_source(f"{scene}#My_shirt")
     assert (garment.name, garment.is_metric) == ("My_shirt", False)
-    np.testing.assert_array_equal(garment.mesh.positions, MOVING[0])
-    np.testing.assert_array_equal(garment.mesh.corner_uvs, SHIRT.corner_uvs)
-    assert garment.mesh.part_names == ("left_sleeve", "front")
-    np.testing.assert_array_equal(garment.mesh.face_parts, ~SHIRT.parts["left sleeve"])
-    both = read_alembic_garment(scene).mesh  # as the pieces of one
+    np.testing.assert_array_equal(garment.positions, MOVING[0])
+    np.testing.assert_array_equal(garment.corner_uvs, SHIRT.corner_uvs)
+    assert garment.part_names == ("left_sleeve", "front")
+    np.testing.assert_array_equal(garment.face_parts, ~SHIRT.parts["left sleeve"])
+    both = read_alembic_garment(scene)  # as the pieces of one
     np.testing.assert_array_equal(both.positions, np.concatenate([MOVING[0], BODY.positions[0]]))
     np.testing.assert_array_equal(both.faces[-len(FACES) :], BODY.faces + VERTICES)
     assert both.corner_uvs is None
@@ -120,7 +120,7 @@ def test_usd_glb_and_abc_of_a_run_agree(tmp_path):
 
     ways = np.cumsum(RNG.normal(scale=0.01, size=MOVING.shape), axis=0)
     positions = (np.asarray(SPHERE.vertices) + ways).astype(np.float32)
-    body = BodyTrack(positions[:, ::-1], VERTICES - 1 - FACES, positions[0, ::-1])
+    body = AnimatedMesh("body", positions[:, ::-1], VERTICES - 1 - FACES, rest_positions=positions[0, ::-1])
     run = TrajectoryFile(positions, SHIRT.velocities, FACES, STEP, {"garment": "tank"}, body)
     half = np.arange(len(FACES)) % 2
     garment = GarmentFile(
@@ -136,7 +136,7 @@ def test_usd_glb_and_abc_of_a_run_agree(tmp_path):
             points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr().Get(frame)
             np.testing.assert_array_equal(found.positions[frame], np.array(points))
     np.testing.assert_allclose(cloth.positions, morphed.positions, atol=TOLERANCE)
-    assert read_garment_source(f"{path}#tank").mesh.part_names == ("front", "back")
+    assert read_garment_source(f"{path}#tank").part_names == ("front", "back")
 
 
 def write_foreign(
@@ -188,7 +188,7 @@ def test_others_polygons_transforms_and_times(tmp_path, kind):
         *(found.positions[0][found.faces[:, k]] - found.positions[0][found.faces[:, 0]] for k in (1, 2))
     )
     np.testing.assert_allclose(normals, [[1, 0, 0]] * 2, atol=1e-7)  # the square's +z, turned
-    garment = read_garment_source(tmp_path / "a.abc").mesh
+    garment = read_garment_source(tmp_path / "a.abc")
     np.testing.assert_array_equal(garment.corner_uvs, square[:, :2][garment.faces])
 
 

@@ -12,11 +12,12 @@ import trimesh
 from commands import eslr
 
 from eslr_jax import AssetError, load_motion, pose_body
-from eslr_jax.pipeline.formats.animated import Skin
+from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import GarmentFile, in_vertex_order
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, write_trajectory
+from eslr_jax.pipeline.formats.palette import SKIN_COLOR
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, write_trajectory
 
 FRAMES, STEP = 4, 1 / 30
 SPHERE = trimesh.creation.icosphere(subdivisions=1)
@@ -31,7 +32,9 @@ def run():
         positions=positions,
         velocities=rng.normal(size=positions.shape).astype(np.float32),
         faces=np.asarray(SPHERE.faces),
-        body=BodyTrack(
+        body=AnimatedMesh(
+            name="body",
+            color=SKIN_COLOR,
             positions=positions[:, ::-1] + np.float32(2),
             faces=VERTICES - 1 - np.asarray(SPHERE.faces),
             rest_positions=positions[0],
@@ -239,7 +242,9 @@ def test_blender_lays_point_caches_on_the_mesh(tmp_path, run, garment, suffix):
 def skinned(run, body):
     """A run on the bundled body, which joints move."""
     poses = pose_body(body, load_motion("jump"), num_frames=FRAMES)
-    track = BodyTrack(
+    track = AnimatedMesh(
+        name="body",
+        color=SKIN_COLOR,
         positions=np.asarray(poses.positions),
         faces=np.asarray(poses.faces),
         rest_positions=np.asarray(poses.rest_positions),

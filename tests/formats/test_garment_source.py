@@ -34,8 +34,8 @@ def hood(tmp_path_factory):
 
 def test_hood_garments_by_name_with_their_pins(hood):
     source = read_garment_source(f"{hood}#dress")
-    np.testing.assert_allclose(source.mesh.positions, POSITIONS * 2)
-    np.testing.assert_array_equal(source.mesh.faces, FACES)
+    np.testing.assert_allclose(source.positions, POSITIONS * 2)
+    np.testing.assert_array_equal(source.faces, FACES)
     assert np.flatnonzero(source.is_pinned).tolist() == [1, 4]
     assert source.name == "dress"
     assert source.is_metric

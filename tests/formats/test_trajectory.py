@@ -8,8 +8,9 @@ import pytest
 
 from eslr_jax import AssetError, load_trajectory, pose_body, prepare_scene
 from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
-from eslr_jax.pipeline.formats.animated import Skin
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
+from eslr_jax.pipeline.formats.palette import SKIN_COLOR
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.pipeline.report.run import ClothTrack, read_run, run_trajectory, write_run
 from eslr_jax.pose.motion import still_motion
 
@@ -21,9 +22,11 @@ def floats(*shape):
     return RNG.normal(size=shape).astype(np.float32)
 
 
-BODY = BodyTrack(
+BODY = AnimatedMesh(
+    "body",
     positions=floats(FRAMES, 4, 3),
     faces=np.array([[0, 1, 2], [0, 2, 3]]),
+    color=SKIN_COLOR,
     rest_positions=floats(4, 3),
     skin=Skin(
         np.full((4, 2), np.float32(0.5)), np.tile([0, 1], (4, 1)), floats(FRAMES, 2, 3, 4), floats(2, 3),

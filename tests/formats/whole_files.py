@@ -13,6 +13,7 @@ from foreign_files import SMPL_PARENTS, write_amass, write_bvh, write_character,
 
 from eslr_jax.files.npz import write_arrays
 from eslr_jax.pipeline.assets.motions import read_joint_map
+from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.bundled import read_body, read_motion_archive
 from eslr_jax.pipeline.formats.bvh import read_bvh
 from eslr_jax.pipeline.formats.garment import (
@@ -24,10 +25,9 @@ from eslr_jax.pipeline.formats.garment import (
 from eslr_jax.pipeline.formats.gltf_rig import read_gltf_body, read_gltf_motion
 from eslr_jax.pipeline.formats.mesh_sequence import read_mesh_sequence
 from eslr_jax.pipeline.formats.smpl import read_amass, read_smpl_body, read_smpl_pickle
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, read_trajectory, write_trajectory
 from eslr_jax.pipeline.rigs.rig import make_body
 from eslr_jax.pipeline.rigs.sequence import pose_sequence
-from eslr_jax.pose.motion import Motion
 from eslr_jax.pose.skeleton import Skeleton, SkeletonMotion, chain_positions
 
 POSITIONS = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0.25], [0, 0.5, 0.125], [0.25, 0.75, 0]])
@@ -39,7 +39,7 @@ def read_as_garment(path: Path) -> None:
     from eslr_jax.mesh.validate import check_arrays
 
     source = read_garment_source(path)
-    check_arrays(source.mesh.positions, source.mesh.faces, name=path.name)
+    check_arrays(source.positions, source.faces, name=path.name)
 
 
 def whole_garment(kind: str, path: Path) -> None:
@@ -171,7 +171,7 @@ ARRAYS = {
     "motion archive": (
         lambda: {"joint_names": np.array(["a", "b"]), "c/rotations": np.zeros((4, 2, 3)),
                  "c/translations": np.zeros((4, 3)), "c/fps": np.array(30.0)},
-        lambda p: [Motion(name, *clip) for name, clip in read_motion_archive(p).items()],
+        read_motion_archive,
     ),
     "body": (
         lambda: {
@@ -189,7 +189,7 @@ ARRAYS = {
     ),
     "trajectory": (
         lambda: arrays_of(content(write_trajectory, TrajectoryFile(
-            GRID, GRID, GRID_FACES, 0.1, body=BodyTrack(GRID, GRID_FACES, GRID[0]),
+            GRID, GRID, GRID_FACES, 0.1, body=AnimatedMesh("body", GRID, GRID_FACES, rest_positions=GRID[0]),
             friction_loads=GRID[..., 0],
         ), suffix=".npz")),
         read_trajectory,

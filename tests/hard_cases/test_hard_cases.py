@@ -6,13 +6,14 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard_cases import CASES, CaseScene, Measure, Run, Simulator, find_case, run_case, solver_simulator
+from hard_cases import CASES, CaseScene, Measure, Run, Simulator, find_case, run_case
 from hard_cases.build import FRAME, hanging_sheet, make_cloth, make_scene, sheet
+from hard_cases.case import solver_simulator
 from hard_cases.colliders import Sphere
 from hard_cases.measures import depths, mechanical_energy, optimality_gaps, settle, triangle_depths
 
 from eslr_jax import ConfigError, MeshError, Status
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.terms import Contact
 
 

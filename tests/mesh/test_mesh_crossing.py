@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from cloth import make_sheet
 
-from eslr_jax.pipeline.report.crossing import find_crossings
-from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.crossing import find_crossings, intersecting_pairs
 
 SPACING, GAP = 0.02, 0.01  # [m]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eslr_jax.mesh.parting import parted, uncrossed
-from eslr_jax.pipeline.report.referee import intersecting_pairs
+from eslr_jax.pipeline.report.crossing import intersecting_pairs
 
 
 @pytest.fixture(scope="module")

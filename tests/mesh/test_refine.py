@@ -6,7 +6,7 @@ import trimesh
 from cloth import make_sheet
 
 from eslr_jax.mesh.topology import face_areas, unique_edges
-from eslr_jax.pipeline.dressing.refine import refine
+from eslr_jax.pipeline.dressing.remesh import refine
 
 
 @pytest.mark.parametrize("scheme", ["t", "q", "tq"])

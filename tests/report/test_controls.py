@@ -14,7 +14,7 @@ from draped_ball import drifting_ball, square
 from eslr_jax import ConfigError, Network, SimConfig, prepare_scene, rollout_scene
 from eslr_jax.mesh.padding import choose_bucket, pad_garment
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.report.controls import Control, control_garment, control_network
+from eslr_jax.pipeline.report.evaluate import Control, control_garment, control_network
 from eslr_jax.pipeline.report.gap import stepped_potentials, trajectory_gap
 from eslr_jax.simulation.frame import first_problem
 from eslr_jax.terms import CLOTH

@@ -17,9 +17,9 @@ from eslr_jax import (
 )
 from eslr_jax.networks.eslr import Eslr
 from eslr_jax.pipeline.report.evaluate import EvaluationOptions, evaluate
-from eslr_jax.pipeline.report.foreign import foreign_trajectory, with_energies
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.pipeline.report.report import trajectory_report
+from eslr_jax.pipeline.report.score import foreign_trajectory, with_energies
 from eslr_jax.terms.air import blowing
 
 FRAMES = 7

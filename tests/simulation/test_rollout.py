@@ -126,8 +126,8 @@ def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
 
 @pytest.mark.slow
 def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved):
-    from eslr_jax.pipeline.report.foreign import find_friction_loads
     from eslr_jax.pipeline.report.gap import reached_potentials, trajectory_states
+    from eslr_jax.pipeline.report.score import find_friction_loads
 
     scene = prepare_scene(cloth, poses).replace(pin_targets=None)
     trajectory = rollout_scene(None, scene, SOLVER)

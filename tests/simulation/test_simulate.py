@@ -21,7 +21,7 @@ from eslr_jax import (
     simulate,
 )
 from eslr_jax.fabric.materials import COTTON
-from eslr_jax.pipeline.cli.actor import Actor
+from eslr_jax.pipeline.cli.method import Actor
 from eslr_jax.pipeline.cli.options import Options
 from eslr_jax.pipeline.cli.simulate import Unfinished
 from eslr_jax.pipeline.report.gap import GapOptions, measure_gap

@@ -18,8 +18,7 @@ import pytest
 from eslr_jax import CheckpointError, ConfigError, TrainConfig, load_model
 from eslr_jax.networks.normalizer import WARMUP_UPDATES
 from eslr_jax.networks.registry import MODELS
-from eslr_jax.pipeline.assets.models import model_record
-from eslr_jax.pipeline.assets.training import load_training_data
+from eslr_jax.pipeline.assets.models import load_training_data, model_record
 from eslr_jax.simulation.scene import initial_state
 from eslr_jax.solver.guess import pushed_out_guess
 from eslr_jax.solver.potential import potential

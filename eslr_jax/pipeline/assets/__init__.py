@@ -1,6 +1,5 @@
 """Bundled bodies, garments, motions and networks, loaded by name, and those of a user by path."""
 
-from eslr_jax.pipeline.assets.bodies import load_body
 from eslr_jax.pipeline.assets.catalog import (
     Asset,
     asset_names,
@@ -11,7 +10,7 @@ from eslr_jax.pipeline.assets.catalog import (
 )
 from eslr_jax.pipeline.assets.garments import load_garment, load_garment_file, prepare_stored
 from eslr_jax.pipeline.assets.models import load_model
-from eslr_jax.pipeline.assets.motions import load_motion
+from eslr_jax.pipeline.assets.motions import load_body, load_motion
 
 __all__ = [
     "Asset",

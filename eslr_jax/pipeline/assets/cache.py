@@ -7,12 +7,11 @@ can't be read or written costs time and nothing else.
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import dataclasses
 import hashlib
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,12 +35,13 @@ _CODE = (
     "pipeline/assets/garments.py",
     "pipeline/rigs/alignment.py",
     "pipeline/rigs/rig.py",
+    "simulation/archive.py",
     "numerics.py",
     "types.py",
 )
 
-Struct = TypeVar("Struct")
-_STATIC = "static"  # the array that holds the static fields of a pytree, as a Python literal
+Value = TypeVar("Value")
+_read_arrays = partial(read_arrays, content="cache")
 
 
 def user_cache() -> Path:
@@ -96,40 +96,20 @@ def content_key(*parts: Any) -> str:
     return digest.hexdigest()
 
 
-def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the arrays of an entry, named by `content_key`; make and store them if the entry is missing."""
+def cached(
+    key: str,
+    make: Callable[[], Value],
+    *,
+    write: Callable[[Path, Value], None] = write_arrays,
+    read: Callable[[Path], Value] = _read_arrays,
+) -> Value:
+    """Return an entry, named by `content_key`; make and store it if it is missing. By default it holds arrays."""
     path = cache_folder() / f"{key}.npz"
     if path.exists():
         with contextlib.suppress(AssetError, OSError):  # damaged, or just removed: make it again
-            arrays = read_arrays(path, content="cache")
+            value = read(path)
             os.utime(path)
-            return arrays
-    arrays = make()
-    write_kept(path, lambda path: write_arrays(path, arrays), MAX_ENTRIES)
-    return arrays
-
-
-def cached_struct(key: str, kind: type[Struct], make: Callable[[], Struct]) -> Struct:
-    """Return the pytree of an entry; compute and store it if the entry is missing.
-
-    Args:
-        key: Name of the entry, from `content_key`.
-        kind: Its class, a `flax.struct.dataclass`. A field of leaves holds one array, or None where that is its
-            default. A static field (`pytree_node=False`) holds numbers, text, booleans, None or tuples of these.
-        make: Computes the pytree.
-
-    Returns:
-        The pytree with NumPy leaves. Static fields keep their types, which JAX hashes to find compiled programs.
-    """
-    fields = dataclasses.fields(kind)  # type: ignore[arg-type]
-    static = [field.name for field in fields if not field.metadata.get("pytree_node", True)]
-
-    def make_arrays() -> dict[str, np.ndarray]:
-        made = make()
-        values = {field.name: getattr(made, field.name) for field in fields}
-        text = repr({name: values.pop(name) for name in static})
-        arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
-        return arrays | {_STATIC: np.array(text)}
-
-    arrays = dict(cached_arrays(key, make_arrays))
-    return kind(**ast.literal_eval(str(arrays.pop(_STATIC))), **arrays)
+            return value
+    value = make()
+    write_kept(path, lambda path: write(path, value), MAX_ENTRIES)
+    return value

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,19 +15,18 @@ from eslr_jax.errors import ConfigError
 from eslr_jax.files.parsing import parsing
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.prepare import prepare_garment, to_device
-from eslr_jax.pipeline.assets.bodies import load_body
-from eslr_jax.pipeline.assets.cache import cached_arrays, cached_struct, content_key
+from eslr_jax.pipeline.assets.cache import cached, content_key
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
+from eslr_jax.pipeline.assets.motions import load_body
 from eslr_jax.pipeline.dressing.fit import fit_garment
 from eslr_jax.pipeline.dressing.options import FitOptions, Scale
-from eslr_jax.pipeline.dressing.refine import refine
+from eslr_jax.pipeline.dressing.remesh import refine
 from eslr_jax.pipeline.dressing.report import check_wearer, wearer_entry
 from eslr_jax.pipeline.dressing.sewing import sew_pattern
 from eslr_jax.pipeline.dressing.transfer import transfer_garment
 from eslr_jax.pipeline.fabrics import garment_material
 from eslr_jax.pipeline.formats.garment import (
     GarmentFile,
-    GarmentSource,
     garment_arrays,
     garment_from_arrays,
     garment_path,
@@ -36,6 +36,7 @@ from eslr_jax.pipeline.formats.garment import (
 )
 from eslr_jax.pipeline.formats.pattern import read_pattern
 from eslr_jax.pipeline.formats.registry import suffixes_of
+from eslr_jax.simulation.archive import read_tree, write_tree
 from eslr_jax.types import Body, Garment
 
 # Of the bundled body, on which patterns for GarmentCode's mean body stretch little: 1.69 m tall, bust and hips
@@ -44,10 +45,7 @@ from eslr_jax.types import Body, Garment
 MEAN_SHAPE = (-1.6, 0.0, 1.0, 0.0)
 Resolution = Literal["1k", "4k", "10k", "50k", "200k"]
 _SAME_BODY = 1e-4  # [m] by which the bundled body may differ, read from another file
-_REFINED = {
-    "50k": "tq",
-    "200k": "tqq",
-}  # sizes that are made from 4k vertices, see `pipeline.dressing.refine`
+_REFINED = {"50k": "tq", "200k": "tqq"}  # sizes that are made from 4k vertices, see `refine`
 
 
 def load_garment(
@@ -102,11 +100,10 @@ def load_garment_file(
     body: Body | None = None,
     fit: FitOptions | None = None,
     cache: bool = True,
-    on_source: Callable[[GarmentSource], None] | None = None,
 ) -> GarmentFile:
     """Load a garment as arrays on the host, fitted to the body if it is a mesh, carried to it if it is bundled.
 
-    Arguments are those of `load_garment`; `on_source` is told of a mesh before it is fitted.
+    Arguments are those of `load_garment`.
     """
     if not is_path(str(name)):
         options = fit or FitOptions()
@@ -129,14 +126,16 @@ def load_garment_file(
     if path.suffix.lower() in suffixes_of("pattern"):
         return sew_pattern_file(path, body, num_vertices=int(vertices[:-1]) * 1000, cache=cache)
     source = read_garment_source(name)
-    if on_source is not None:
-        on_source(source)
     rig, options = load_body() if body is None else body, fit or FitOptions()
+    parts = ("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
+    return _kept(lambda: fit_garment(source, rig, options), source.name, parts, cache=cache)
+
+
+def _kept(make: Callable[[], GarmentFile], name: str, parts: Iterable[Any], *, cache: bool) -> GarmentFile:
+    """Return a garment that was made of these parts before, or make it; see `content_key`."""
     if not cache:
-        return fit_garment(source, rig, options)
-    key = content_key("fit", path.read_bytes(), str(name), options, rig.joint_names, *_body_arrays(rig))
-    arrays = cached_arrays(key, lambda: garment_arrays(fit_garment(source, rig, options)))
-    return garment_from_arrays(arrays, source.name)
+        return make()
+    return garment_from_arrays(cached(content_key(*parts), lambda: garment_arrays(make())), name)
 
 
 def sew_pattern_file(
@@ -157,20 +156,14 @@ def sew_pattern_file(
     if all(np.array_equal(*pair) for pair in zip(_body_arrays(rig), _body_arrays(source), strict=True)):
         source = rig
 
-    def sew() -> dict[str, np.ndarray]:
-        pattern, name = read_pattern(path), Path(path).name
-        return garment_arrays(
-            sew_pattern(pattern, rig, source, num_vertices=num_vertices, pin=pin, name=name)
-        )
+    def sew() -> GarmentFile:
+        name = Path(path).name
+        return sew_pattern(read_pattern(path), rig, source, num_vertices=num_vertices, pin=pin, name=name)
 
-    if not cache:
-        return garment_from_arrays(sew(), path)
     with parsing(path, "pattern") as file:
         given = file.read_bytes()
     bodies = (rig.joint_names, *_body_arrays(rig), source.joint_names, *_body_arrays(source))
-    return garment_from_arrays(
-        cached_arrays(content_key("sew", given, num_vertices, pin, *bodies), sew), path
-    )
+    return _kept(sew, str(path), ("sew", given, num_vertices, pin, *bodies), cache=cache)
 
 
 def check_resolution(names: Sequence[str], vertices: Resolution) -> None:
@@ -196,15 +189,10 @@ def _carried(stored: GarmentFile, body: Body | None, scale: Scale, *, cache: boo
         and np.allclose(body.rest_positions, own.rest_positions, atol=_SAME_BODY)
     ):
         return dataclasses.replace(stored, metadata=stored.metadata | wearer_entry(own))  # its run keeps it
-    if not cache:
-        return transfer_garment(stored, own, body, scale=scale)
     bends = () if body.pose_directions is None else (np.asarray(body.pose_directions),)
     arrays = [array for _, array in sorted(garment_arrays(stored).items())]
-    key = content_key(
-        "transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends
-    )
-    carried = cached_arrays(key, lambda: garment_arrays(transfer_garment(stored, own, body, scale=scale)))
-    return garment_from_arrays(carried, "garment")
+    parts = ("transfer", scale, body.joint_names, *arrays, *_body_arrays(own), *_body_arrays(body), *bends)
+    return _kept(lambda: transfer_garment(stored, own, body, scale=scale), "garment", parts, cache=cache)
 
 
 def _refined(stored: GarmentFile, scheme: str) -> GarmentFile:
@@ -274,7 +262,9 @@ def prepare_stored(
 
     own = [array for key, array in sorted(garment_arrays(stored).items()) if key != "metadata"]
     key = content_key("prepare", pad, sorted(options.items()), *own)
-    garment = cached_struct(key, Garment, make) if cache else make()
+    read = partial(read_tree, kind=Garment, content="garment", remedy="make it again")
+    write = partial(write_tree, content="garment")
+    garment = cached(key, make, write=write, read=read) if cache else make()
     if has_coarse_edges:
         garment = add_coarse_edges(garment)
     if stored.metadata.get("fabrics"):

@@ -1,31 +1,61 @@
-"""Load motions by name or by path, carried over to a body."""
+"""Load bodies and motions by name or by path."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.errors import AssetError, ConfigError, MotionError
 from eslr_jax.files.npz import read_arrays
 from eslr_jax.files.parsing import parsing, split_name
-from eslr_jax.pipeline.assets.bodies import load_body
+from eslr_jax.mesh.validate import validate_body
 from eslr_jax.pipeline.assets.catalog import find_asset, is_path
-from eslr_jax.pipeline.formats.bundled import read_motion_archive
+from eslr_jax.pipeline.formats.bundled import pick_clip, read_body, read_motion_archive
 from eslr_jax.pipeline.formats.gltf_rig import GLTF_SUFFIXES, gltf_clip_names
 from eslr_jax.pipeline.formats.registry import find_reader
 from eslr_jax.pipeline.rigs.procedural import PROCEDURAL, make_procedural
-from eslr_jax.pipeline.rigs.rig import make_motion, skeleton_motion
-from eslr_jax.pose.motion import Motion
+from eslr_jax.pipeline.rigs.rig import make_body, make_motion, skeleton_motion
+from eslr_jax.pose.motion import Motion, shape_body
 from eslr_jax.pose.skeleton import SkeletonMotion
 from eslr_jax.pose.timing import skip_start_pose
 from eslr_jax.types import Body
+
+
+def load_body(name: str | Path = "anny", *, units: str | None = None, betas: Sequence[float] = ()) -> Body:
+    """Load a rigged body; warn if the unit of its file is a guess.
+
+    Args:
+        name: Name of a bundled body, or path of one: a SMPL, SMPL-H or SMPL-X model (.npz, .pkl), a skinned
+            character (.gltf, .glb, .vrm), or an npz file in the bundled format. `FILE#MESH,MESH` picks
+            the meshes of a character that make up the body.
+        units: Unit of the file: m, dm, cm, mm, in, ft, or metres per unit; by default recognised.
+        betas: Shape coefficients [standard deviations] of a body with shapes, such as a SMPL model.
+
+    Raises:
+        AssetError: There is no such body, the file is damaged, or its unit is unknown.
+        ConfigError: The body has fewer shapes than betas, or a unit is given and it is always in metres.
+        MissingExtraError: The file needs an extra that is not installed.
+        MeshError: A body is inside out, or in the bundled format not closed.
+    """
+    text = str(name)
+    file, meshes = split_name(text)
+    found = find_reader("body", file)(file, meshes) if is_path(text) else read_body(find_asset("body", text))
+    if not isinstance(found, Body):
+        found = make_body(found, units=units)
+    elif units is not None:
+        raise ConfigError(f"body {text} is in metres; leave out its unit")
+    else:
+        rest, faces, is_obstacle = map(np.asarray, (found.rest_positions, found.faces, found.is_obstacle))
+        validate_body(rest, faces, is_obstacle, name=Path(file).name)
+    return shape_body(found, betas) if len(betas) else found
+
 
 DEFAULT_MOTION = "cmu_016_32"
 
@@ -140,23 +170,11 @@ def _is_made_for(motion: Motion, body: Body, *, is_bundled: bool) -> bool:
 
 def _bundled_motion(text: str) -> Motion:
     """Load a clip by name, or from an archive in the bundled format."""
-    if is_path(text):
-        file, clip = split_name(text)
-        if not Path(file).exists():
-            raise AssetError(f"motion file {file} doesn't exist; check the path")
-        clips = _motion_archive(Path(file), Path(file).stat().st_mtime)
-        if not clip and len(clips) > 1:
-            raise MotionError(f"{file} holds {len(clips)} clips; name one, as in {file}#{next(iter(clips))}")
-        clip = clip or next(iter(clips))
-        if clip not in clips:
-            raise MotionError(f"{file} has no clip {clip!r}; it has {', '.join(clips)}")
-    else:
-        path, clip = find_asset("motion", text), text
-        clips = _motion_archive(path, path.stat().st_mtime)
-    return Motion(clip, *clips[clip])
+    if not is_path(text):
+        return _bundled_clips(find_asset("motion", text))[text]
+    file, clip = split_name(text)
+    clips = read_motion_archive(file)
+    return clips[pick_clip(file, list(clips), clip)]
 
 
-@lru_cache(maxsize=4)
-def _motion_archive(path: Path, modified: float):
-    del modified  # part of the key: a changed file is read again
-    return read_motion_archive(path)
+_bundled_clips = lru_cache(maxsize=4)(read_motion_archive)  # several of a file are loaded one after the other

@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.errors import AssetError, ConfigError
-from eslr_jax.pipeline.cli.actor import FPS, load_wearer
 from eslr_jax.pipeline.cli.console import app, use_compile_cache, waiting
-from eslr_jax.pipeline.cli.method import choose_method
+from eslr_jax.pipeline.cli.method import FPS, choose_method, load_wearer
 from eslr_jax.pipeline.cli.options import Options, refuse_given
 
 _ARCHITECTURE = "eslr-15"  # the paper's

@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from eslr_jax.errors import AssetError, MissingExtraError
-from eslr_jax.pipeline.cli.actor import load_wearer
 from eslr_jax.pipeline.cli.console import app, say, stderr, use_compile_cache, waiting
+from eslr_jax.pipeline.cli.method import load_wearer
+from eslr_jax.pipeline.cli.options import check_npz
 from eslr_jax.pipeline.dressing.options import FitOptions
 
 if TYPE_CHECKING:
@@ -57,14 +58,11 @@ class Fit:
 
     def __call__(self) -> None:
         """Fit, write the file and the picture, and say what was done."""
-        from eslr_jax.pipeline.assets import prepare_stored
         from eslr_jax.pipeline.dressing.report import describe_fit, describe_transfer
-        from eslr_jax.pipeline.fabrics import garment_material
         from eslr_jax.pipeline.formats.garment import is_garment_file, write_garment_npz
 
         garment, out = self.garment, self.out
-        if out.suffix != ".npz":
-            raise AssetError(f"--out {out}: a fitted garment is an npz file; name it such as {out.stem}.npz")
+        check_npz(out, "a fitted garment")
         if Path(garment).is_file() and is_garment_file(garment):
             raise AssetError(
                 f"{garment} is fitted already; give it to eslr simulate, or give eslr fit the mesh that it was "
@@ -83,9 +81,7 @@ class Fit:
                     f"{self.garment} needs no fit: it is made for this body; give it to eslr simulate, or give "
                     "eslr fit a mesh"
                 )
-            stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(self.fabric)})
-            # It refuses a fabric that is unknown, or of a part that the garment lacks.
-            garment_material(self.fabric, prepare_stored(stored, name=Path(self.garment).name), stored)
+            stored = _with_fabrics(stored, self.fabric, Path(self.garment).name)
         write_garment_npz(self.out, stored)
         # The name of the file alone may be that of the garment's texture.
         drawn = self.out.with_name(f"{self.out.stem}_fit.png")
@@ -105,22 +101,24 @@ class Fit:
         """Return the garment, fitted to the body or carried to it from the one that it was made for."""
         from eslr_jax.pipeline.assets import asset_names, load_garment_file
         from eslr_jax.pipeline.dressing.fit import fit_garment
-        from eslr_jax.pipeline.dressing.report import describe_cost
         from eslr_jax.pipeline.formats.garment import read_garment_source
 
-        def describe_source(source) -> None:
-            text = describe_cost(len(source.mesh.positions))
-            if text and self.options.edge_length is None:  # else it is remeshed, and its size is chosen
-                say(text)
-
         if self.made_for is None:
-            return load_garment_file(self.garment, body=rig, fit=self.options, on_source=describe_source)
+            return load_garment_file(self.garment, body=rig, fit=self.options)
         if not {self.garment, f"{self.garment}_1k"}.isdisjoint(asset_names("garment")):
             raise AssetError(f"garment {self.garment} is made for the bundled body; leave out --made-for")
-        first = load_wearer(self.made_for)
-        source = read_garment_source(self.garment)
-        describe_source(source)
+        source, first = read_garment_source(self.garment), load_wearer(self.made_for)
         return fit_garment(source, rig, self.options, made_for=first)
+
+
+def _with_fabrics(stored: GarmentFile, fabric: tuple[str, ...], name: str) -> GarmentFile:
+    """Return a garment that keeps its fabrics; raise if one is unknown, or of a part that the garment lacks."""
+    from eslr_jax.pipeline.assets import prepare_stored
+    from eslr_jax.pipeline.fabrics import garment_material
+
+    stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(fabric)})
+    garment_material(fabric, prepare_stored(stored, name=name), stored)
+    return stored
 
 
 def _write_views(
@@ -183,25 +181,18 @@ class Sew:
 
     def __call__(self) -> None:
         """Sew, write the file and the picture, and say what was done."""
-        from eslr_jax.pipeline.assets import prepare_stored
         from eslr_jax.pipeline.assets.garments import sew_pattern_file
         from eslr_jax.pipeline.dressing.report import describe_sewing, describe_transfer
-        from eslr_jax.pipeline.fabrics import garment_material
         from eslr_jax.pipeline.formats.garment import write_garment_npz
 
-        if self.out.suffix != ".npz":
-            raise AssetError(
-                f"--out {self.out}: a garment is an npz file; name it such as {self.out.stem}.npz"
-            )
+        check_npz(self.out, "a garment")
         with waiting("sewing"):
             rig = load_wearer(self.body, units=self.body_units, betas=self.betas)
             made_for = rig if self.made_for == "body" else self.made_for and load_wearer(self.made_for)
             stored = sew_pattern_file(
                 self.pattern, rig, made_for=made_for or None, num_vertices=self.vertices, pin=self.pin
             )
-            stored = dataclasses.replace(stored, metadata=stored.metadata | {"fabrics": list(self.fabric)})
-            # It refuses a fabric that is unknown, or of a part that the garment lacks.
-            garment_material(self.fabric, prepare_stored(stored, name=self.pattern.name), stored)
+            stored = _with_fabrics(stored, self.fabric, self.pattern.name)
         write_garment_npz(self.out, stored)
         report = stored.metadata["sewing"]
         print(json.dumps(report, indent=2) if self.json else describe_sewing(report))
@@ -272,11 +263,7 @@ class Convert:
         from eslr_jax.networks.weights import write_network
         from eslr_jax.pipeline.assets.hood import read_hood
 
-        out = self.out
-        if out.suffix != ".npz":
-            raise AssetError(
-                f"--out {out}: a network is written as an npz file; name it such as {out.stem}.npz"
-            )
+        check_npz(self.out, "a network")
         network = read_hood(self.checkpoint)
-        write_network(out, network, {"converted_from": self.checkpoint.name})
-        print(f"{out}: {network.num_parameters:,} parameters")
+        write_network(self.out, network, {"converted_from": self.checkpoint.name})
+        print(f"{self.out}: {network.num_parameters:,} parameters")

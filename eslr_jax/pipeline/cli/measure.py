@@ -14,9 +14,9 @@ from rich.table import Table
 
 from eslr_jax.config import EvaluationOptions
 from eslr_jax.errors import ConfigError, MeshError, MotionError
-from eslr_jax.pipeline.cli.actor import load_actor
 from eslr_jax.pipeline.cli.batch import MANIFEST, read_manifest
 from eslr_jax.pipeline.cli.console import app, print_report, progress, say, use_compile_cache, waiting
+from eslr_jax.pipeline.cli.method import load_actor
 from eslr_jax.pipeline.cli.options import Options
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from eslr_jax.errors import ConfigError
+from eslr_jax.errors import AssetError, ConfigError
 
 if TYPE_CHECKING:
     from eslr_jax.terms import Term
@@ -166,6 +166,12 @@ def refuse_given(reason: str, options: dict[str, bool]) -> None:
     """Raise a ConfigError if an option is given that would do nothing, for a reason."""
     if given := [option for option, is_given in options.items() if is_given]:
         raise ConfigError(f"{reason}; leave out {', '.join(given)}")
+
+
+def check_npz(out: Path, what: str) -> None:
+    """Raise an AssetError unless a file to write has the suffix that it needs."""
+    if out.suffix != ".npz":
+        raise AssetError(f"--out {out}: {what} is an npz file; name it such as {out.stem}.npz")
 
 
 def parse_seconds(text: str, fps: float, *, option: str) -> float:

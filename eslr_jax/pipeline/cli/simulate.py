@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from eslr_jax.errors import AssetError, ConfigError, EslrError, MissingExtraError
-from eslr_jax.pipeline.cli.actor import Actor, load_actor
 from eslr_jax.pipeline.cli.console import (
     EXIT_CODE,
     app,
@@ -21,7 +20,7 @@ from eslr_jax.pipeline.cli.console import (
     use_compile_cache,
     waiting,
 )
-from eslr_jax.pipeline.cli.method import Method, choose_method
+from eslr_jax.pipeline.cli.method import Actor, Method, choose_method, load_actor
 from eslr_jax.pipeline.cli.options import Options
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from eslr_jax.pipeline.formats.garment import GarmentFile
     from eslr_jax.simulation.interrupt import Interruption
     from eslr_jax.simulation.simulate import Simulation
-    from eslr_jax.types import BodyMotion, Garment, Material, Scene, Trajectory
+    from eslr_jax.types import BodyMotion, Garment, Scene, Trajectory
 
 _LONG = 5.0  # [s]; a longer wait for the compiler is reported
 _KEPT = 1.2  # times the budget; a longer mean time per frame counts as a miss
@@ -85,16 +84,13 @@ class Simulate(Options):
 
 
 class _Setting(NamedTuple):
-    """What is simulated, and how."""
+    """A body in motion, what it wears, and how it is simulated."""
 
-    names: tuple[str, ...]  # of the garments
     garments: list[GarmentFile]  # each of them as the body wears it; none where a simulation goes on
     stored: GarmentFile  # all of them together
     actor: Actor
-    material: Material
     method: Method
     settle: int  # frames before frame 0
-    scene: Scene  # with these frames
 
 
 class Unfinished(NamedTuple):
@@ -118,14 +114,14 @@ def simulate_run(
 
     done = None
     if options.resume:
-        options, setting, done = _read_interrupted(options)
+        options, setting, scene, done = _read_interrupted(options)
     else:
         options.check()
         with waiting("preparing garment, body and motion"):
-            setting = _prepare(options, near)
+            setting, scene = _prepare(options, near)
         ensure_output_dir(options.out)
-        _announce(options, setting)
-    simulation = _run(setting, done, stop)
+        _announce(options, setting, scene)
+    simulation = _run(setting, scene, done, stop)
     timing, budget_ms = simulation.timing, setting.method.budget_ms
     if timing.compile_s > _LONG:
         say(f"waited {timing.compile_s:.0f} s for the compiler; the next run of such a scene does not wait")
@@ -141,7 +137,7 @@ def simulate_run(
     return report
 
 
-def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
+def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Scene, Trajectory]:
     """Return the options of an interrupted simulation, what is simulated, and the frames that are done."""
     from eslr_jax.pipeline.formats.garment import read_garment_npz
     from eslr_jax.simulation.archive import read_tree
@@ -158,10 +154,9 @@ def _read_interrupted(given: Simulate) -> tuple[Simulate, _Setting, Trajectory]:
                 f"{_typed(value)}; leave out all options but --out to go on, or start in another folder without "
                 "--resume"
             )
-    stored, garments = read_garment_npz(given.out / "garment.npz"), own.garments
+    stored = read_garment_npz(given.out / "garment.npz")
     method = choose_method(own).within_budget(len(stored.rest_positions), own.substeps)
-    setting = _Setting(garments, [], stored, actor, scene.material, method, settle, scene)
-    return dataclasses.replace(given, **vars(own)), setting, done
+    return dataclasses.replace(given, **vars(own)), _Setting([], stored, actor, method, settle), scene, done
 
 
 def _typed(value: Any) -> str:
@@ -171,49 +166,28 @@ def _typed(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-class _Dressed(NamedTuple):
-    """A body in motion, and what it wears."""
-
-    actor: Actor
-    garments: list[GarmentFile]
-    stored: GarmentFile
-    cloth: Garment
-    method: Method
-    settle: int
-    settling: BodyMotion  # the motion with the frames before
-
-
 def reached_vertices(options: Options) -> Int[np.ndarray, " near"]:
     """Return the vertices of the body that the cloth of a scene can reach, see `simulate_run`."""
     import numpy as np
 
     from eslr_jax.terms.worn import Worn
 
-    dressed = _dress(options)
-    surface = Worn(dressed.cloth, dressed.settling).surface
+    _, cloth, settling = _dress(options)
+    surface = Worn(cloth, settling).surface
     return np.zeros(0, int) if surface is None else np.asarray(surface.vertex_ids)
 
 
-def _dress(options: Options) -> _Dressed:
-    """Load garments, body and motion, and choose how to simulate them."""
+def _dress(options: Options) -> tuple[_Setting, Garment, BodyMotion]:
+    """Load garments, body and motion, and choose how to simulate them; the motion has the frames before."""
     from eslr_jax.pipeline.assets import load_garment_file, prepare_stored
     from eslr_jax.pipeline.assets.garments import check_resolution
     from eslr_jax.pipeline.dressing.outfit import wear_together
-    from eslr_jax.pipeline.dressing.report import describe_cost
     from eslr_jax.pose.timing import SETTLE_FRAMES, with_settling
 
     names, method = options.garments, choose_method(options)
     check_resolution(names, options.vertices)
     actor = load_actor(options)
-
-    def describe_source(source) -> None:
-        if text := describe_cost(len(source.mesh.positions)):
-            say(text)
-
-    garments = [
-        load_garment_file(name, vertices=options.vertices, body=actor.rig, on_source=describe_source)
-        for name in names
-    ]
+    garments = [load_garment_file(name, vertices=options.vertices, body=actor.rig) for name in names]
     stored = wear_together(garments, names)
     method = method.within_budget(len(stored.rest_positions), options.substeps)
     cloth = prepare_stored(stored, name="+".join(names), **method.garment_options)
@@ -221,10 +195,10 @@ def _dress(options: Options) -> _Dressed:
     if settle is None:
         settle = SETTLE_FRAMES if method.config.iterations > 0 else 0
     settling = with_settling(actor.poses, settle, actor.rig)
-    return _Dressed(actor, garments, stored, cloth, method, settle, settling)
+    return _Setting(garments, stored, actor, method, settle), cloth, settling
 
 
-def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Setting:
+def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> tuple[_Setting, Scene]:
     """Prepare the scene, and begin to compile it."""
     import numpy as np
 
@@ -235,8 +209,8 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     from eslr_jax.simulation.simulate import begin_compiling
     from eslr_jax.terms.worn import surface_near
 
-    actor, garments, stored, cloth, method, settle, settling = _dress(options)
-    material = garment_material(options.fabric, cloth, stored)
+    setting, cloth, settling = _dress(options)
+    method = setting.method
     begin = partial(begin_compiling, method.params, config=method.config, is_paced=method.pace is not None)
     surface = None
     if near is not None:
@@ -244,7 +218,7 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     scene = prepare_scene(
         cloth,
         settling,
-        material=material,
+        material=garment_material(options.fabric, cloth, setting.stored),
         terms=options.terms(),
         integrator=options.integrator or ("bdf2" if method.config.iterations > 0 else "euler"),
         substeps=options.substeps,
@@ -253,30 +227,30 @@ def _prepare(options: Options, near: Int[np.ndarray, " near"] | None) -> _Settin
     )
     if scene.body is not None:
         vertices = np.asarray(scene.body.surface.vertex_ids)
-        check_speed(actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
-    return _Setting(options.garments, garments, stored, actor, material, method, settle, scene)
+        check_speed(setting.actor.poses, MAX_APPROACH * options.substeps, vertices=vertices)
+    return setting, scene
 
 
-def _announce(options: Options, setting: _Setting) -> None:
+def _announce(options: Options, setting: _Setting, scene: Scene) -> None:
     """Say what a person wants to know before the simulation begins."""
     from eslr_jax.pipeline.dressing.report import LARGE, describe_fit, describe_sewing, describe_transfer
     from eslr_jax.pipeline.fabrics import beyond_training
     from eslr_jax.pipeline.report.report import describe_start, start_crossing
     from eslr_jax.pose.timing import begins_at_rest
 
-    method, stored, scene = setting.method, setting.stored, setting.scene
+    method, stored = setting.method, setting.stored
     if method.network is not None:
         if method.model != method.network and options.iterations is None:
             say(f"a frame is solved by {method.model}; --iterations 0 is the network alone")
         # A tolerance is kept by the solver behind a network, whatever the network knows of the fabric.
-        unseen = beyond_training(setting.material)
+        unseen = beyond_training(scene.material)
         if unseen and method.tolerance is None:
             say(f"no network has seen such a fabric ({', '.join(unseen)}): rather use --simulator physics")
     crossing = start_crossing(scene, parts=(stored.face_parts, stored.part_names))
     start = describe_start(crossing, is_put_on=begins_at_rest(setting.settle, setting.actor.rig))
     if start is not None:
         say(start)
-    for name, worn in zip(setting.names, setting.garments, strict=True):
+    for name, worn in zip(options.garments, setting.garments, strict=True):
         if "fit" in worn.metadata:
             say(describe_fit(worn.metadata["fit"]))
         if "sewing" in worn.metadata:
@@ -288,7 +262,7 @@ def _announce(options: Options, setting: _Setting) -> None:
         say(method.describe_load(num_vertices, scene.num_frames, scene.substeps))
 
 
-def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simulation:
+def _run(setting: _Setting, scene: Scene, done: Trajectory | None, stop: Interruption) -> Simulation:
     """Compile and simulate with progress; Ctrl-C ends it after the frames in work."""
     import jax
 
@@ -296,7 +270,7 @@ def _run(setting: _Setting, done: Trajectory | None, stop: Interruption) -> Simu
     from eslr_jax.simulation.plan import first_frames
     from eslr_jax.simulation.simulate import simulate
 
-    method, scene = setting.method, setting.scene
+    method = setting.method
     # The first frames compile; the bar counts the time.
     with progress("compiling a frame", scene.num_frames - 1) as advance:
 
@@ -331,7 +305,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
 
     from eslr_jax.pipeline.fabrics import worn_fabrics
     from eslr_jax.pipeline.report.report import describe_model, environment, trajectory_report
-    from eslr_jax.pipeline.report.run import ClothTrack, write_run
+    from eslr_jax.pipeline.report.run import write_run
     from eslr_jax.pipeline.report.wear import wear_report
     from eslr_jax.pose.lbs import skin_garment
     from eslr_jax.pose.motion import first_poses
@@ -366,7 +340,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
         is_kept = keeps_tolerance(bounds, residuals, method.config.tolerance)
         last = {"frame": count - 1, "time_s": (count - 1) * float(poses.timestep)}
         report = {
-            "garment": "+".join(setting.names),
+            "garment": "+".join(options.garments),
             "fabric": list(worn_fabrics(options.fabric, stored)) or ["cotton"],
             "motion": motion,
             "motion_start_s": motion_start,
@@ -389,10 +363,7 @@ def _write(options: Simulate, setting: _Setting, simulation: Simulation) -> dict
             **environment(),
         }
     with waiting("writing files"):
-        track = ClothTrack(
-            trajectory.positions, trajectory.velocities, trajectory.friction_loads, trajectory.residuals
-        )
-        write_run(out, track, scene, (rig, poses, stored), report=report)
+        write_run(out, trajectory, scene, (rig, poses, stored), report=report)
         (out / "sheet.png").unlink(missing_ok=True)  # of an earlier run
         if not is_unfinished:
             (out / UNFINISHED).unlink(missing_ok=True)

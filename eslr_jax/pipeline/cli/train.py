@@ -61,8 +61,7 @@ class Train:
 
     def __call__(self) -> None:
         """Train, draw the curves, and print where the networks are."""
-        from eslr_jax.pipeline.assets.models import load_model, model_record
-        from eslr_jax.pipeline.assets.training import load_training_data
+        from eslr_jax.pipeline.assets.models import load_model, load_training_data, model_record
         from eslr_jax.training.loop import is_first_process, keep_memory, plot_curves, seed_folders, train
 
         if self.keys:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError
-from eslr_jax.mesh.topology import face_areas, face_cross_products, undirected_edges, vertex_components
+from eslr_jax.mesh.topology import face_areas, undirected_edges, vertex_components
 from eslr_jax.mesh.validate import check_arrays, validate_mesh
 from eslr_jax.pipeline.dressing.clearance import lay_to_rest
 from eslr_jax.pipeline.dressing.options import FitOptions
@@ -25,9 +26,10 @@ from eslr_jax.pipeline.dressing.repair import (
     shell_thickness,
     weld,
 )
-from eslr_jax.pipeline.dressing.report import wearer_entry
+from eslr_jax.pipeline.dressing.report import describe_cost, wearer_entry
 from eslr_jax.pipeline.dressing.transfer import carry_shape
-from eslr_jax.pipeline.formats.garment import GarmentFile, GarmentSource, first_rows
+from eslr_jax.pipeline.formats.garment import GarmentFile, first_rows
+from eslr_jax.pipeline.formats.mesh import MeshFile
 from eslr_jax.pose.motion import chest_direction
 from eslr_jax.types import Body
 
@@ -37,15 +39,15 @@ _ALONG = 0.2  # of all edges' vertices that are as near to another piece: seams,
 
 
 def fit_garment(
-    source: GarmentSource, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
+    mesh: MeshFile, body: Body, options: FitOptions | None = None, *, made_for: Body | None = None
 ) -> GarmentFile:
-    """Clean a garment's mesh, put it on the body, and give it skin weights and pins.
+    """Clean a garment's mesh, put it on the body, and give it skin weights and pins; warn if that takes long.
 
     Lengths, areas and angles stay those of the file, unless it is remeshed. Lowering arms and moving vertices
     out of the body change the rest positions, not the sewn shape.
 
     Args:
-        source: Garment of `read_garment_source`.
+        mesh: Garment of `read_garment_source`.
         body: The body in its rest pose.
         options: Settings that replace what is recognised from the mesh.
         made_for: The body that it was modelled on, if that is another one: it is put on that body first and
@@ -60,7 +62,7 @@ def fit_garment(
         ConfigError: An option contradicts the garment.
     """
     options = options or FitOptions()
-    mesh, name = source.mesh, source.name
+    name = mesh.name
     check_arrays(mesh.positions, mesh.faces, name=name)
     largest = float(np.abs(mesh.positions).max())
     if largest > _MAX_COORDINATE:
@@ -74,12 +76,16 @@ def fit_garment(
         raise ConfigError(
             f"scale {options.scale} is for a garment of another body; give that body too (eslr fit --made-for)"
         )
+    if options.edge_length is None and (
+        text := describe_cost(len(mesh.positions))
+    ):  # else its size is chosen
+        warnings.warn(text, stacklevel=2)
     worn_by = body if made_for is None else made_for
     clean, report = _clean(mesh.positions, mesh.faces, options)
     postures = arm_postures(worn_by) if options.arms == "auto" else [rest_posture(worn_by)]
     facing = chest_direction(worn_by)
     placement = find_placement(
-        clean.positions, clean.faces, postures, options, is_metric=source.is_metric, facing=facing, name=name
+        clean.positions, clean.faces, postures, options, is_metric=mesh.is_metric, facing=facing, name=name
     )
     posture = postures[placement.posture]
     clean, joined, doubts = _join(
@@ -93,12 +99,7 @@ def fit_garment(
         )
     # Faces are turned that disagree with neighbours, and parts that face the body.
     turn = consistent_orientation(clean.positions, clean.faces)
-    crosses = face_cross_products(clean.positions, _turn(clean.faces, turn))
-    _, nearest = posture.tree.query(clean.positions[clean.faces].mean(axis=1))
-    outward = np.einsum("fx,fx->f", crosses, posture.normals[posture.touchable[nearest]])
-    _, component = vertex_components(clean.faces, len(clean.positions))
-    owner = component[clean.faces[:, 0]]
-    is_turned = turn ^ (np.bincount(owner, weights=outward) < 0)[owner]
+    is_turned = turn ^ posture.is_turned_in(clean.positions, _turn(clean.faces, turn))
     faces = _turn(clean.faces, is_turned)
     report |= joined | {"turned_faces": int(is_turned.sum())}
 
@@ -106,14 +107,14 @@ def fit_garment(
     file_pins = np.zeros(len(sewn), bool)
     if options.edge_length is None:
         vertex_map, joined_rows, face_source = clean.vertex_map, None, clean.face_source
-        if source.is_pinned is not None:
-            held = vertex_map[source.is_pinned]
+        if mesh.is_pinned is not None:
+            held = vertex_map[mesh.is_pinned]
             file_pins[held[held >= 0]] = True
         if mesh.rows is not None:
             vertex_map, joined_rows = vertex_map[mesh.rows], first_rows(mesh.rows, len(vertex_map))
         uvs = None if uvs is None else _turn(uvs[face_source], is_turned)
     else:
-        lost = _lost_pins(source, options)
+        lost = _lost_pins(mesh, options)
         sewn, faces, nearest = remesh(sewn, faces, options.edge_length)
         vertex_map, joined_rows, face_source = np.arange(len(sewn)), None, clean.face_source[nearest]
         file_pins, uvs = np.zeros(len(sewn), bool), None
@@ -199,7 +200,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray, options: FitOptions) -> tup
 
 def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any], list[str]]:
     """Join or drop separate parts as the options say; positions are in metres. Return report and warnings."""
-    chosen, warnings = options.components, []
+    chosen, doubts = options.components, []
     if chosen == "auto":
         gaps = (min(_SEAM, options.join_gap), options.join_gap)
         shares = shares_along_seams(clean.positions, clean.faces, gaps)
@@ -207,18 +208,18 @@ def _join(clean: Cleaned, options: FitOptions) -> tuple[Cleaned, dict[str, Any],
         chosen = "join" if is_open else "keep"
         if is_near:
             pieces = vertex_components(clean.faces, len(clean.positions))[0]
-            warnings = [
+            doubts = [
                 f"{pieces} pieces whose edges lie within {100 * options.join_gap:g} cm of each other are not "
                 "sewn; give eslr fit --components join, or --components keep if they are apart"
             ]
     if chosen not in ("join", "largest"):
-        return clean, {}, warnings
+        return clean, {}, doubts
     if chosen == "join":
         step = join_components(clean.positions, clean.faces, options.join_gap)
     else:
         step = largest_component(clean.positions, clean.faces)
     if options.components == "auto" and undirected_edges(step.faces)[2].max() > 2:
-        return clean, {}, warnings  # an edge of three pieces, such as a pocket's on a seam
+        return clean, {}, doubts  # an edge of three pieces, such as a pocket's on a seam
     onward = np.append(step.vertex_map, -1)[clean.vertex_map]  # -1 stays -1
     left = vertex_components(step.faces, len(step.positions))[0]
     joined = dataclasses.replace(step, vertex_map=onward, face_source=clean.face_source[step.face_source])
@@ -232,7 +233,7 @@ def _turn(rows: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
     return result
 
 
-def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
+def _lost_pins(mesh: MeshFile, options: FitOptions) -> list[str]:
     """Return a warning of pins of the file, whose vertices remeshing replaces; raise if a number names them."""
     counted = [text for text in options.pin if text.startswith("vertices:")]
     if counted:
@@ -240,7 +241,7 @@ def _lost_pins(source: GarmentSource, options: FitOptions) -> list[str]:
             f"pin {counted[0]!r} counts vertices of the file, which edge_length replaces by others; name a part, "
             "a region or a loop"
         )
-    if "none" in options.pin or source.is_pinned is None or not source.is_pinned.any():
+    if "none" in options.pin or mesh.is_pinned is None or not mesh.is_pinned.any():
         return []
     return [
         "the pins of the file are lost with edge_length, which replaces its vertices; name a part, a region or a "

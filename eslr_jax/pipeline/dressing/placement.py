@@ -247,11 +247,7 @@ def _slide(sample: Sample, orientations: list[Placement], postures: list[Posture
 def _settle(points: np.ndarray, offset: np.ndarray, posture: Posture) -> np.ndarray:
     """Move points as one until they lie neither inside nor far from the body: damped least squares."""
     for _ in range(12):
-        placed = points + offset
-        distance, nearest = posture.tree.query(placed)
-        vertex = posture.touchable[nearest]
-        normals = posture.normals[vertex]
-        height = np.einsum("px,px->p", placed - posture.positions[vertex], normals)
+        distance, height, normals = posture.tangent_planes(points + offset)
         weight = np.where(height < 0, 1.0, 0.1) * (distance < 0.1)
         wanted = np.clip(height, 0.005, 0.03) - height
         matrix = np.einsum("p,px,py->xy", weight, normals, normals) + 0.02 * len(points) * np.eye(3)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from eslr_jax.mesh.topology import vertex_normals
+from eslr_jax.mesh.topology import face_cross_products, vertex_components, vertex_normals
 from eslr_jax.pose.motion import SHOULDERS, joint_transforms
 from eslr_jax.types import Body
 
@@ -81,12 +81,28 @@ class Posture:
         """The root joint, or the middle of a moving mesh's many roots [m]."""
         return np.median(self.joints[np.array(self.parents) < 0], axis=0)
 
-    def heights(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-        """Return the distance of every point to the nearest touchable vertex [m], negative inside."""
+    def tangent_planes(
+        self, points: Float[np.ndarray, "points 3"]
+    ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
+        """Return the distance to the nearest touchable vertex, the height over its plane [m], and its normal."""
         distance, nearest = self.tree.query(points)
         vertex = self.touchable[nearest]
-        side = np.einsum("px,px->p", points - self.positions[vertex], self.normals[vertex])
+        normals = self.normals[vertex]
+        return distance, np.einsum("px,px->p", points - self.positions[vertex], normals), normals
+
+    def heights(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+        """Return the distance of every point to the nearest touchable vertex [m], negative inside."""
+        distance, side, _ = self.tangent_planes(points)
         return np.where(side < 0, -distance, distance)
+
+    def is_turned_in(
+        self, positions: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+    ) -> Bool[np.ndarray, " faces"]:
+        """Return which faces belong to a piece that faces the body."""
+        _, nearest = self.tree.query(positions[faces].mean(axis=1))
+        outward = np.vecdot(face_cross_products(positions, faces), self.normals[self.touchable[nearest]])
+        piece = vertex_components(faces, len(positions))[1][faces[:, 0]]
+        return (np.bincount(piece, weights=outward) < 0)[piece]
 
 
 def rest_posture(body: Body) -> Posture:

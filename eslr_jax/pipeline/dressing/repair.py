@@ -161,9 +161,8 @@ def consistent_orientation(
     _, sheet = connected_components(graph, directed=False)
     sheet, turned_sheet = sheet[:num_faces], sheet[num_faces:]
     areas = np.bincount(sheet, weights=face_areas(positions, faces), minlength=2 * num_faces)
-    is_tie = (areas[turned_sheet] == areas[sheet]) & (
-        turned_sheet < sheet
-    )  # as of a pattern's front and back
+    # As of a pattern's front and back.
+    is_tie = (areas[turned_sheet] == areas[sheet]) & (turned_sheet < sheet)
     return (areas[turned_sheet] > areas[sheet]) | is_tie
 
 

@@ -22,7 +22,6 @@ from scipy.sparse.linalg import splu
 from eslr_jax.errors import MeshError
 from eslr_jax.mesh.parting import uncrossed
 from eslr_jax.mesh.piercing import piercing_edges
-from eslr_jax.mesh.topology import face_cross_products, vertex_components
 from eslr_jax.mesh.validate import validate_mesh
 from eslr_jax.pipeline.dressing.clearance import body_heights, lay_to_rest
 from eslr_jax.pipeline.dressing.panels import SewnMesh, join_panels
@@ -93,10 +92,7 @@ def sew_pattern(
     _check_place(mesh, pattern, posture, name)
     draped = drape(mesh, posture)
     faces, corners = mesh.faces, mesh.panel_corners
-    _, nearest = posture.tree.query(draped[faces].mean(axis=1))
-    outward = np.vecdot(face_cross_products(draped, faces), posture.normals[posture.touchable[nearest]])
-    piece = vertex_components(faces, len(draped))[1][faces[:, 0]]
-    is_inward = (np.bincount(piece, weights=outward) < 0)[piece]
+    is_inward = posture.is_turned_in(draped, faces)
     faces = np.where(is_inward[:, None], faces[:, ::-1], faces)
     corners = np.where(is_inward[:, None, None], corners[:, ::-1], corners)
     validate_mesh(draped, faces, name=f"{name}, sewn", allow_components=True)
@@ -318,10 +314,7 @@ def _heights(
     points: Float[np.ndarray, "points 3"], posture: Posture
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
     """Return `body_heights`, to a few millimetres, from the skin's tangent plane at the nearest vertex."""
-    distance, nearest = posture.tree.query(points)
-    vertex = posture.touchable[nearest]
-    normals = posture.normals[vertex]
-    side = np.einsum("px,px->p", points - posture.positions[vertex], normals)
+    distance, side, normals = posture.tangent_planes(points)
     return np.where(distance < _NEAR, side, np.copysign(distance, side)), normals
 
 

@@ -18,7 +18,6 @@ from eslr_jax.files.atomic import atomic_write
 from eslr_jax.pipeline.extras import require
 from eslr_jax.pipeline.formats.animated import AnimatedMesh, identifiers, vertex_normals
 from eslr_jax.pipeline.formats.apart import read_apart
-from eslr_jax.pipeline.formats.garment import GarmentSource
 from eslr_jax.pipeline.formats.mesh import MeshFile, cut_polygons, name_parts
 from eslr_jax.pipeline.formats.mesh_sequence import DEFAULT_FPS, MeshSequence
 from eslr_jax.pipeline.formats.registry import reader, writer
@@ -91,7 +90,7 @@ def _set_samples(schema: Any, mesh: AnimatedMesh) -> None:
 
 
 @reader("garment", [".abc"])
-def read_alembic_garment(path: Path, names: str = "") -> GarmentSource:
+def read_alembic_garment(path: Path, names: str = "") -> MeshFile:
     """Read the first sample of all meshes, or of some, as one garment, whose parts are face sets or meshes."""
     arrays = _read(path, names, 1)
     meshes = [_mesh(arrays, number, path) for number in range(len(arrays["names"]))]
@@ -99,14 +98,14 @@ def read_alembic_garment(path: Path, names: str = "") -> GarmentSource:
     uvs = [uvs for _, _, uvs, _ in meshes if uvs is not None]
     own = [str(name) for name, (_, faces, *_) in zip(arrays["names"], meshes, strict=True) for _ in faces]
     face_parts, part_names = name_parts([[part for *_, parts in meshes for part in parts], own])
-    mesh = MeshFile(
+    return MeshFile(
         positions=np.concatenate([positions[0] for positions, *_ in meshes]),
         faces=np.concatenate([faces + count for (_, faces, *_), count in zip(meshes, counts, strict=False)]),
         corner_uvs=np.concatenate(uvs) if len(uvs) == len(meshes) else None,
         face_parts=face_parts,
         part_names=part_names,
+        name=names.replace(",", "_") or path.stem,
     )
-    return GarmentSource(mesh, names.replace(",", "_") or path.stem)
 
 
 @reader("mesh sequence", [".abc"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -15,9 +15,10 @@ import numpy as np
 import scipy.sparse
 from scipy.spatial.transform import Rotation
 
-from eslr_jax.errors import AssetError, MeshError, MotionError
+from eslr_jax.errors import AssetError, EslrError, MeshError, MotionError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir
 from eslr_jax.files.npz import check_layout
+from eslr_jax.mesh import topology
 from eslr_jax.pipeline.formats.palette import GARMENT_COLORS, Color
 
 _RIGID_TOLERANCE = 1e-3  # entries of R^T R - I that forward kinematics in float32 may reach
@@ -63,9 +64,26 @@ class AnimatedMesh:
     velocities: np.ndarray | None = None  # [frames, vertices, 3] [m/s]
     rest_positions: np.ndarray | None = None  # [vertices, 3] [m], what `skin` moves
     skin: Skin | None = None  # joints that move it, exactly or nearly
-    parts: Mapping[str, np.ndarray] = dataclasses.field(
-        default_factory=dict
-    )  # which faces a part has [faces]
+    # Which faces a part has [faces].
+    parts: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
+def check_moving(
+    positions: np.ndarray,
+    faces: np.ndarray,
+    *,
+    what: str,
+    remedy: str,
+    not_finite: type[EslrError] = MeshError,
+) -> None:
+    """Raise a MeshError, or `not_finite`, unless arrays are a mesh over time; see `check_layout`."""
+    arrays, layout = {"positions": positions, "faces": faces}, dict(list(_LAYOUT.items())[:2])
+    check_layout(arrays, layout, what=what, remedy=remedy, error=MeshError)
+    if 0 in positions.shape or not len(faces):
+        raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
+    is_finite = np.isfinite(positions).all((1, 2))
+    if not is_finite.all():
+        raise not_finite(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
 
 
 def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
@@ -84,11 +102,7 @@ def check_meshes(meshes: Sequence[AnimatedMesh], timestep: float) -> None:
         if mesh.skin is not None:
             arrays |= {key: np.asarray(value) for key, value in vars(mesh.skin).items()}
         check_layout(arrays, _LAYOUT, what=what, remedy=remedy, error=MeshError)
-        if 0 in arrays["positions"].shape or not len(arrays["faces"]):
-            raise MeshError(f"{what} has no frames, vertices or faces; {remedy}")
-        is_finite = np.isfinite(arrays["positions"]).all((1, 2))
-        if not is_finite.all():
-            raise MeshError(f"{what} is not finite in frame {np.argmin(is_finite)}; {remedy}")
+        check_moving(arrays["positions"], arrays["faces"], what=what, remedy=remedy)
         if mesh.skin is None:
             continue
         if mesh.rest_positions is None:
@@ -156,22 +170,13 @@ def split_seams(
 
 
 def vertex_normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the area-weighted face normals around each vertex; faces are counter-clockwise seen from outside.
+    """Return `topology.vertex_normals` as files have them.
 
     Returns:
         Unit normals, shape [vertices, 3], float32; (0, 1, 0) where a vertex has no face.
     """
-    corners = positions[faces].astype(np.float64)
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = np.stack(
-        [
-            np.bincount(faces.reshape(-1), np.repeat(face_normals[:, axis], 3), minlength=len(positions))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+    normals = topology.vertex_normals(positions.astype(np.float64), faces)
+    return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0]).astype(np.float32)
 
 
 def principal_shapes(offsets: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -271,19 +276,15 @@ def write_frames(
     target = Path(folder)
     if target.is_file() or (target.is_dir() and any(target.iterdir())):
         raise AssetError(f"{target} exists already; name a new folder for the sequence")
-    ensure_output_dir(target.parent)
-    parts = target.with_name(f".{target.name}.part")
-    shutil.rmtree(parts, ignore_errors=True)  # of an export that was killed
     digits = max(4, len(str(len(mesh.positions) - 1)))
-    try:
-        ensure_output_dir(parts)
-        for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
-            with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
-                temporary.write_bytes(content(positions))
-        if target.is_dir():
-            target.rmdir()
-        os.replace(parts, target)
-    except OSError as error:
-        raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error
-    finally:
-        shutil.rmtree(parts, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=ensure_output_dir(target.parent)) as name:
+        parts = ensure_output_dir(Path(name) / target.name)
+        try:
+            for frame, positions in enumerate(np.asarray(mesh.positions, np.float32)):
+                with atomic_write(parts / f"{mesh.name}_{frame:0{digits}d}{suffix}") as temporary:
+                    temporary.write_bytes(content(positions))
+            if target.is_dir():
+                target.rmdir()
+            os.replace(parts, target)
+        except OSError as error:
+            raise AssetError(f"can't write {target}: {error.strerror}; choose another folder") from error

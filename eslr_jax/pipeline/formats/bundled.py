@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.npz import check_layout, read_arrays
 from eslr_jax.pipeline.formats.registry import reader
+from eslr_jax.pose.motion import Motion
 from eslr_jax.types import Body
 
 _BODY = {
@@ -27,15 +28,6 @@ _BODY = {
 }
 _ROUNDED = 1e-3  # by which the sum of a vertex' skin weights may differ from one and is left alone
 UPRIGHT = 0.7  # least height over the longest side of a standing body; a T-pose is as wide as it is high
-
-
-class Clip(NamedTuple):
-    """One clip of a motion archive."""
-
-    rotations: np.ndarray  # local axis-angle [rad], shape [frames, joints, 3]
-    translations: np.ndarray  # position of the root joint [m], shape [frames, 3]
-    fps: float  # [1/s]
-    joint_names: tuple[str, ...]
 
 
 @reader("body", [".npz"])
@@ -74,12 +66,12 @@ def read_body(path: Path, _meshes: str = "") -> Body:
     )
 
 
-def read_motion_archive(path: str | Path) -> dict[str, Clip]:
+def read_motion_archive(path: str | Path) -> dict[str, Motion]:
     """Read clips by name: `joint_names`, `<clip>/rotations`, `<clip>/translations`, `<clip>/fps`.
 
     Raises:
         AssetError: The file is missing or damaged.
-        MotionError: The archive holds no clip, or a clip is incomplete.
+        MotionError: The archive holds no clip, or a clip is incomplete or impossible.
     """
     arrays = read_arrays(path, content="motion")
     names = sorted(key.removesuffix("/rotations") for key in arrays if key.endswith("/rotations"))
@@ -96,13 +88,23 @@ def read_motion_archive(path: str | Path) -> dict[str, Clip]:
         if missing:
             raise MotionError(f"{path}: clip {name} lacks {', '.join(missing)}; write the archive again")
         check_layout(arrays, layout, what=str(path), remedy="write the archive again", error=MotionError)
-        clips[name] = Clip(
+        clips[name] = Motion(
+            name,
             arrays[f"{name}/rotations"].astype(np.float64),
             arrays[f"{name}/translations"].astype(np.float64),
             read_number(arrays[f"{name}/fps"], f"{path}: {name}/fps"),
             tuple(map(str, arrays["joint_names"])),
         )
     return clips
+
+
+def pick_clip(path: str | Path, names: Sequence[str], clip: str) -> str:
+    """Return the clip of a file that is asked for, or its only one where that is ""; raise a MotionError else."""
+    if not clip and len(names) > 1:
+        raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
+    if clip and clip not in names:
+        raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+    return clip or names[0]
 
 
 def read_number(array: np.ndarray, what: str) -> float:

@@ -12,7 +12,7 @@ from eslr_jax.errors import AssetError
 from eslr_jax.files.parsing import split_name
 from eslr_jax.pipeline.formats.animated import AnimatedMesh
 from eslr_jax.pipeline.formats.garment import GarmentFile, first_rows, split_outfit
-from eslr_jax.pipeline.formats.palette import SKIN_COLOR, garment_color
+from eslr_jax.pipeline.formats.palette import garment_color
 from eslr_jax.pipeline.formats.registry import WRITERS, find_writer, names_of, suffixes_of
 from eslr_jax.pipeline.formats.trajectory import TrajectoryFile
 
@@ -112,17 +112,7 @@ def _meshes(run: TrajectoryFile, garment: GarmentFile | None) -> dict[str, Anima
         velocities=run.velocities[:, places],
         parts=parts,
     )
-    if run.body is None:
-        return {"garment": cloth}
-    body = AnimatedMesh(
-        "body",
-        run.body.positions,
-        run.body.faces,
-        SKIN_COLOR,
-        rest_positions=run.body.rest_positions,
-        skin=run.body.skin,
-    )
-    return {"garment": cloth, "body": body}
+    return {"garment": cloth} if run.body is None else {"garment": cloth, "body": run.body}
 
 
 def _warn_of_order(garment: GarmentFile) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from eslr_jax.errors import AssetError, MeshError
 from eslr_jax.files.npz import check_layout, read_arrays, write_arrays
 from eslr_jax.files.parsing import split_name
+from eslr_jax.mesh.topology import unique_edges
 from eslr_jax.pipeline.formats.mesh import MeshFile, read_mesh_file, shared_vertices
 from eslr_jax.pipeline.formats.mesh_sequence import MeshSequence
 from eslr_jax.pipeline.formats.registry import find_reader, suffixes_of
@@ -83,16 +84,6 @@ def split_outfit(
     return garments
 
 
-@dataclasses.dataclass(frozen=True)
-class GarmentSource:
-    """A garment of a user that is not fitted to a body yet."""
-
-    mesh: MeshFile
-    name: str
-    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # if the file tells
-    is_metric: bool = False  # the format prescribes metres and Y up
-
-
 def is_garment_file(path: str | Path) -> bool:
     """Tell whether a file is a fitted garment, and not a mesh that has to be fitted first."""
     return Path(path).suffix.lower() == ".npz" and "skin_weights" in read_arrays(path, content="garment")
@@ -104,7 +95,7 @@ def garment_path(text: str | Path) -> Path:
     return Path(file if Path(file).suffix.lower() in suffixes_of("garment") else text)
 
 
-def read_garment_source(text: str | Path) -> GarmentSource:
+def read_garment_source(text: str | Path) -> MeshFile:
     """Read a garment of a user: a mesh file, or one garment of HOOD's `garments_dict.pkl`.
 
     Args:
@@ -121,8 +112,7 @@ def read_garment_source(text: str | Path) -> GarmentSource:
     path = garment_path(text)
     if path.suffix.lower() in suffixes_of("garment"):
         return find_reader("garment", path)(path, split_name(text)[1])
-    mesh = read_mesh_file(path)
-    return GarmentSource(mesh, path.stem, is_metric=mesh.is_metric)
+    return dataclasses.replace(read_mesh_file(path), name=path.stem)
 
 
 def read_garment_npz(path: str | Path) -> GarmentFile:
@@ -266,5 +256,5 @@ def in_outfit_order(
 
 def _edges(faces: Int[np.ndarray, "faces 3"], count: int) -> Int[np.ndarray, " edges"]:
     """Return one number for every edge between known vertices."""
-    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique((ends @ [count, 1])[ends[:, 0] >= 0])
+    ends = unique_edges(faces + 1) - 1  # none is negative on the way
+    return (ends @ [count, 1])[ends[:, 0] >= 0]

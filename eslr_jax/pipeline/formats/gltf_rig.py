@@ -13,6 +13,7 @@ import numpy as np
 
 from eslr_jax.errors import AssetError, MotionError
 from eslr_jax.files.parsing import parsing
+from eslr_jax.pipeline.formats.bundled import pick_clip
 from eslr_jax.pipeline.formats.gltf_document import GltfDocument, sample_keys
 from eslr_jax.pipeline.formats.registry import reader
 from eslr_jax.pose.skeleton import (
@@ -94,12 +95,8 @@ def read_gltf_motion(path: Path, clip: str = "") -> SkeletonMotion:
     names = _clip_names(document)
     if not names:
         raise MotionError(f"{path} has no animation; export the character with one")
-    if not clip and len(names) > 1:
-        raise MotionError(f"{path} holds {len(names)} clips; name one, as in {path}#{names[0]}")
-    if clip and clip not in names:
-        raise MotionError(f"{path} has no clip {clip!r}; it has {', '.join(names)}")
+    index = names.index(pick_clip(path, names, clip))
     joints = read_joints(document)
-    index = names.index(clip) if clip else 0
     keys = document.key_frames(document.items("animations")[index])
     if not keys:
         raise MotionError(f"{path}: animation {names[index]!r} moves no node; choose another")

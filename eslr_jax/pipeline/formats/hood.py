@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError
-from eslr_jax.pipeline.formats.garment import GarmentSource
 from eslr_jax.pipeline.formats.mesh import MeshFile
 from eslr_jax.pipeline.formats.pickle import read_pickle
 from eslr_jax.pipeline.formats.registry import reader
@@ -19,7 +18,7 @@ _PINNED = 3  # node_type of a pinned vertex (`NodeType.HANDLE`)
 
 
 @reader("garment", [".pkl"])
-def read_hood_garment(path: Path, name: str = "") -> GarmentSource:
+def read_hood_garment(path: Path, name: str = "") -> MeshFile:
     """Read one garment of HOOD's dictionary: rest_pos, faces and node_type by name."""
     garments = read_pickle(path, content="garment")
     if not isinstance(garments, dict) or not all(isinstance(entry, dict) for entry in garments.values()):
@@ -46,4 +45,4 @@ def read_hood_garment(path: Path, name: str = "") -> GarmentSource:
                 f"garment {name} of {path}: {len(kinds)} node_types for {len(positions)} vertices"
             )
         is_pinned = kinds == _PINNED
-    return GarmentSource(MeshFile(positions, arrays["faces"]), name, is_pinned, is_metric=True)
+    return MeshFile(positions, arrays["faces"], is_metric=True, name=name, is_pinned=is_pinned)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from eslr_jax.files.parsing import parsing
 from eslr_jax.pipeline.formats.registry import find_reader
@@ -29,6 +29,8 @@ class MeshFile:
     # Corner of each polygon from which it was cut into triangles
     cuts: Int[np.ndarray, " polygons"] | None = None
     is_metric: bool = False  # the format prescribes metres and Y up
+    name: str = ""  # of a garment
+    is_pinned: Bool[np.ndarray, " vertices"] | None = None  # if the file tells
 
 
 def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:

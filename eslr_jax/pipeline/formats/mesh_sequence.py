@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from eslr_jax.errors import AssetError, MeshError, MotionError
-from eslr_jax.files.npz import check_layout, read_arrays
+from eslr_jax.files.npz import read_arrays
 from eslr_jax.files.parsing import split_name
+from eslr_jax.pipeline.formats.animated import check_moving
 from eslr_jax.pipeline.formats.mesh import read_mesh_file
 from eslr_jax.pipeline.formats.registry import find_reader, reader, suffixes_of
 from eslr_jax.pose.skeleton import MAX_FRAMES
@@ -33,14 +34,7 @@ class MeshSequence:
 
     def __post_init__(self) -> None:
         """Raise a MeshError unless this is a finite moving mesh, a MotionError at an impossible frame rate."""
-        arrays = {"positions": self.positions, "faces": self.faces}
-        layout = {"positions": ("f", "frames vertices 3"), "faces": ("iu", "faces 3", "vertices")}
-        check_layout(arrays, layout, what=self.name, remedy="export it again", error=MeshError)
-        if 0 in self.positions.shape or not len(self.faces):
-            raise MeshError(f"{self.name} has no frames, vertices or faces; export it again")
-        is_bad = ~np.isfinite(self.positions).all(axis=(1, 2))
-        if is_bad.any():
-            raise MeshError(f"{self.name}: frame {np.argmax(is_bad)} is not finite; cut or repair it")
+        check_moving(self.positions, self.faces, what=self.name, remedy="export it again")
         if not (np.isfinite(self.fps) and 1.0 <= self.fps <= 1000.0):
             raise MotionError(f"{self.name}: {self.fps} frames per second; expected 1 to 1000")
 

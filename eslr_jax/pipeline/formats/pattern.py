@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import MeshError
 from eslr_jax.pipeline.formats.registry import reader
@@ -33,9 +34,8 @@ class Seam(NamedTuple):
     """Two edges that are sewn to each other."""
 
     sides: tuple[Side, Side]
-    is_parallel: (
-        bool  # they run the same way along the seam, right side to wrong side, and not against each other
-    )
+    # They run the same way along the seam, right side to wrong side, and not against each other.
+    is_parallel: bool
 
     def __str__(self) -> str:
         return " to ".join(f"{panel} edge {edge}" for panel, edge in self.sides)
@@ -166,11 +166,7 @@ def _rotation(given: Any, where: str) -> Float[np.ndarray, "3 3"]:
         if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
             raise MeshError(f"{where}: its rotation matrix is no rotation; correct it")
         return matrix
-    x, y, z = np.radians(_numbers(given, (3,), f"{where}: rotation"))
-    (a, b, c), (p, q, r) = np.cos([x, y, z]), np.sin([x, y, z])
-    about_x = np.array([[1, 0, 0], [0, a, -p], [0, p, a]])
-    about_y = np.array([[b, 0, q], [0, 1, 0], [-q, 0, b]])
-    return np.array([[c, -r, 0], [r, c, 0], [0, 0, 1]]) @ about_y @ about_x
+    return Rotation.from_euler("xyz", _numbers(given, (3,), f"{where}: rotation"), degrees=True).as_matrix()
 
 
 def _curve(start: np.ndarray, end: np.ndarray, given: Any, unit: float, where: str) -> np.ndarray:
@@ -228,9 +224,8 @@ def _crossing_segments(outline: np.ndarray) -> tuple[int, int] | None:
         (x, y), (u, v) = (end - start).T[:, :, None], (points[None] - start[:, None]).transpose(2, 0, 1)
         return np.sign(x * v - y * u)
 
-    is_split = (
-        sides(start) * sides(end) < 0
-    )  # the second segment's ends lie on both sides of the first's line
+    # The second segment's ends lie on both sides of the first's line.
+    is_split = sides(start) * sides(end) < 0
     is_crossing = is_split & is_split.T
     if not is_crossing.any():
         return None

@@ -4,7 +4,7 @@ It is found by its suffix, and named in messages and help texts. A format from e
 is imported. Kinds of readers, each with its arguments after the path:
 
 - "mesh": `like`, the same mesh in another shape, or None; returns a `MeshFile`;
-- "garment": the name of one of several; returns a `GarmentSource`. Every mesh is a garment, too;
+- "garment": the name of one of several; returns a `MeshFile` with its name. Every mesh is a garment, too;
 - "pattern": nothing; returns a `Pattern`;
 - "body": the names of its meshes; returns a `RiggedMesh`, or a `Body`;
 - "motion": the name of a clip; returns a `SkeletonMotion`;

@@ -20,15 +20,13 @@ import numpy as np
 
 from eslr_jax.errors import AssetError
 from eslr_jax.files.npz import check_layout, read_arrays, write_arrays
-from eslr_jax.pipeline.formats.animated import Skin
+from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
+from eslr_jax.pipeline.formats.palette import SKIN_COLOR
 
 FORMAT = "eslr-trajectory-3"
 _REQUIRED = ("format", "positions", "velocities", "faces", "timestep", "metadata")
-_BODY = {  # field of BodyTrack -> array
-    "positions": "body_positions",
-    "faces": "body_faces",
-    "rest_positions": "body_rest_positions",
-}
+# Fields of the body and of its skin -> arrays.
+_BODY = {name: f"body_{name}" for name in ("positions", "faces", "rest_positions")}
 _SKIN = {field.name: f"body_{field.name}" for field in dataclasses.fields(Skin)}
 _LAYOUT = {
     "timestep": ("f", ""),
@@ -51,16 +49,6 @@ _REMEDY = "write it again"
 
 
 @dataclasses.dataclass(frozen=True)
-class BodyTrack:
-    """A body in motion."""
-
-    positions: np.ndarray  # [frames, body_vertices, 3] [m]
-    faces: np.ndarray  # [body_faces, 3]
-    rest_positions: np.ndarray  # [body_vertices, 3] [m]
-    skin: Skin | None = None  # the joints that moved it
-
-
-@dataclasses.dataclass(frozen=True)
 class TrajectoryFile:
     """What a trajectory file holds."""
 
@@ -69,7 +57,7 @@ class TrajectoryFile:
     faces: np.ndarray  # [faces, 3]
     timestep: float  # time between frames [s]
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # garment, motion, ...: values of JSON
-    body: BodyTrack | None = None
+    body: AnimatedMesh | None = None  # with its rest positions
     friction_loads: np.ndarray | None = None  # [frames, vertices], normal force that friction acts with [N]
     residuals: np.ndarray | None = None  # [frames], force norm over weight that each frame ended with
 
@@ -139,7 +127,8 @@ def read_trajectory(path: str | Path) -> TrajectoryFile:
         values["joint_names"] = tuple(str(name) for name in values["joint_names"])
         skin = Skin(**values)
     if "body_positions" in arrays:
-        body = BodyTrack(**{field: arrays[name] for field, name in _BODY.items()}, skin=skin)
+        values = {field: arrays[name] for field, name in _BODY.items()}
+        body = AnimatedMesh("body", **values, color=SKIN_COLOR, skin=skin)
     return TrajectoryFile(
         arrays["positions"],
         arrays["velocities"],

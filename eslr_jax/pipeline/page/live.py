@@ -205,20 +205,21 @@ def _one_frame(live: Live, choice: Choice) -> bool:
             hand = grasp(held, np.asarray(handle.position) + cast.spots[frame])
         stage = changed(cast.stage, fabric, wind, hand)
         tolerance = 0.01 * float(live.controls["tolerance"].value)  # of the gap that a frame begins with
-        step = jax.block_until_ready(advance(stage, live.state, (before, frame), live.iterations, tolerance))
-    status = Status(int(step.state.status))
+        stepped = advance(stage, live.state, (before, frame), live.iterations, tolerance)
+        state, report = jax.block_until_ready(stepped)
+    status = Status(int(state.status))
     if status != Status.OK:
         restart(live)
         live.controls["status"].content = f"put on anew: {status.describe()}"
         return False
-    live.state, live.step = step.state, live.step + 1
+    live.state, live.step = state, live.step + 1
     if live.controls["record"].value:
-        state, residual = jax.tree.map(np.asarray, (step.state, step.report.residual))
-        live.recorded.append(Recorded(frame, state, residual, is_held="hand" in live.controls))
+        kept = jax.tree.map(np.asarray, (state, report.residual))
+        live.recorded.append(Recorded(frame, *kept, is_held="hand" in live.controls))
         live.setting = setting
     # The body walks on the spot.
     body = np.asarray(cast.poses.positions[frame]) - cast.spots[frame]
-    cloth = np.asarray(step.state.position) - cast.spots[frame]
+    cloth = np.asarray(state.position) - cast.spots[frame]
     with live.server.atomic():
         for piece, mesh in cast.drawn_body:
             mesh.vertices = piece.place(body)
@@ -229,7 +230,7 @@ def _one_frame(live: Live, choice: Choice) -> bool:
     live.is_compiled = True
     live.controls["constants"].content = describe_fabric(fabric)
     if live.times:
-        _tell(live, cast, step.report, tolerance)
+        _tell(live, cast, report, tolerance)
     return True
 
 

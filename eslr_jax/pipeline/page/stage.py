@@ -51,13 +51,6 @@ class Stage(NamedTuple):
     back: FrameInput  # from every frame to the one before
 
 
-class Step(NamedTuple):
-    """One frame."""
-
-    state: ClothState
-    report: FrameReport
-
-
 def no_hand() -> Hand:
     """Return a hand that holds nothing."""
     return Hand(jnp.int32(0), jnp.zeros(3), jnp.float32(0.0))
@@ -115,7 +108,7 @@ def changed(stage: Stage, material: Material, wind: Any, hand: Hand) -> Stage:
 
 def advance(
     stage: Stage, state: ClothState, frames: tuple[int, int], iterations: int, tolerance: float
-) -> Step:
+) -> tuple[ClothState, FrameReport]:
     """Step the cloth while the body moves from the first of two neighbouring frames to the other.
 
     The frame may end at a tolerance: a share of its initial gap.
@@ -136,9 +129,8 @@ def _step(
     tolerance: Float[Array, ""],
     *,
     config: SimConfig,
-) -> Step:
-    stepper = make_stepper(None, config, iterations, tolerance)
-    return Step(*step_frame(stepper, scene, state, frame))
+) -> tuple[ClothState, FrameReport]:
+    return step_frame(make_stepper(None, config, iterations, tolerance), scene, state, frame)
 
 
 def nearest_vertex(positions: Float[np.ndarray, "vertices 3"], origin: Any, direction: Any) -> int:

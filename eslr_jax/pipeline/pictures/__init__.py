@@ -1,7 +1,13 @@
 """Pictures and video without a display or a GPU (extra `render`)."""
 
-from eslr_jax.pipeline.pictures.annotate import add_color_bar, color_scale, side_by_side, write_label
-from eslr_jax.pipeline.pictures.files import write_png, write_video
+from eslr_jax.pipeline.pictures.annotate import (
+    add_color_bar,
+    color_scale,
+    side_by_side,
+    write_label,
+    write_png,
+    write_video,
+)
 from eslr_jax.pipeline.pictures.pictures import contact_sheet, moment_text, render_frame, render_frames
 
 __all__ = [

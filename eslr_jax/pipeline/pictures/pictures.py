@@ -9,7 +9,7 @@ import numpy as np
 
 from eslr_jax.errors import ConfigError, MeshError, NonFiniteError
 from eslr_jax.pipeline.extras import require
-from eslr_jax.pipeline.formats.animated import Skin
+from eslr_jax.pipeline.formats.animated import Skin, check_moving
 from eslr_jax.pipeline.formats.palette import GARMENT_COLORS
 from eslr_jax.pipeline.pictures.annotate import side_by_side
 from eslr_jax.pipeline.pictures.camera import facing_angles, follow, parse_angle
@@ -193,16 +193,5 @@ def _checked_mesh(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and faces; raise a named error unless they form a finite animated mesh."""
     points, triangles = np.asarray(positions, np.float32), np.asarray(faces)
-    if points.ndim != 3 or points.shape[2] != 3 or 0 in points.shape:
-        raise MeshError(f"{name} positions have shape {points.shape}; they must be [frames, vertices, 3]")
-    is_table = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype.kind in "iu"
-    if not is_table or not len(triangles):
-        raise MeshError(f"{name} faces have shape {triangles.shape}; they must be integers [faces, 3]")
-    if triangles.min() < 0 or triangles.max() >= points.shape[1]:
-        raise MeshError(f"{name} has a face that names vertex {triangles.max()} of {points.shape[1]}")
-    is_finite = np.isfinite(points).all(axis=(1, 2))
-    if not is_finite.all():
-        raise NonFiniteError(
-            f"{name} positions are NaN or infinite from frame {int(np.argmin(is_finite))} on"
-        )
+    check_moving(points, triangles, what=name, remedy="correct it", not_finite=NonFiniteError)
     return points, triangles

@@ -1,4 +1,4 @@
-"""Evaluate a network on a split: optimality gap, and free rollouts (host)."""
+"""Evaluate a network on a split: optimality gap, and free rollouts; and without one of its parts (host)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from eslr_jax.config import EvaluationOptions, SimConfig
+from eslr_jax.config import Control, EvaluationOptions, SimConfig
 from eslr_jax.errors import ConfigError, Status
 from eslr_jax.mesh.prepare import pad_alike
 from eslr_jax.networks.network import Network
 from eslr_jax.pipeline.assets import load_body, load_garment, load_motion, load_splits, split_clips
-from eslr_jax.pipeline.report.controls import control_garment, control_network
 from eslr_jax.pipeline.report.gap import ITERATIONS, GapOptions, OptimalityGap, gap_medians, measure_gap
 from eslr_jax.pipeline.report.metrics import extremes, measure_frames
 from eslr_jax.pipeline.report.report import mean_energies
@@ -26,6 +26,7 @@ from eslr_jax.simulation.simulate import good_frames, hold_last, raise_for_statu
 from eslr_jax.terms import FAST
 from eslr_jax.types import Garment, Scene, Trajectory
 
+EMBEDDING_CONTROLS: tuple[Control, ...] = ("no_embedding", "random_embedding")
 _TRUTH_ITERATIONS = 300  # of the rollout that supplies teacher-forced states
 _REFERENCE_ITERATIONS = 30  # of the solver's free rollouts, 0.2 % of the initial gap
 _STILL_FRAMES = 120  # of the rest pose with lowered arms, for the drift
@@ -193,3 +194,43 @@ def _pool_rollouts(scenes: list[dict[str, Any]]) -> dict[str, Any]:
         pooled["distance_mm"] = float(np.mean([scene["distance_mm"] for scene in scenes]))
         pooled["optimum"] = _pool_rollouts([scene["optimum"] for scene in scenes])
     return pooled
+
+
+def control_network(control: Control, network: Network) -> Network:
+    """Return a trained network, one of this package's, without what a control takes away.
+
+    "untrained" has weights of a new network, on the trained one's statistics of features. "no_decoder" has a last
+    layer of zeros: what is left are gradient steps, and the guess.
+
+    Raises:
+        ConfigError: The network has no such part.
+    """
+    if control in EMBEDDING_CONTROLS and not getattr(network.config, "attention_blocks", 0):
+        raise ConfigError(f"control {control} takes geodesic coordinates away, which only attention reads")
+    if control == "untrained":
+        return network.replace(params=network.config.new_network().params)
+    if control == "no_decoder":
+        decoder, last = network.params["decoder"], network.config.hidden_layers
+        names = (f"kernel_{last}", f"bias_{last}")
+        zeros = {name: jnp.zeros_like(decoder[name]) for name in names}
+        return network.replace(params={**network.params, "decoder": {**decoder, **zeros}})
+    return network
+
+
+def control_garment(control: Control, garment: Garment) -> Garment:
+    """Return a garment without what a control takes away.
+
+    "no_embedding" has geodesic coordinates of zero, "random_embedding" normal numbers of the same spread, equal
+    for equal garments however they are padded.
+    """
+    embedding = garment.geodesic_embedding
+    if control == "no_embedding":
+        return garment.replace(geodesic_embedding=jnp.zeros_like(embedding))
+    if control == "random_embedding":
+        is_real = garment.vertex_mask[:, None]
+        # One key a vertex, so that padding does not change what is drawn.
+        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(0)))(jnp.arange(len(embedding)))
+        noise = jax.vmap(lambda key: jax.random.normal(key, embedding.shape[1:]))(keys)
+        spread = jnp.std(embedding, axis=0, keepdims=True, where=is_real)
+        return garment.replace(geodesic_embedding=jnp.where(is_real, noise * spread, 0.0))
+    return garment

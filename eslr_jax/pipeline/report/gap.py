@@ -34,9 +34,8 @@ class OptimalityGap(NamedTuple):
     optimum: Float[Array, " frames"]
     reached: Float[Array, " frames"]  # where the trajectory itself went
     solver: dict[int, Float[Array, " frames"]]  # after so many iterations from the solver's own guess
-    refined: dict[
-        int, Float[Array, " frames"]
-    ]  # after as many from the network's prediction; empty without one
+    # After as many from the network's prediction; empty without one.
+    refined: dict[int, Float[Array, " frames"]]
 
     @property
     def initial_gap(self) -> Float[Array, " frames"]:

@@ -16,11 +16,12 @@ from jaxtyping import Array, Float
 from eslr_jax.errors import AssetError
 from eslr_jax.files.atomic import atomic_write, ensure_output_dir, move_files
 from eslr_jax.files.npz import read_arrays
-from eslr_jax.pipeline.formats.animated import Skin
+from eslr_jax.pipeline.formats.animated import AnimatedMesh, Skin
 from eslr_jax.pipeline.formats.export import export_trajectory
 from eslr_jax.pipeline.formats.garment import GarmentFile, read_garment_npz, write_garment_npz
-from eslr_jax.pipeline.formats.trajectory import BodyTrack, TrajectoryFile, read_trajectory, write_trajectory
-from eslr_jax.pipeline.report.foreign import foreign_trajectory
+from eslr_jax.pipeline.formats.palette import SKIN_COLOR
+from eslr_jax.pipeline.formats.trajectory import TrajectoryFile, read_trajectory, write_trajectory
+from eslr_jax.pipeline.report.score import foreign_trajectory
 from eslr_jax.simulation.archive import read_tree, save_scene
 from eslr_jax.types import Body, BodyMotion, Scene, Trajectory
 
@@ -61,7 +62,7 @@ class Run:
 
 
 class ClothTrack(NamedTuple):
-    """The cloth, frame by frame."""
+    """The cloth, frame by frame: what a run needs of a `Trajectory`."""
 
     positions: Float[Array, "frames vertices 3"]  # [m]
     velocities: Float[Array, "frames vertices 3"]  # [m/s]
@@ -71,7 +72,7 @@ class ClothTrack(NamedTuple):
 
 def write_run(
     folder: Path,
-    track: ClothTrack,
+    track: ClothTrack | Trajectory,
     scene: Scene | None,
     actor: tuple[Body, BodyMotion, GarmentFile],
     *,
@@ -101,7 +102,8 @@ def write_run(
         parents=rig.parents,
         joint_names=rig.joint_names,
     )
-    body = BodyTrack(*map(np.asarray, (poses.positions, poses.faces, poses.rest_positions)), skin)
+    moving, faces, rest = map(np.asarray, (poses.positions, poses.faces, poses.rest_positions))
+    body = AnimatedMesh("body", moving, faces, SKIN_COLOR, rest_positions=rest, skin=skin)
     file = TrajectoryFile(
         positions=np.asarray(track.positions),
         velocities=np.asarray(track.velocities),

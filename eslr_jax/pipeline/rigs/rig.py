@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eslr_jax.errors import AssetError, MotionError
+from eslr_jax.files.npz import check_layout
 from eslr_jax.mesh.validate import UNITS, check_outward
 from eslr_jax.pipeline.formats.mesh import shared_vertices
 from eslr_jax.pipeline.rigs.alignment import LIMBS, align_rests, match_parts, rig_scale
@@ -28,6 +29,13 @@ _HUMAN = 1.7  # [m]
 _IN_METRES = (0.3, 3.0)  # [m] extents of bodies that are taken to be in metres
 _IN_UNITS = (0.5, 2.6)  # [m] extents that make another unit believable
 _EXTENTS = (1e-4, 1e6)  # of a body in any unit; beyond, the file is damaged
+_LAYOUT = {  # of a RiggedMesh
+    "joints": ("f", "joints 3"),
+    "positions": ("f", "vertices 3"),
+    "faces": ("iu", "faces 3", "vertices"),
+    "skin_weights": ("f", "vertices influences"),
+    "skin_indices": ("iu", "vertices influences", "joints"),
+}
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from Z up
 
 
@@ -137,27 +145,10 @@ def make_body(mesh: RiggedMesh, *, units: str | None = None) -> Body:
 
 def _check_mesh(mesh: RiggedMesh) -> None:
     """Raise unless a rigged mesh can be a body."""
-    count, joints = len(mesh.positions), len(mesh.skeleton)
-    if count == 0 or len(mesh.faces) == 0:
-        raise AssetError(f"body {mesh.name} has {count} vertices and {len(mesh.faces)} faces; give a mesh")
-    if (
-        mesh.positions.shape != (count, 3)
-        or mesh.faces.shape[1:] != (3,)
-        or mesh.skeleton.rest_positions.shape != (joints, 3)
-    ):
-        raise AssetError(f"body {mesh.name} is no triangle mesh with joints; export it again")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= count:
-        raise AssetError(
-            f"body {mesh.name} has a face that names vertex {mesh.faces.max()} of {count}; export it again"
-        )
-    if mesh.skin_weights.shape != mesh.skin_indices.shape or len(mesh.skin_weights) != count:
-        raise AssetError(
-            f"body {mesh.name} has skin weights for {len(mesh.skin_weights)} of {count} vertices; export it again"
-        )
-    if mesh.skin_indices.min() < 0 or mesh.skin_indices.max() >= joints:
-        raise AssetError(
-            f"body {mesh.name} has a skin weight for joint {mesh.skin_indices.max()} of {joints}; export it again"
-        )
+    arrays = vars(mesh) | {"joints": mesh.skeleton.rest_positions}
+    check_layout(arrays, _LAYOUT, what=f"body {mesh.name}", remedy="export it again")
+    if not len(mesh.positions) or not len(mesh.faces):
+        raise AssetError(f"body {mesh.name} has no vertices or faces; give a mesh")
     values = (mesh.positions, mesh.skin_weights, mesh.skeleton.rest_positions)
     if not all(np.isfinite(array).all() for array in values):
         raise AssetError(f"body {mesh.name} has NaN or infinite vertices, weights or joints; repair it")

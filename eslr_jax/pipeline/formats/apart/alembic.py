@@ -41,9 +41,8 @@ def find_meshes(parent: Any, carriers: tuple[Any, ...] = ()) -> Iterator[tuple[s
 
 def array(values: Any) -> np.ndarray:
     """Return a copy of an array of the library's, which lives no longer than its sample."""
-    return (
-        np.array(memoryview(values)) if len(values) else np.zeros(0, np.int32)
-    )  # an empty one has no buffer
+    # An empty one has no buffer.
+    return np.array(memoryview(values)) if len(values) else np.zeros(0, np.int32)
 
 
 def carried(carriers: tuple[Any, ...], time: float) -> np.ndarray:
