@@ -9,9 +9,8 @@ from jaxtyping import Float, Int
 from eslr_jax.mesh.topology import face_areas, incidence_table, unique_edges, vertex_areas
 from eslr_jax.types import BodySurface
 
-_PATCH_SIZE = (
-    16  # vertices, faces or edges in a group; more make the first level cheaper and the second dearer
-)
+# Vertices, faces or edges in a group; more make the first level cheaper and the second dearer.
+_PATCH_SIZE = 16
 
 
 def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
