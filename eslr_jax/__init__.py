@@ -10,47 +10,25 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
 
-_PUBLIC = {
-    "SimConfig": "eslr_jax.config",
-    "TrainConfig": "eslr_jax.config",
-    "Network": "eslr_jax.networks.network",
-    **dict.fromkeys(
-        (
-            "AssetError",
-            "CapacityError",
-            "CheckpointError",
-            "ConfigError",
-            "EslrError",
-            "MeshError",
-            "MissingExtraError",
-            "MotionError",
-            "NonFiniteError",
-            "Status",
-        ),
-        "eslr_jax.errors",
-    ),
-    "Material": "eslr_jax.types",
-    "Trajectory": "eslr_jax.types",
-    "load_body": "eslr_jax.pipeline.assets",
-    "load_garment": "eslr_jax.pipeline.assets",
-    "load_model": "eslr_jax.pipeline.assets",
-    "load_motion": "eslr_jax.pipeline.assets",
-    "load_trajectory": "eslr_jax.pipeline.report.run",
-    "pose_body": "eslr_jax.pose.motion",
-    "prepare_garment": "eslr_jax.mesh.prepare",
-    "plan_scene": "eslr_jax.simulation.plan",
-    "prepare_scene": "eslr_jax.simulation.plan",
-    "prepare_scenes": "eslr_jax.simulation.plan",
-    "rollout": "eslr_jax.simulation.rollout",
-    "rollout_scene": "eslr_jax.simulation.rollout",
-    "scene_terms": "eslr_jax.terms",
-    "score_trajectory": "eslr_jax.pipeline.report.score",
-    "simulate": "eslr_jax.simulation.simulate",
-    "step": "eslr_jax.simulation.rollout",
-    "load_scene": "eslr_jax.simulation.archive",
-    "save_scene": "eslr_jax.simulation.archive",
-    "simulate_batch": "eslr_jax.simulation.batch",
+_NAMES = {
+    "config": "SimConfig TrainConfig",
+    "errors": "AssetError CapacityError CheckpointError ConfigError EslrError MeshError MissingExtraError "
+    "MotionError NonFiniteError Status",
+    "types": "Material Trajectory",
+    "mesh.prepare": "prepare_garment",
+    "networks.network": "Network",
+    "pipeline.assets": "load_body load_garment load_model load_motion",
+    "pipeline.report.run": "load_trajectory",
+    "pipeline.report.score": "score_trajectory",
+    "pose.motion": "pose_body",
+    "simulation.archive": "load_scene save_scene",
+    "simulation.batch": "simulate_batch",
+    "simulation.plan": "plan_scene prepare_scene prepare_scenes",
+    "simulation.rollout": "rollout rollout_scene step",
+    "simulation.simulate": "simulate",
+    "terms": "scene_terms",
 }
+_PUBLIC = {name: f"eslr_jax.{module}" for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = ["__version__", *_PUBLIC]
 

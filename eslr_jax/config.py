@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import importlib
 import tomllib
+from collections.abc import Collection
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -18,6 +19,10 @@ Criterion = Literal["postcvpr", "cvpr", "metric"]
 Control = Literal["untrained", "no_decoder", "no_embedding", "random_embedding"]
 """What a network may be deprived of, see `pipeline.report.evaluate`."""
 
+_MAY_BE_ZERO = (
+    "iterations", "tolerance", "warmup", "final_learning_rate", "still_probability", "noise", "girth",
+    "shape_range", "material_probability", "max_skipped", "seed",
+)  # fmt: skip
 MOST_ITERATIONS = 500  # of a frame with a tolerance; a dress on a fast clip takes 140 on average for 1 %
 
 
@@ -49,11 +54,7 @@ class SimConfig:
             object.__setattr__(self, "tolerance", 0.01 if self.iterations is None else 0.0)
         if self.iterations is None:
             object.__setattr__(self, "iterations", MOST_ITERATIONS)
-        if self.memory < 1:
-            raise ValueError(f"memory must be at least 1, got {self.memory}")
-        for name in ("iterations", "tolerance"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_numbers(self, may_be_zero=_MAY_BE_ZERO)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +130,8 @@ class TrainConfig:
     reset_displacement: float = 0.3  # [m] along an axis in one frame, beyond which a trajectory starts anew
     material_probability: float = 0.25  # share of trajectories with a random fabric (HOOD's ranges)
     collision_stiffness: float = 3.5e7  # [J/m^5], of the set "consistent"; "hood" has its own ramp
-    # Refinement steps in the loss: all alike, only the last, or each by the share of the gap that it leaves.
-    refinement_weights: Literal["equal", "last", "contraction"] = "equal"
+    # Refinement steps in the loss: all alike, or each by the share of the gap that it leaves.
+    refinement_weights: Literal["equal", "contraction"] = "equal"
     max_skipped: int = 100  # non-finite updates skipped in a row before training stops
     log_every: int = 100  # steps between lines of metrics.jsonl
     checkpoint_every: int = 1000  # steps
@@ -143,36 +144,13 @@ class TrainConfig:
         Raises:
             ValueError: Names the field.
         """
-        for name in (
-            "steps",
-            "seeds",
-            "batch_size",
-            "vmap_size",
-            "frames",
-            "through_time",
-            "slots_per_garment",
-            "horizon",
-            "horizon_growth",
-            "log_every",
-            "checkpoint_every",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in (
-            "learning_rate",
-            "clip_norm",
-            "reset_stretch",
-            "reset_displacement",
-            "collision_stiffness",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        check_numbers(self, may_be_zero=_MAY_BE_ZERO)
         if self.frames % self.through_time:
             raise ValueError(
                 f"frames = {self.frames} must be a multiple of through_time = {self.through_time}"
             )
-        if self.iterations < 0 or (self.iterations and self.energy_set == "hood"):
-            raise ValueError('iterations must not be negative, and needs energy_set = "consistent"')
+        if self.iterations and self.energy_set == "hood":
+            raise ValueError(f'iterations = {self.iterations} needs energy_set = "consistent"')
         if self.criterion != "postcvpr" and self.energy_set != "hood":
             raise ValueError(f'criterion = "{self.criterion}" needs energy_set = "hood"')
         if self.refinement_weights != "equal" and self.iterations:
@@ -187,14 +165,28 @@ class TrainConfig:
             raise ValueError(
                 'collision_stiffness needs energy_set = "consistent": HOOD has a ramp of its own'
             )
-        for name in ("noise", "girth", "shape_range", "warmup", "final_learning_rate"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("material_probability", "still_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not self.garments or not self.vertices:
             raise ValueError("garments and vertices must name at least one each")
+
+
+def check_numbers(config: Any, *, may_be_zero: Collection[str]) -> None:
+    """Check that the numbers of a configuration are positive, whole ones at least 1, or 0 or more.
+
+    Raises:
+        ValueError: Names the field.
+    """
+    for field in dataclasses.fields(config):
+        name, value = field.name, getattr(config, field.name)
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        if name in may_be_zero and not value >= 0:
+            raise ValueError(f"{name} must not be negative, got {value}")
+        if name not in may_be_zero and not value > 0:
+            least = "at least 1" if isinstance(value, int) else "positive"
+            raise ValueError(f"{name} must be {least}, got {value}")
 
 
 Config = TypeVar("Config")

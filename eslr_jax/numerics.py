@@ -20,13 +20,7 @@ def as_partial(function: Callable) -> Partial:
 
 
 def safe_norm(x: Float[Array, ...], axis: int = -1, keepdims: bool = False) -> Float[Array, ...]:
-    """Return the Euclidean norm with a zero (not NaN) gradient at zero.
-
-    Args:
-        x: Vectors along `axis`.
-        axis: Axis of the components.
-        keepdims: Keep `axis` with length one.
-    """
+    """Return the Euclidean norm along an axis, with a zero (not NaN) gradient at zero."""
     return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))
 
 
@@ -36,9 +30,9 @@ def safe_sqrt(x: Float[Array, ...]) -> Float[Array, ...]:
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
-def safe_normalize(x: Float[Array, ...], axis: int = -1) -> Float[Array, ...]:
+def safe_normalize(x: Float[Array, ...]) -> Float[Array, ...]:
     """Return unit vectors; a zero vector stays zero and has a zero gradient."""
-    parts = jnp.split(x, x.shape[axis], axis=axis)  # added one by one: a sum is a kernel of its own on a CPU
+    parts = jnp.split(x, x.shape[-1], axis=-1)  # added one by one: a sum is a kernel of its own on a CPU
     squared = sum(part * part for part in parts)
     is_zero = squared == 0
     return jnp.where(is_zero, 0.0, x * jax.lax.rsqrt(jnp.where(is_zero, 1.0, squared)))
@@ -172,12 +166,9 @@ def sub3(a: _Vector[_Component], b: _Vector[_Component]) -> _Vector[_Component]:
 def pierces(
     start: _Vector[_Component], end: _Vector[_Component], triangle: Sequence[_Vector[_Component]]
 ) -> _Component:
-    """Return which segments pass through which triangles; one that only touches the plane does not.
+    """Return which segments pass through which triangles, given by their ends and their three corners.
 
-    Args:
-        start: First ends of the segments, by components.
-        end: Second ends.
-        triangle: Three corners, each by components.
+    One that only touches the plane does not.
     """
     a, b, c = triangle
     normal = cross3(sub3(b, a), sub3(c, a))
@@ -302,24 +293,16 @@ _define(_sum_flat, _gather_flat, _sum_flat_impl, lambda flat, incidence: inciden
 def scatter_corners(
     values: Float[Array, "items corners"], incidence: Int[Array, "rows degree"]
 ) -> Float[Array, " rows"]:
-    """Sum over every row the values of the corners that name it; the transpose of `gather_corners`.
-
-    Args:
-        values: One value per corner of every item.
-        incidence: Flat corner positions per row, see `gather_corners`.
-    """
+    """Sum over every row the values of the corners that name it; the transpose of `gather_corners`."""
     return _sum_flat_impl(values.T.ravel(), None, incidence)
 
 
 def sum_incident(
     values: Float[Array, "items features"], incidence: Int[Array, "rows degree"], *, corners: int
 ) -> Float[Array, "rows features"]:
-    """Sum over every row the values of the items (faces, hinges) that name it.
+    """Sum over every row the values of the items that name it, each with so many corners.
 
-    Args:
-        values: One row per item.
-        incidence: Flat corner positions per row, see `gather_corners`.
-        corners: Corners of an item.
+    For `incidence` see `gather_corners`.
     """
     items = _incident_items(incidence, values.shape[0], corners=corners)
     padded = jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]), values.dtype)])
@@ -340,10 +323,7 @@ def vertex_normals(
 ) -> Float[Array, "vertices 3"]:
     """Return unit normals weighted by the areas of the incident faces; zero where there is none.
 
-    Args:
-        positions: Vertex positions [m].
-        faces: Triangles, counter-clockwise seen from outside.
-        incidence: Of the faces, see `gather_corners`.
+    Faces are counter-clockwise seen from outside; for `incidence` see `gather_corners`.
     """
     a, b, c = gather_corners(positions, faces, incidence)
     normals = jnp.stack(cross3(sub3(b, a), sub3(c, a)))

@@ -251,9 +251,8 @@ class Trajectory:
     friction_loads: Float[Array, "frames vertices"]  # normal forces that load the next frame's friction [N]
     energies: dict[str, Float[Array, " frames"]]  # that each frame ended with [J], by the names of the terms
     residuals: Float[Array, " frames"]  # force norm over weight at the end of each frame
-    gap_bounds: Float[
-        Array, " frames"
-    ]  # share of the initial gap that the solver left at most; inf without one
+    # Share of the initial gap that the solver left at most; inf without one.
+    gap_bounds: Float[Array, " frames"]
     iterations: Int[Array, " frames"]  # of the solver; with substeps, the most that one of them took
     status: Int[Array, ""]  # errors.Status bits
     first_bad_frame: Int[Array, ""]  # row of the first frame with a status; -1 while status is OK

@@ -73,7 +73,10 @@ def test_recipe_takes_a_model_by_name(tmp_path):
         ('[model]\nbase = "mgn-5"\nrefinement_steps = 3', "unknown option model.refinement_steps"),
         ("[model]\nlatent_size = 64", "the model has no base"),
         ("model = 3", "the model is 3"),
-        ('model = "smooth-small"\niterations = 9\nrefinement_weights = "last"', "needs iterations = 0"),
+        (
+            'model = "smooth-small"\niterations = 9\nrefinement_weights = "contraction"',
+            "needs iterations = 0",
+        ),
         ('model = "mgn-5"\nrefinement_weights = "contraction"', "refinement_steps > 1"),
         ('model = "mgn-5"\nschedule = "hood"\nwarmup = 5', 'warmup needs schedule = "cosine"'),
         ('model = "mgn-5"\nschedule = "hood"\nfinal_learning_rate = 0.0', "final_learning_rate needs"),

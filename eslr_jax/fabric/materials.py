@@ -12,14 +12,13 @@ from eslr_jax.terms.gravity import Gravity
 from eslr_jax.terms.stretch import stretch_stiffness
 from eslr_jax.types import Material
 
-_COTTON: dict[str, Any] = {
-    "density": np.float32(0.20022),  # [kg/m^2] = 426 kg/m^3 x 0.47 mm
-    "lame_mu": np.float32(23600.0),  # [Pa]
-    "lame_lambda": np.float32(44400.0),  # [Pa]
-    "bending_stiffness": np.float32(3.9625778e-5),  # [J] = 50 (lambda + 2 mu) h^3 / 12
-    "thickness": np.float32(4.7e-4),  # [m]
-}
-COTTON = Material(**_COTTON)
+COTTON: Any = Material(
+    density=np.float32(0.20022),  # [kg/m^2] = 426 kg/m^3 x 0.47 mm
+    lame_mu=np.float32(23600.0),  # [Pa]
+    lame_lambda=np.float32(44400.0),  # [Pa]
+    bending_stiffness=np.float32(3.9625778e-5),  # [J] = 50 (lambda + 2 mu) h^3 / 12
+    thickness=np.float32(4.7e-4),  # [m]
+)
 """The fabric of SNUG (Santesteban et al. 2022) with which HOOD and the paper evaluate."""
 
 _WANG = "Wang, O'Brien, Ramamoorthi 2011, doi:10.1145/2010324.1964966, data of ARCSim"
@@ -106,9 +105,7 @@ def _woven(name: str, stretch: tuple[float, float, float, float], bending: tuple
 def rigidity_of(bending_length: float, density: float) -> float:
     """Return the flexural rigidity [N m] of a bending length c [m]: D = w c^3, with w the weight per area.
 
-    Args:
-        bending_length: Peirce's: half of the overhang whose end lies 41.5 degrees below its edge.
-        density: [kg/m^2].
+    Peirce's bending length is half of the overhang whose end lies 41.5 degrees below its edge.
 
     Source: Peirce 1930, doi 10.1080/19447023008661529.
     """
@@ -184,17 +181,16 @@ def _lame(stretch: float, thickness: Any) -> dict[str, Any]:
     }
 
 
-def describe_cotton() -> Fabric:
-    """Return cotton as one of the table's rows."""
-    bending = float(_COTTON["bending_stiffness"])
-    what = "the fabric of SNUG, HOOD and the paper"
-    stretch = float(stretch_stiffness(COTTON))
-    return Fabric(float(_COTTON["density"]), stretch, bending, what, "Santesteban et al. 2022 (SNUG)")
-
-
 def all_fabrics() -> dict[str, Fabric | Woven]:
     """Return every named fabric: cotton, those of one stiffness, those by threads."""
-    return {"cotton": describe_cotton(), **FABRICS, **WOVEN}
+    cotton = Fabric(
+        float(COTTON.density),
+        float(stretch_stiffness(COTTON)),
+        float(COTTON.bending_stiffness),
+        "the fabric of SNUG, HOOD and the paper",
+        "Santesteban et al. 2022 (SNUG)",
+    )
+    return {"cotton": cotton, **FABRICS, **WOVEN}
 
 
 def fabric_names() -> tuple[str, ...]:
@@ -211,11 +207,9 @@ def fabric_material(name: str) -> Material:
     """
     if name == "cotton":
         return COTTON
-    fabric, thickness = FABRICS[name], _COTTON["thickness"]
-    values: dict[str, Any] = {
-        "density": np.float32(fabric.density),
-        **_lame(fabric.stretch_stiffness, thickness),
-        "bending_stiffness": np.float32(fabric.bending_stiffness),
-        "thickness": thickness,
-    }
-    return Material(**values)
+    fabric = FABRICS[name]
+    return COTTON.replace(
+        density=np.float32(fabric.density),
+        bending_stiffness=np.float32(fabric.bending_stiffness),
+        **_lame(fabric.stretch_stiffness, COTTON.thickness),
+    )

@@ -13,16 +13,12 @@ from eslr_jax.errors import AssetError, EslrError
 from eslr_jax.files.atomic import atomic_write
 from eslr_jax.files.parsing import parsing
 
+MAX_BYTES = 16 << 30  # unpacked
 _KINDS = {"f": "floats", "iu": "integers", "biu": "flags", "biuf": "flags", "fiu": "numbers", "U": "text"}
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compressed: bool = False) -> None:
-    """Write named arrays as an npz archive, atomically.
-
-    Args:
-        path: Path of the archive.
-        arrays: Arrays by name.
-        is_compressed: Compress the arrays, which makes files smaller and writing several times slower.
+    """Write named arrays as an npz archive, atomically; compressed, it is smaller and takes much longer.
 
     Raises:
         AssetError: The file can't be written.
@@ -33,7 +29,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray], *, is_compr
 
 
 def read_arrays(
-    path: str | Path, *, content: str, names: Collection[str] | None = None, max_bytes: int = 16 << 30
+    path: str | Path, *, content: str, names: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
     """Read arrays of an npz archive; nothing is unpickled, and headers are checked before memory is taken.
 
@@ -41,13 +37,9 @@ def read_arrays(
         path: Path of the archive.
         content: What the file should hold, for messages, e.g. "trajectory".
         names: Names of the arrays to read where present; None reads all.
-        max_bytes: Largest unpacked size accepted [bytes].
-
-    Returns:
-        Arrays by name.
 
     Raises:
-        AssetError: The file is missing, truncated, damaged, larger than `max_bytes`, or no npz archive.
+        AssetError: The file is missing, truncated, damaged, larger than `MAX_BYTES`, or no npz archive.
     """
     with parsing(path, content, form=" as an npz archive", remedy="write it again") as file:
         if not zipfile.is_zipfile(file):
@@ -57,9 +49,9 @@ def read_arrays(
             if names is not None:
                 members = {name: member for name, member in members.items() if name in names}
             total = sum(archive.getinfo(member).file_size for member in members.values())
-            if total > max_bytes:
+            if total > MAX_BYTES:
                 raise AssetError(
-                    f"{content} file {path} unpacks to {total} bytes, more than {max_bytes}; check the file"
+                    f"{content} file {path} unpacks to {total} bytes, more than {MAX_BYTES}; check the file"
                 )
             return {name: _read_member(archive, member) for name, member in members.items()}
 

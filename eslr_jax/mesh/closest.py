@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from eslr_jax.mesh.topology import normalize
+
 
 def closest_points(
     points: Float[np.ndarray, "points 3"],
@@ -71,8 +73,7 @@ def nearest_places(
     corners = faces[nearest]
     offsets = points - np.einsum("pk,pkx->px", weights, positions[corners])
     along = np.einsum("pk,pkx->px", weights, normals[corners])
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
-    return NearestPlaces(nearest, weights, offsets, along)
+    return NearestPlaces(nearest, weights, offsets, normalize(along))
 
 
 def barycentric_of_closest(

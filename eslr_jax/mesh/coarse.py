@@ -18,7 +18,7 @@ from jaxtyping import Int
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from eslr_jax.mesh.padding import round_up
-from eslr_jax.mesh.topology import directed_edges
+from eslr_jax.mesh.topology import adjacency, directed_edges
 from eslr_jax.types import CoarseEdges, Garment
 
 # Of the mesh edges, for HOOD's three levels; enough for every bundled garment.
@@ -58,9 +58,9 @@ def add_coarse_edges(garment: Garment) -> Garment:
 
 def coarsen(pairs: Int[np.ndarray, "edges 2"], num_vertices: int) -> list[Int[np.ndarray, "coarse_edges 2"]]:
     """Return the undirected edges of every coarse level, finest first, given the mesh edges."""
-    centers, levels = _centers(_matrix(pairs, num_vertices)), []
+    centers, levels = _centers(adjacency(pairs, num_vertices)), []
     for _ in CAPACITIES:
-        hops = dijkstra(_matrix(pairs, num_vertices), indices=centers, unweighted=True, min_only=True)
+        hops = dijkstra(adjacency(pairs, num_vertices), indices=centers, unweighted=True, min_only=True)
         hops = np.where(np.isfinite(hops), hops, 0).astype(int)  # zero where none is reached (HOOD)
         graph: Graph = [set() for _ in range(num_vertices)]
         for a, b in pairs.tolist():
@@ -75,20 +75,17 @@ def coarsen(pairs: Int[np.ndarray, "edges 2"], num_vertices: int) -> list[Int[np
 def _coarsen_once(graph: Graph, distance: list[int]) -> Graph:
     """Return the next level of a graph, given the hops of its vertices from the centres."""
     joined: Graph = [set() for _ in graph]
-    for i, around in enumerate(graph):
-        if distance[i] % 2:
-            closer, farther = _split(around, distance, i)
-            for a in closer:
-                for b in farther:
-                    _link(joined, a, b)
+    removed = [_split(around, distance, i) for i, around in enumerate(graph) if distance[i] % 2]
+    for closer, farther in removed:
+        for a in closer:
+            for b in farther:
+                _link(joined, a, b)
     level = [set(around) for around in joined]
-    for i, around in enumerate(graph):
-        if distance[i] % 2:
-            closer, farther = _split(around, distance, i)
-            for a in closer if not farther else ():
-                for b in closer:
-                    if a != b and not _is_near(joined, a, b):
-                        _link(level, a, b)
+    for closer, farther in removed:
+        for a in closer if not farther else ():
+            for b in closer:
+                if a != b and not _is_near(joined, a, b):
+                    _link(level, a, b)
     for i, around in enumerate(graph):
         if distance[i] % 2 == 0:
             for a in sorted(around):
@@ -112,11 +109,6 @@ def _link(graph: Graph, a: int, b: int) -> None:
 def _is_near(graph: Graph, a: int, b: int) -> bool:
     """Return whether two vertices are at most two hops apart."""
     return b in graph[a] or not graph[a].isdisjoint(graph[b])
-
-
-def _matrix(pairs: np.ndarray, num_vertices: int) -> scipy.sparse.csr_array:
-    both = np.concatenate([pairs, pairs[:, ::-1]]).T
-    return scipy.sparse.coo_array((np.ones(both.shape[1]), both), (num_vertices, num_vertices)).tocsr()
 
 
 def _centers(matrix: scipy.sparse.csr_array) -> list[int]:

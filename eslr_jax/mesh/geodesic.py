@@ -15,13 +15,7 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from eslr_jax.mesh.topology import (
-    half_edges,
-    next_half_edges,
-    twin_half_edges,
-    unique_edges,
-    vertex_components,
-)
+from eslr_jax.mesh import topology
 
 _MAX_HINGES = 3  # that a shortcut crosses
 
@@ -34,7 +28,7 @@ def geodesic_graph(
     A bridge joins the nearest vertices of two components by their Euclidean distance, so that every distance is
     finite.
     """
-    edges = unique_edges(faces)
+    edges = topology.unique_edges(faces)
     lengths = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
     shortcuts, shortcut_lengths = unfolded_shortcuts(positions, faces)
     bridges, bridge_lengths = _bridges(positions, faces)
@@ -59,15 +53,9 @@ def geodesic_distances(
 def farthest_point_landmarks(
     graph: scipy.sparse.csr_array, count: int, *, first: int = 0
 ) -> tuple[Int[np.ndarray, " landmarks"], Float[np.ndarray, "landmarks vertices"]]:
-    """Pick landmarks one by one, each farthest from the ones before.
+    """Return landmarks, each farthest from the ones before, and their distances to every vertex [m].
 
-    Args:
-        graph: Connected graph of edge lengths [m], shape [vertices, vertices].
-        count: Number of landmarks; at most the number of vertices.
-        first: First landmark.
-
-    Returns:
-        Landmark vertices, and their distances to every vertex [m].
+    `graph` is connected and has edge lengths [m]; there are at most as many landmarks as vertices.
     """
     landmarks, distances = [first], [dijkstra(graph, indices=first)]
     nearest = distances[0]
@@ -87,8 +75,8 @@ def unfolded_shortcuts(
     laid out in one plane with the vertex at the origin. A window is the side looked through, with the cone of
     directions that reach it. A pair may occur in both directions.
     """
-    starts, ends, opposites = half_edges(faces)
-    twins = twin_half_edges(faces)
+    starts, ends, opposites = topology.half_edges(faces)
+    twins = topology.twin_half_edges(faces)
     edges = positions[ends] - positions[starts]
     arms = positions[opposites] - positions[starts]
     lengths = np.linalg.norm(edges, axis=1)
@@ -115,8 +103,8 @@ def unfolded_shortcuts(
         segments.append(np.linalg.norm(apex[is_seen], axis=1))
         # behind the hinge: the side right -> apex for directions below the apex, apex -> left above it
         below, above = from_low > tolerance, to_high > tolerance
-        to_right = next_half_edges(sides)
-        to_left = next_half_edges(to_right)
+        to_right = topology.next_half_edges(sides)
+        to_left = topology.next_half_edges(to_right)
         lowest = np.where((from_low > 0)[:, None], apex, low)
         highest = np.where((to_high > 0)[:, None], apex, high)
         sources = np.concatenate([sources[below], sources[above]])
@@ -139,7 +127,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def _bridges(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return one vertex pair for every component but the first, in Prim's order, and their distances [m]."""
-    num_components, component = vertex_components(faces, len(positions))
+    num_components, component = topology.vertex_components(faces, len(positions))
     pairs, lengths = [], []
     is_joined = component == component[0] if len(component) else np.zeros(0, bool)
     best = np.full(len(positions), np.inf)  # distance of an outside vertex to the joined part

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from eslr_jax.mesh.piercing import piercing_edges
-from eslr_jax.mesh.topology import unique_edges
+from eslr_jax.mesh.topology import adjacency, face_cross_products, normalize, unique_edges
 
 _GAP = 5e-3  # [m] between two parts: cloth on both sides that keeps two millimetres off, and one to spare
 _DEEP = 15e-3  # [m] that a vertex may be behind a face; deeper ones belong to the far side of a limb
@@ -50,11 +50,7 @@ def parted(
 ) -> Float[np.ndarray, "frames vertices 3"]:
     """Return the positions of a body whose parts have been pushed apart [m].
 
-    Args:
-        positions: Of the moving body [m].
-        rest: In a pose in which nothing crosses [m].
-        faces: Counter-clockwise seen from outside.
-        every: Frames from one to the next that are searched whole; between them only what came near in any.
+    At rest nothing crosses. Every so many frames one is searched whole; between them only what came near in any.
     """
     positions, whole, out = np.asarray(positions), _Body(rest, faces), np.array(positions)
     is_near = np.any([whole.looked_for(posed)[1] for posed in positions[::every]], axis=0)
@@ -102,10 +98,7 @@ class _Mesh:
 
     def __init__(self, faces: Int[np.ndarray, "faces 3"], num_vertices: int):
         self.faces = faces
-        edges = unique_edges(faces)
-        ends = np.concatenate([edges, edges[:, ::-1]]).T
-        shape = (num_vertices, num_vertices)
-        self.neighbors = scipy.sparse.coo_matrix((np.ones(ends.shape[1]), tuple(ends)), shape).tocsr()
+        self.neighbors = adjacency(unique_edges(faces), num_vertices)
         self.degrees = np.maximum(np.asarray(self.neighbors.sum(axis=1)).ravel(), 1.0)
 
     def smoothing(self, points: np.ndarray, crossing: Int[np.ndarray, "crossing 3"]) -> np.ndarray:
@@ -135,9 +128,8 @@ class _Body(_Mesh):
         self.rest = rest
         self.middles, self.normals, _ = _middles_and_normals(rest, faces)
         corners = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-        self.incidence = scipy.sparse.coo_matrix(
-            (np.ones(faces.size), corners), (len(rest), len(faces))
-        ).tocsr()
+        shape = (len(rest), len(faces))
+        self.incidence = scipy.sparse.coo_array((np.ones(faces.size), corners), shape).tocsr()
 
     def yielding(
         self, places: Sequence[Float[np.ndarray, "vertices 3"]], yielded: Float[np.ndarray, "vertices 3"]
@@ -163,8 +155,7 @@ class _Body(_Mesh):
     ) -> tuple[_Opposed, Bool[np.ndarray, " faces"]]:
         """Return opposed places, and faces that may cross others."""
         middles, normals, sizes = _middles_and_normals(posed, self.faces)
-        facing = self.incidence @ normals
-        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+        facing = normalize(self.incidence @ normals)
         found = cKDTree(posed).sparse_distance_matrix(cKDTree(middles), _AROUND, output_type="ndarray")
         vertex, face = found["i"], found["j"]
         cosine = np.einsum("ij,ij->i", facing[vertex], normals[face])
@@ -188,8 +179,7 @@ def _middles_and_normals(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     """Return the middle, the unit normal and the size of faces, from the middle to the farthest corner."""
     corners = points[faces]
     middles = corners.mean(axis=1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = normalize(face_cross_products(points, faces))
     return middles, normals, np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
 
 

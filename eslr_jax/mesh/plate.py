@@ -93,10 +93,8 @@ def _laid(garment: Garment, corners: np.ndarray, direction: Sequence[float]) -> 
     wanted = np.asarray(direction, np.float64)
     if wanted.shape != (3,) or not np.linalg.norm(wanted) > 0:
         raise MeshError(f"{direction} is no direction; give three numbers")
-    positions, faces = (
-        np.asarray(garment.rest_positions, np.float64),
-        np.asarray(garment.faces)[: len(corners)],
-    )
+    positions = np.asarray(garment.rest_positions, np.float64)
+    faces = np.asarray(garment.faces)[: len(corners)]
     points = positions[faces]
     first = topology.normalize(points[:, 0] - points[:, 2])
     normal = topology.normalize(np.cross(points[:, 0] - points[:, 2], points[:, 1] - points[:, 2]))

@@ -11,18 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from eslr_jax.errors import MeshError
-from eslr_jax.mesh import topology
+from eslr_jax.mesh import padding, topology
 from eslr_jax.mesh.coarse import add_coarse_edges
 from eslr_jax.mesh.embedding import EmbeddingMode, geodesic_embedding
-from eslr_jax.mesh.padding import (
-    BLOCK,
-    EDGE_BLOCK,
-    FACE_BLOCK,
-    Bucket,
-    common_bucket,
-    garment_bucket,
-    pad_garment,
-)
 from eslr_jax.mesh.surface import compact_groups
 from eslr_jax.mesh.validate import validate_lengths, validate_mesh, validate_orientation
 from eslr_jax.types import Garment
@@ -101,7 +92,7 @@ def prepare_garment(
     edges = topology.unique_edges(faces)
     senders, receivers, reverse = topology.directed_edges(edges)
     neighbors, neighbor_mask = topology.neighbor_table(senders, receivers, num_vertices)
-    leaves: dict[str, Any] = dict(
+    garment: Any = Garment(  # NumPy leaves, until the padding is done
         rest_positions=positions,
         sewn_positions=sewn,
         faces=faces,
@@ -118,10 +109,10 @@ def prepare_garment(
         neighbor_mask=neighbor_mask,
         face_incidence=topology.incidence_table(faces, num_vertices),
         hinge_incidence=topology.incidence_table(hinges, num_vertices),
-        vertex_blocks=compact_groups(positions, BLOCK),
-        face_blocks=compact_groups(positions[faces].mean(axis=1), FACE_BLOCK),
+        vertex_blocks=compact_groups(positions, padding.BLOCK),
+        face_blocks=compact_groups(positions[faces].mean(axis=1), padding.FACE_BLOCK),
         edges=edges,
-        edge_blocks=compact_groups(positions[edges].mean(axis=1), EDGE_BLOCK),
+        edge_blocks=compact_groups(positions[edges].mean(axis=1), padding.EDGE_BLOCK),
         edge_mask=np.ones(len(senders), bool),
         vertex_mask=np.ones(num_vertices, bool),
         geodesic_embedding=geodesic_embedding(positions, faces, embedding_size, embedding_mode),
@@ -129,11 +120,10 @@ def prepare_garment(
         skin_indices=skin_indices,
         is_pinned=is_pinned,
     )
-    garment = Garment(**leaves)  # NumPy leaves, until the padding is done
-    return to_device(pad_garment(garment) if pad else garment)
+    return to_device(padding.pad_garment(garment) if pad else garment)
 
 
-def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list[Garment]:
+def pad_alike(garments: Sequence[Garment], bucket: padding.Bucket | None = None) -> list[Garment]:
     """Pad garments to one bucket, so that they share compiled functions and can be stacked.
 
     Args:
@@ -142,9 +132,9 @@ def pad_alike(garments: Sequence[Garment], bucket: Bucket | None = None) -> list
         bucket: Sizes to reach; by default the smallest that hold all garments and a spare vertex.
     """
     if bucket is None:
-        bucket = common_bucket([garment_bucket(garment) for garment in garments])
+        bucket = padding.common_bucket([padding.garment_bucket(garment) for garment in garments])
         bucket = bucket._replace(vertices=bucket.vertices + 1)
-    padded = [pad_garment(garment.replace(material=None), bucket) for garment in garments]
+    padded = [padding.pad_garment(garment.replace(material=None), bucket) for garment in garments]
     return [to_device(add_coarse_edges(one) if one.coarse is not None else one) for one in padded]
 
 

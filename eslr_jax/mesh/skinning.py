@@ -24,17 +24,11 @@ def transfer_skin_weights(
 ) -> tuple[Float[np.ndarray, "vertices 4"], Int[np.ndarray, "vertices 4"]]:
     """Take each garment vertex's weights from the closest body point, then smooth them over the garment.
 
-    Args:
-        positions: Garment vertices in the body's rest pose [m], shape [vertices, 3].
-        body_positions: Body vertices in the rest pose [m], shape [body_vertices, 3].
-        body_faces: Triangles of the body, shape [body_faces, 3].
-        body_skin_weights: Weights of the body's vertices, shape [body_vertices, influences].
-        body_skin_indices: Joint of every weight, shape [body_vertices, influences].
-        faces: Triangles of the garment, shape [faces, 3].
-        smoothing_steps: Number of Laplacian smoothings. Loose skirts need about 20, or the two legs tear them.
+    Positions are in the body's rest pose [m]. Loose skirts need about 20 Laplacian smoothings: the two legs tear
+    them otherwise.
 
     Returns:
-        The four largest weights of every vertex, which sum to one, and their joints, shape [vertices, 4].
+        The four largest weights of every vertex, which sum to one, and their joints.
     """
     nearest, barycentric = closest_points(positions, body_positions, body_faces)
     corners = body_faces[nearest]

@@ -10,9 +10,8 @@ from eslr_jax.mesh.padding import round_up
 from eslr_jax.mesh.topology import face_areas, incidence_table, moved_incidence, unique_edges, vertex_areas
 from eslr_jax.types import BodySurface
 
-_PATCH_SIZE = (
-    16  # vertices, faces or edges in a group; more make the first level cheaper and the second dearer
-)
+# Vertices, faces or edges in a group; more make the first level cheaper and the second dearer.
+_PATCH_SIZE = 16
 
 
 # Vertices of a padded surface. A part of a body between the first two numbers is padded to the second: so shirts,

@@ -68,6 +68,12 @@ def directed_edges(
     return senders[order], receivers[order], reverse[order]
 
 
+def adjacency(edges: Int[np.ndarray, "pairs 2"], num_vertices: int) -> scipy.sparse.csr_array:
+    """Return the matrix with a one for each direction of every edge."""
+    both = np.concatenate([edges, edges[:, ::-1]]).T
+    return scipy.sparse.coo_array((np.ones(both.shape[1]), both), (num_vertices, num_vertices)).tocsr()
+
+
 def neighbor_table(
     senders: Int[np.ndarray, " edges"], receivers: Int[np.ndarray, " edges"], num_vertices: int
 ) -> tuple[Int[np.ndarray, "vertices degree"], Bool[np.ndarray, "vertices degree"]]:

@@ -9,15 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from eslr_jax.errors import MeshError
-from eslr_jax.mesh.topology import (
-    boundary_loops,
-    face_areas,
-    half_edges,
-    next_half_edges,
-    twin_half_edges,
-    undirected_edges,
-    vertex_components,
-)
+from eslr_jax.mesh import topology
 
 _FLAT = 1e-6  # of the cube around a body: less volume than that is rounding
 MIN_DIAGONAL = 0.05  # [m] of the bounding box; smaller is no garment
@@ -51,7 +43,7 @@ def validate_mesh(
     _check_faces(positions, faces, name)
     _check_edges(faces, name)
     _check_fans(faces, len(positions), name)
-    num_components, component = vertex_components(faces, len(positions))
+    num_components, component = topology.vertex_components(faces, len(positions))
     if num_components > 1 and not allow_components:
         sizes = np.bincount(component)
         largest = np.sort(sizes)[::-1]
@@ -149,7 +141,7 @@ def _check_faces(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
     """Raise on faces without area and on faces that name the same three vertices."""
     corners = positions[faces]
     longest = np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1)
-    is_bad = face_areas(positions, faces) <= DEGENERATE_TOLERANCE * longest
+    is_bad = topology.face_areas(positions, faces) <= DEGENERATE_TOLERANCE * longest
     if is_bad.any():
         face = int(np.argmax(is_bad))
         raise MeshError(
@@ -169,8 +161,8 @@ def _check_faces(positions: np.ndarray, faces: np.ndarray, name: str) -> None:
 
 def _check_edges(faces: np.ndarray, name: str) -> None:
     """Raise on edges with more than two faces, and on neighbours that wind in opposite directions."""
-    starts, ends, _ = half_edges(faces)
-    edges, edge_of, counts = undirected_edges(faces)
+    starts, ends, _ = topology.half_edges(faces)
+    edges, edge_of, counts = topology.undirected_edges(faces)
     if counts.max() > 2:
         edge = int(np.argmax(counts > 2))
         users = np.flatnonzero(edge_of == edge) // 3
@@ -194,12 +186,12 @@ def _check_fans(faces: np.ndarray, num_vertices: int, name: str) -> None:
 
     Corners of neighbouring faces at the same vertex are joined, so that each fan is a component of a graph.
     """
-    starts, _, _ = half_edges(faces.astype(np.int64))
-    twins = twin_half_edges(faces)
+    starts, _, _ = topology.half_edges(faces.astype(np.int64))
+    twins = topology.twin_half_edges(faces)
     start = np.flatnonzero(twins >= 0)  # corner of the half-edge's start
     twin = twins[start]
-    rows = np.concatenate([start, next_half_edges(start)])
-    columns = np.concatenate([next_half_edges(twin), twin])
+    rows = np.concatenate([start, topology.next_half_edges(start)])
+    columns = np.concatenate([topology.next_half_edges(twin), twin])
     graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (len(starts), len(starts)))
     _, first = np.unique(connected_components(graph, directed=False)[1], return_index=True)
     counts = np.bincount(starts[first], minlength=num_vertices)
@@ -232,8 +224,8 @@ def validate_body(
         raise MeshError(
             f"{name}: {np.shape(is_obstacle)} obstacle marks for {len(faces)} faces; give one per face"
         )
-    starts, ends, _ = half_edges(faces.astype(np.int64))
-    is_open = (twin_half_edges(faces) < 0) & np.asarray(is_obstacle)[np.arange(len(starts)) // 3]
+    starts, ends, _ = topology.half_edges(faces.astype(np.int64))
+    is_open = (topology.twin_half_edges(faces) < 0) & np.asarray(is_obstacle)[np.arange(len(starts)) // 3]
     if is_open.any():
         edge = int(np.argmax(is_open))
         raise MeshError(
@@ -271,7 +263,7 @@ def validate_orientation(
     positions, faces = np.asarray(positions, np.float64), np.asarray(faces)
     centered = positions - positions.mean(axis=0)
     triangles = [centered[faces]]
-    for loop in boundary_loops(faces):
+    for loop in topology.boundary_loops(faces):
         boundary = centered[loop]
         center = np.broadcast_to(boundary.mean(axis=0), boundary.shape)
         triangles.append(np.stack([np.roll(boundary, -1, axis=0), boundary, center], axis=1))

@@ -27,36 +27,40 @@ _PREFIXES = re.compile(
 )
 _IGNORED = {"twist", "roll", "end", "nub", "ik", "pole", "ctrl", "helper", "site", "share", "metacarpal"}
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
-_WORDS = {  # with a side or without one
-    "hips": "hips", "pelvis": "hips", "root": "root",
-    "spine": "spine", "lowerback": "spine", "upperback": "spine", "thorax": "spine", "chest": "spine",
-    "upperchest": "spine", "torso": "spine", "abdomen": "spine", "abdomenlower": "spine",
-    "abdomenupper": "spine", "chestlower": "spine", "chestupper": "spine", "waist": "spine",
-    "neck": "neck", "lowerneck": "neck", "upperneck": "neck", "necklower": "neck", "neckupper": "neck",
-    "head": "head", "skull": "head",
-}  # fmt: skip
-_SIDED_WORDS = {
-    "hipjoint": "hip_joint",
-    "upleg": "upper_leg", "upperleg": "upper_leg", "thigh": "upper_leg", "femur": "upper_leg",
-    "hip": "upper_leg", "thighbend": "upper_leg",
-    "loleg": "lower_leg", "lowerleg": "lower_leg", "lowleg": "lower_leg", "calf": "lower_leg",
-    "shin": "lower_leg", "tibia": "lower_leg", "knee": "lower_leg", "leg": "lower_leg",
-    "foot": "foot", "ankle": "foot",
-    "toe": "toe", "toes": "toe", "toebase": "toe", "ball": "toe",
-    "clavicle": "clavicle", "collar": "clavicle", "shoulder": "shoulder",
-    "scapula": "clavicle",
-    "uparm": "upper_arm", "upperarm": "upper_arm", "humerus": "upper_arm", "arm": "upper_arm",
-    "shldr": "upper_arm", "shldrbend": "upper_arm", "uarm": "upper_arm",
-    "loarm": "forearm", "lowerarm": "forearm", "lowarm": "forearm", "forearm": "forearm",
-    "radius": "forearm", "elbow": "forearm", "forearmbend": "forearm",
-    "farm": "forearm",
-    "hand": "hand", "wrist": "wrist",
-    "fingers": "fingers", "fingerbase": "fingers", "handfinger": "fingers",
-}  # fmt: skip
-for _finger in _FINGERS:
-    for _word in (_finger, f"hand{_finger}", f"f{_finger}"):
-        _SIDED_WORDS[_word] = _finger
-_SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky", "fpinky": "pinky"}
+
+
+def _by_word(words: Mapping[str, str]) -> dict[str, str]:
+    return {word: chain for chain, names in words.items() for word in names.split()}
+
+
+_WORDS = _by_word(  # with a side or without one
+    {
+        "hips": "hips pelvis",
+        "root": "root",
+        "spine": "spine lowerback upperback thorax chest upperchest torso abdomen abdomenlower abdomenupper "
+        "chestlower chestupper waist",
+        "neck": "neck lowerneck upperneck necklower neckupper",
+        "head": "head skull",
+    }
+)
+_SIDED_WORDS = _by_word(
+    {
+        "hip_joint": "hipjoint",
+        "upper_leg": "upleg upperleg thigh femur hip thighbend",
+        "lower_leg": "loleg lowerleg lowleg calf shin tibia knee leg",
+        "foot": "foot ankle",
+        "toe": "toe toes toebase ball",
+        "clavicle": "clavicle collar scapula",
+        "shoulder": "shoulder",
+        "upper_arm": "uparm upperarm humerus arm shldr shldrbend uarm",
+        "forearm": "loarm lowerarm lowarm forearm radius elbow forearmbend farm",
+        "hand": "hand",
+        "wrist": "wrist",
+        "fingers": "fingers fingerbase handfinger",
+        **{finger: f"{finger} hand{finger} f{finger}" for finger in _FINGERS},
+    }
+)
+_SIDED_WORDS |= {"mid": "middle", "little": "pinky", "handlittle": "pinky"}
 HAND = ("hand", "fingers", *_FINGERS)  # parts that continue the forearm's bone
 _SHARED = 0.75  # of a rig's names that begin alike: the rest are roots and props
 _CHAINS = {"foot": ("upper_leg", "lower_leg", "foot"), "hand": ("upper_arm", "forearm", "hand")}

@@ -53,13 +53,10 @@ def joint_transforms(
     the map of a point q is G_j q + (x_j - G_j r_j); the root has G = R, x = `translation`.
 
     Args:
-        rotations: Local axis-angle rotations relative to the rest pose [rad], shape [joints, 3].
-        translation: Posed position of the root joint [m], shape [3].
-        joint_rest_positions: Rest positions of the joints [m], shape [joints, 3].
+        rotations: Local axis-angle rotations relative to the rest pose [rad].
+        translation: Posed position of the root joint [m].
+        joint_rest_positions: Rest positions of the joints [m].
         parents: Parent of each joint, -1 for the root; a parent comes before its children. Static.
-
-    Returns:
-        Rotation and offset [m] side by side, shape [joints, 3, 4].
 
     Source: Loper et al. 2015, equations 2-4.
     """
@@ -87,24 +84,16 @@ def skin(
     indices: Int[Array, "vertices influences"],
     transforms: Float[Array, "joints 3 4"],
 ) -> Float[Array, "vertices 3"]:
-    """Blend the joints' affine maps by weight and apply them to rest points.
+    """Return rest points [m] moved by the joints' affine maps, of `joint_transforms`, blended by weight.
 
-    Args:
-        positions: Rest points [m], shape [vertices, 3].
-        weights: Skin weights, rows sum to one, shape [vertices, influences].
-        indices: Joint of each weight, shape [vertices, influences].
-        transforms: Affine map of each joint, shape [joints, 3, 4]; see `joint_transforms`.
-
-    Returns:
-        Posed points [m], shape [vertices, 3].
+    Rows of the weights sum to one; `indices` are their joints.
 
     Source: Loper et al. 2015, equation 1.
     """
     joints = jnp.arange(transforms.shape[0], dtype=indices.dtype)
     is_joint = indices[:, :, None] == joints[None, None, :]
-    dense = jnp.sum(
-        jnp.where(is_joint, weights[:, :, None], 0.0), axis=1
-    )  # a product beats gathers everywhere
+    # A product beats gathers everywhere.
+    dense = jnp.sum(jnp.where(is_joint, weights[:, :, None], 0.0), axis=1)
     blended = product(dense, transforms.reshape((-1, 12))).reshape((-1, 3, 4))
     return _apply(blended[:, :, :3], positions) + blended[:, :, 3]
 
@@ -133,11 +122,9 @@ def skin_garment(
 def bend(
     directions: Float[Array, "vertices 3 entries"], turned: Float[Array, "joints 3 3"]
 ) -> Float[Array, "vertices 3"]:
-    """Return the displacement of rest points by pose blend shapes [m], shape [vertices, 3].
+    """Return the displacement of rest points by pose blend shapes [m].
 
-    Args:
-        directions: Displacement per entry of R - I [m], shape [vertices, 3, 9 * joints].
-        turned: Local rotation matrices minus the identity of all joints but the root, shape [joints, 3, 3].
+    `directions` are displacements per entry of R - I [m], and `turned` holds R - I of all joints but the root.
 
     Source: Loper et al. 2015, equation 9.
     """

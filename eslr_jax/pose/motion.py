@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from eslr_jax.numerics import product
 from eslr_jax.pose import lbs
 from eslr_jax.pose.joints import find_parts, torso_axes
 from eslr_jax.pose.retarget import ARM_ABDUCTION, abduct_arms, resample
-from eslr_jax.pose.skeleton import Skeleton
+from eslr_jax.pose.skeleton import Skeleton, check_tracks
 from eslr_jax.types import Body, BodyMotion, BodySurface
 
 SHOULDERS = 0.8  # of the body's height, for a body without arms
@@ -42,23 +42,9 @@ class Motion:
         Raises:
             MotionError: No frames, mismatched shapes, NaN, or an impossible frame rate.
         """
-        frames = len(self.translations)
-        if frames == 0:
-            raise MotionError(f"motion {self.name} has no frames; give at least one")
-        expected = (frames, len(self.joint_names), 3)
-        if self.rotations.shape != expected or self.translations.shape != (frames, 3):
-            raise MotionError(
-                f"motion {self.name}: rotations {self.rotations.shape} and translations "
-                f"{self.translations.shape} do not fit {frames} frames of {len(self.joint_names)} joints"
-            )
-        for label, values in (("rotations", self.rotations), ("translations", self.translations)):
-            is_bad = ~np.isfinite(values.reshape(frames, -1)).all(axis=1)
-            if is_bad.any():
-                raise MotionError(
-                    f"motion {self.name}: {label} of frame {np.argmax(is_bad)} are not finite; cut or repair it"
-                )
-        if not 1.0 <= self.fps <= 1000.0:
-            raise MotionError(f"motion {self.name}: {self.fps} frames per second; expected 1 to 1000")
+        joints = len(self.joint_names)
+        tracks = {"rotations": (self.rotations, (joints, 3)), "translations": (self.translations, (3,))}
+        check_tracks(f"motion {self.name}", tracks, self.fps)
 
 
 def still_motion(body: Body, num_frames: int, *, fps: float = 30.0, arm_angle: float = 0.0) -> Motion:
@@ -220,6 +206,7 @@ def shape_body(body: Body, betas: Sequence[float] | np.ndarray) -> Body:
     )
 
 
+@partial(jax.jit, static_argnums=3)
 def joint_transforms(
     rotations: np.ndarray, translations: np.ndarray, joints: jax.Array, parents: tuple[int, ...]
 ) -> jax.Array:
@@ -228,10 +215,7 @@ def joint_transforms(
     Arguments are those of `lbs.joint_transforms`, rotations and translations for every frame.
     """
     turns, places = (jnp.asarray(values, jnp.float32) for values in (rotations, translations))
-    return _joint_transforms(turns, places, joints, parents)
-
-
-_joint_transforms = jax.jit(jax.vmap(lbs.joint_transforms, in_axes=(0, 0, None, None)), static_argnums=3)
+    return jax.vmap(lambda turn, place: lbs.joint_transforms(turn, place, joints, parents))(turns, places)
 
 
 def chest_direction(body: Body) -> np.ndarray:

@@ -6,12 +6,12 @@ Axes are right-handed, Y up, in metres where the format has a unit. The rest pos
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eslr_jax.errors import AssetError, MotionError
-from eslr_jax.files.npz import check_layout
 
 MAX_JOINTS = 4096  # more than any character has; a damaged file may claim more
 MAX_FRAMES = 1 << 20  # nine hours at 30 frames per second
@@ -53,22 +53,26 @@ class SkeletonMotion:
 
     def __post_init__(self) -> None:
         """Raise a MotionError unless there are frames of finite values at a possible rate."""
-        what, frames = f"motion {self.name}", len(self.rotations)
-        layout = {
-            "parents": ("iu", "joints"),
-            "rotations": ("f", "frames joints 3 3"),
-            "positions": ("f", "frames joints 3"),
-        }
-        parents = np.array(self.skeleton.parents)
-        arrays = {"parents": parents, "rotations": self.rotations, "positions": self.positions}
-        check_layout(arrays, layout, what=what, remedy="export it again", error=MotionError)
-        if not 0 < frames <= MAX_FRAMES:
-            raise MotionError(f"{what} has {frames} frames; give 1 to {MAX_FRAMES}")
-        is_finite = np.isfinite(self.rotations).all((1, 2, 3)) & np.isfinite(self.positions).all((1, 2))
-        if not is_finite.all():
-            raise MotionError(f"{what} is not finite in frame {np.argmin(is_finite)}; cut or repair it")
-        if not (np.isfinite(self.fps) and 1.0 <= self.fps <= 1000.0):
-            raise MotionError(f"motion {self.name}: {self.fps} frames per second; expected 1 to 1000")
+        joints = len(self.skeleton.parents)
+        tracks = {"rotations": (self.rotations, (joints, 3, 3)), "positions": (self.positions, (joints, 3))}
+        check_tracks(f"motion {self.name}", tracks, self.fps)
+
+
+def check_tracks(what: str, tracks: Mapping[str, tuple[np.ndarray, tuple[int, ...]]], fps: float) -> None:
+    """Raise a MotionError unless arrays have frames of finite values, each of its shape, at a possible rate."""
+    frames = min(len(values) for values, _ in tracks.values())
+    if not 0 < frames <= MAX_FRAMES:
+        raise MotionError(f"{what} has {frames or 'no'} frames; give 1 to {MAX_FRAMES}")
+    for label, (values, shape) in tracks.items():
+        if values.shape != (frames, *shape):
+            raise MotionError(f"{what}: {label} {values.shape} do not fit its {frames} frames of {shape}")
+        is_bad = ~np.isfinite(values.reshape(frames, -1)).all(axis=1)
+        if is_bad.any():
+            raise MotionError(
+                f"{what}: {label} of frame {np.argmax(is_bad)} are not finite; cut or repair it"
+            )
+    if not 1.0 <= fps <= 1000.0:
+        raise MotionError(f"{what}: {fps} frames per second; expected 1 to 1000")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +91,10 @@ class RiggedMesh:
 
 
 def order_joints(names: list[str], parents: list[int], *, what: str) -> tuple[list[int], list[int]]:
-    """Put parents before children, and every joint under one root: further ones become children of the first.
+    """Return joints with parents before children, and the parent of each in that order.
 
-    Args:
-        names: Names of the joints, for messages.
-        parents: Parent of each joint; -1 is a root.
-        what: What messages call the file.
-
-    Returns:
-        The joints in their new order, and the parent of each in that order.
+    A parent of -1 is a root; further ones become children of the first. Messages say `names`, and `what` for the
+    file.
 
     Raises:
         AssetError: There are no joints, too many joints, or a cycle.
@@ -151,10 +150,8 @@ def chain_rotations(local: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
 def chain_offsets(rotations: np.ndarray, offsets: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
     """Return the positions [frames, joints, 3] of joints at turned offsets from their parents.
 
-    Args:
-        rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
-        offsets: Position of each joint relative to its parent in the rest pose's axes, shape [frames, joints, 3].
-        parents: Parent of each joint, which comes before it; -1 is a root.
+    Rotations are in world axes since the rest pose [frames, joints, 3, 3], and offsets in the rest pose's axes
+    [frames, joints, 3]. A parent comes before its children.
     """
     result = np.array(offsets, np.float64)
     for joint, parent in enumerate(parents):
@@ -165,12 +162,9 @@ def chain_offsets(rotations: np.ndarray, offsets: np.ndarray, parents: tuple[int
 
 
 def chain_positions(rotations: np.ndarray, root: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Return the positions [frames, joints, 3] of the joints of rigid bones.
+    """Return the positions [frames, joints, 3] of the joints of rigid bones, with those of joint 0 [frames, 3].
 
-    Args:
-        rotations: Rotations in world axes since the rest pose, shape [frames, joints, 3, 3].
-        root: Position of joint 0, shape [frames, 3].
-        skeleton: Joints at rest.
+    Rotations are in world axes since the rest pose [frames, joints, 3, 3].
     """
     rest = skeleton.rest_positions
     offsets = np.tile(rest - rest[np.maximum(skeleton.parents, 0)], (len(rotations), 1, 1))
@@ -187,16 +181,10 @@ def pose_offsets(
     offsets: np.ndarray,
     fps: float,
 ) -> SkeletonMotion:
-    """Return the motion of joints that are each told relative to their parent.
+    """Return the motion of joints that are each told relative to their parent; -1 is a root.
 
-    Args:
-        name: Name of the motion.
-        joint_names: Name of each joint.
-        parents: Parent of each joint; -1 is a root.
-        rest_offsets: Position of each joint relative to its parent at rest, shape [joints, 3].
-        local: Rotation of each joint relative to its parent, shape [frames, joints, 3, 3].
-        offsets: Position of each joint relative to its parent, shape [frames, joints, 3].
-        fps: Frame rate [1/s].
+    `rest_offsets` [joints, 3] and `offsets` [frames, joints, 3] are positions, `local` rotations
+    [frames, joints, 3, 3].
     """
     names = unique_names(joint_names)
     order, new_parents = order_joints(names, parents, what=f"motion {name}")

@@ -57,12 +57,8 @@ def solve_symmetric(
     Its residual never grows, also where H is indefinite. Conjugate gradients divide by curvatures, and in float32
     they stall where one is near zero.
 
-    Args:
-        apply: Product with H, symmetric.
-        precondition: Product with an estimate of H^-1, symmetric and positive definite.
-        force: Right side [N].
-        tolerance: Residual to reach, relative to the right side.
-        iterations: Upper bound.
+    `apply` is the product with H, symmetric, and `precondition` that with an estimate of H^-1, symmetric and
+    positive definite. The tolerance of the residual is relative to the force.
 
     Source: Paige and Saunders 1975, doi 10.1137/0712047.
     """

@@ -121,11 +121,9 @@ class Air(Term):
 
     def describe(self, garment: Garment) -> str:
         """Return its speed."""
-        return (
-            "a wind that changes"
-            if callable(self.wind)
-            else f"{np.linalg.norm(np.asarray(self.wind)):.1f} m/s"
-        )
+        if callable(self.wind):
+            return "a wind that changes"
+        return f"{np.linalg.norm(np.asarray(self.wind)):.1f} m/s"
 
 
 def blowing(wind: Sequence[float] | None, gust: float = 0.0) -> Air | None:
@@ -165,14 +163,7 @@ def gusts(mean: Sequence[float], strength: float, seed: int = 0) -> Partial:
     return Partial(_gusty, *(jnp.asarray(part, jnp.float32) for part in (mean, height, rates, phases)))
 
 
-def _gusty(
-    mean: Float[Array, " 3"],
-    height: Float[Array, ""],
-    rates: Float[Array, " waves"],
-    phases: Float[Array, "waves 3"],
-    points: Float[Array, "points 3"],
-    time: Float[Array, ""],
-) -> Float[Array, " 3"]:
+def _gusty(mean: Array, height: Array, rates: Array, phases: Array, points: Array, time: Array) -> Array:
     return mean + height * jnp.sum(jnp.sin(rates[:, None] * time + phases), axis=0)
 
 

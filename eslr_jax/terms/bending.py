@@ -45,7 +45,7 @@ class Bending(Term):
     def elements(self, x: Vector3, problem: FrameProblem, data: Any) -> tuple[Elements, ...]:
         """Return the energies of the hinges, or of a plate's faces [J]."""
         garment, material = problem.garment, problem.material
-        energies = angle_energies(dihedral_angles(x, garment)[0], garment, material)
+        energies = angle_energies(dihedral_angles(x, garment), garment, material)
         return (Elements(energies, garment.hinges if material.plate is None else garment.faces),)
 
     def remainder(self, problem: FrameProblem) -> Callable[[Vector3, Any], Float[Array, ""]] | None:
@@ -61,13 +61,13 @@ class Bending(Term):
 
 def dihedral_angles(
     position: Float[Array, "vertices 3"] | Vector3, garment: Garment
-) -> tuple[Float[Array, " hinges"], Float[Array, " hinges"]]:
-    """Return each hinge's signed angle [rad] (zero is flat) and its squared edge length [m^2].
+) -> Float[Array, " hinges"]:
+    """Return each hinge's signed angle [rad]; zero is flat.
 
     theta = atan2(e_hat . (n_a x n_b), n_a . n_b); the two area factors of the unnormalised normals cancel.
     A collapsed hinge has a zero gradient.
     """
-    return _angles(hinge_corners(position, garment))
+    return _corner_angles(*hinge_corners(position, garment))
 
 
 def hinge_corners(position: Float[Array, "vertices 3"] | Vector3, garment: Garment) -> tuple[Vector3, ...]:
@@ -76,11 +76,6 @@ def hinge_corners(position: Float[Array, "vertices 3"] | Vector3, garment: Garme
     XLA would repeat the gathers in every one of the twelve components of the gradient.
     """
     return jax.lax.optimization_barrier(gather_corners(position, garment.hinges, garment.hinge_incidence))
-
-
-def _angles(corners: tuple[Vector3, ...]) -> tuple[Float[Array, " hinges"], Float[Array, " hinges"]]:
-    edge = sub3(corners[1], corners[0])
-    return _corner_angles(*corners), dot3(edge, edge)
 
 
 @jax.custom_jvp
@@ -141,7 +136,7 @@ def bending_energy(
     position: Float[Array, "vertices 3"] | Vector3, garment: Garment, material: Material
 ) -> Float[Array, ""]:
     """Return the bending energy [J], the sum of `angle_energies` at positions [m], shape [vertices, 3]."""
-    return jnp.sum(angle_energies(dihedral_angles(position, garment)[0], garment, material))
+    return jnp.sum(angle_energies(dihedral_angles(position, garment), garment, material))
 
 
 def hinge_energies(
@@ -153,18 +148,14 @@ def hinge_energies(
 ) -> Float[Array, " hinges"]:
     """Return the bending energy of every hinge [J].
 
-    E_h = k_b l^2 / (4 (A_a + A_b)) theta^2 / 2: fabric is flat at rest.
-
-    Args:
-        corners: Positions of the hinges' corners [m], of `gather_corners`.
-        garment: Hinges with their rest lengths and the sum of their rest areas.
-        material: Bending stiffness k_b [J].
-        use_current_length: Take l from the corners, as HOOD does, instead of from the rest mesh.
+    E_h = k_b l^2 / (4 (A_a + A_b)) theta^2 / 2, with the bending stiffness k_b [J] and the areas at rest: fabric
+    is flat at rest. `corners` are those of `hinge_corners`. `use_current_length` takes the edge's length l from
+    them, as HOOD does, instead of from the rest mesh.
 
     Source: HOOD (arXiv 2212.07242); Grinspun et al. 2003, doi 10.2312/SCA03/062-067.
     """
-    angle, squared_length = _angles(corners)
-    stiffness = hinge_stiffnesses(garment, material, squared_length if use_current_length else None)
+    angle, edge = _corner_angles(*corners), sub3(corners[1], corners[0])
+    stiffness = hinge_stiffnesses(garment, material, dot3(edge, edge) if use_current_length else None)
     return stiffness * angle * angle
 
 
@@ -203,10 +194,7 @@ def hinge_stiffnesses(
 ) -> Float[Array, " hinges"]:
     """Return the energy of every hinge [J] by its squared angle; zero where padded.
 
-    Args:
-        garment: Hinges with their rest lengths and the sum of their rest areas.
-        material: Bending stiffness [J].
-        squared_length: Of the hinges' edges [m^2]; those at rest if None.
+    `squared_length` is that of the hinges' edges [m^2]; None takes it at rest.
     """
     if squared_length is None:
         squared_length = jnp.square(garment.hinge_rest_lengths)

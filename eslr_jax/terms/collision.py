@@ -138,16 +138,10 @@ def collision_energies(
     stiffness: Float[Array, ""] | float,
     thickness: Float[Array, ""] | float,
 ) -> Float[Array, " vertices"]:
-    """Return stiffness a_v max(thickness - d_v, 0)^3 of every vertex [J].
+    """Return stiffness a_v max(thickness - d_v, 0)^3 of every vertex [J], at positions at t + 1 [m].
 
-    Weighting by the vertex area a_v makes the energy independent of resolution; HOOD sums over vertices.
-
-    Args:
-        position: Vertex positions at t + 1 [m].
-        contacts: The nearest body point of each vertex at t, carried to t + 1 by the body.
-        garment: Vertex areas [m^2].
-        stiffness: [J/m^5].
-        thickness: Distance kept from the body [m].
+    Weighting by the vertex area a_v makes the energy independent of resolution; HOOD sums over vertices. The
+    stiffness is in J/m^5, and the thickness is the distance kept from the body [m].
 
     Source: HOOD (arXiv 2212.07242), with the closest point on the triangle in place of its centroid.
     """

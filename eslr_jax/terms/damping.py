@@ -72,4 +72,4 @@ class Damping(Term):
 def _strain(position: Float[Array, "vertices 3"] | Vector3, problem: FrameProblem) -> PastStrain:
     garment = problem.garment
     corners = gather_corners(position, garment.faces, garment.face_incidence)
-    return PastStrain(green_strains(corners, garment), dihedral_angles(position, garment)[0])
+    return PastStrain(green_strains(corners, garment), dihedral_angles(position, garment))

@@ -37,14 +37,10 @@ def gravity_energies(
     masses: Float[Array, " vertices"],
     gravity: Float[Array, ""] | float,
 ) -> Float[Array, " vertices"]:
-    """Return m_v g (y_v - y_reference) of every vertex [J].
+    """Return m_v g (y_v - y_reference) of every vertex [J], with positions in metres and g in m/s^2.
 
-    Args:
-        position: Vertex positions [m].
-        reference: Where the energy is zero, usually the frame's start; None is the world origin (HOOD).
-            A near reference keeps float32 sums exact and the total independent of where the scene stands.
-        masses: Vertex masses [kg].
-        gravity: Acceleration [m/s^2].
+    The reference is where the energy is zero, usually the frame's start; None is the world's origin (HOOD). A
+    near one keeps float32 sums exact and the total independent of where the scene stands.
     """
     height = components(position)[1]
     if reference is not None:

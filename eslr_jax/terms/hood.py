@@ -24,15 +24,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from eslr_jax.config import Criterion
-from eslr_jax.numerics import (
-    components,
-    cross3,
-    dot3,
-    masked_sum,
-    safe_norm,
-    safe_normalize,
-    sub3,
-)
+from eslr_jax.numerics import components, cross3, dot3, masked_sum, safe_norm, safe_normalize, sub3
 from eslr_jax.terms.bending import hinge_corners, hinge_energies
 from eslr_jax.terms.gravity import gravity_energies
 from eslr_jax.terms.inertia import inertia_energies
@@ -123,37 +115,6 @@ def nearest_centroid(
     return jax.lax.map(nearest, query, batch_size=_CHUNK)
 
 
-def hood_depths(
-    position: Float[Array, "vertices 3"],
-    query: Float[Array, "vertices 3"],
-    search_body: Float[Array, "body_vertices 3"],
-    body: Float[Array, "body_vertices 3"],
-    faces: Int[Array, "body_faces 3"],
-    thickness: Float[Array, ""] | float,
-) -> Float[Array, " vertices"]:
-    """Return max(eps - d, 0) [m], d the height over the plane of the face with the nearest centroid.
-
-    Args:
-        position: Vertices whose height is taken [m].
-        query: Vertices whose nearest centroid is looked for [m].
-        search_body: Body on which it is looked for [m].
-        body: Body whose planes count [m].
-        faces: Of the body.
-        thickness: eps [m].
-    """
-    nearest, _ = nearest_centroid(query, _face_planes(search_body, faces).centers)
-    planes = _face_planes(body, faces)
-    height = jnp.sum((position - planes.centers[nearest]) * planes.normals[nearest], axis=-1)
-    return jnp.maximum(thickness - height, 0.0)
-
-
-class _Motion(NamedTuple):
-    """How the body moves between the two frames that friction looks at."""
-
-    before: Float[Array, "body_vertices 3"]  # [m]
-    after: Float[Array, "body_vertices 3"]  # [m]
-
-
 def hood_friction_energy(
     position: Float[Array, "vertices 3"], problem: HoodProblem, criterion: Criterion
 ) -> Float[Array, ""]:
@@ -162,21 +123,13 @@ def hood_friction_energy(
     Delta is the cloth's motion minus that of the body face that is nearest before the motion. Delta_T is Delta
     without its part along the mean of two normals (not normalised again), that of this face and that of the face
     that is nearest after the motion, and s = sqrt(|1 - cos^2(Delta_T, z)| + 1e-4).
-
-    Args:
-        position: Predicted vertices [m], shape [vertices, 3].
-        problem: The step, with a body.
-        criterion: Which frames of the body count; static.
     """
     bodies, parameters = problem.bodies, problem.parameters
     if bodies is None:
         return jnp.zeros((), position.dtype)
     is_metric = criterion == "metric"
-    motion_of = (
-        _Motion(bodies.current, bodies.next) if is_metric else _Motion(bodies.previous, bodies.current)
-    )
-    before = _face_planes(motion_of.before, bodies.faces)
-    after = _face_planes(motion_of.after, bodies.faces)
+    before = _face_planes(bodies.current if is_metric else bodies.previous, bodies.faces)
+    after = _face_planes(bodies.next if is_metric else bodies.current, bodies.faces)
     first, first_squared = nearest_centroid(problem.current, before.centers)
     last, last_squared = nearest_centroid(position, after.centers)
     is_near = (first_squared < parameters.friction_radius) & (last_squared < parameters.friction_radius)
@@ -192,7 +145,11 @@ def hood_friction_energy(
 def criterion_depths(
     position: Float[Array, "vertices 3"], problem: HoodProblem, criterion: Criterion
 ) -> Float[Array, " vertices"]:
-    """Return `hood_depths` [m] with the frames that the criterion looks at; zero without a body."""
+    """Return max(eps - d, 0) [m], d the height over the plane of the face with the nearest centroid.
+
+    The criterion says of which frames are the vertices whose nearest centroid is looked for, the body on which it
+    is looked for, and the body whose planes count. Zero without a body.
+    """
     bodies = problem.bodies
     if bodies is None:
         return jnp.zeros(position.shape[0], position.dtype)
@@ -201,9 +158,10 @@ def criterion_depths(
         "cvpr": (problem.current, bodies.previous, bodies.current),
         "metric": (position, bodies.next, bodies.next),
     }[criterion]
-    return hood_depths(
-        position, query, search_body, body, bodies.faces, problem.parameters.collision_thickness
-    )
+    nearest, _ = nearest_centroid(query, _face_planes(search_body, bodies.faces).centers)
+    planes = _face_planes(body, bodies.faces)
+    height = jnp.sum((position - planes.centers[nearest]) * planes.normals[nearest], axis=-1)
+    return jnp.maximum(problem.parameters.collision_thickness - height, 0.0)
 
 
 def hood_terms(
@@ -215,10 +173,7 @@ def hood_terms(
     training criteria pinned vertices have already moved when the losses are taken: they add a constant to
     inertia.
 
-    Args:
-        position: Predicted vertices at t + 1 [m], shape [vertices, 3].
-        problem: The step.
-        criterion: Which frames of the body count (see the module); static.
+    `position` are the predicted vertices at t + 1 [m], and `criterion` is static, see the module.
     """
     garment, material, parameters = problem.garment, problem.material, problem.parameters
     masses = vertex_masses(garment, material)

@@ -74,11 +74,7 @@ def face_energies(
     """Return the membrane energy of every face [J].
 
     E_f = A_f h (mu tr(G^T G) + lambda/2 tr(G)^2), with the Green strain G = (F^T F - I) / 2.
-
-    Args:
-        corners: Positions of the faces' corners [m], of `gather_corners`.
-        garment: Rest areas A_f and frames.
-        material: Thickness h [m] and Lame parameters mu, lambda [Pa].
+    A_f is the area at rest, h the thickness [m], mu and lambda the Lame parameters [Pa].
 
     Source: HOOD (arXiv 2212.07242), supplementary; Santesteban et al. 2022, eq. 5.
     """
@@ -90,18 +86,10 @@ def face_energies(
 
 
 def green_strains(corners: tuple[Vector3, ...], garment: Garment) -> Vector3:
-    """Return the components 00, 11 and 01 of the Green strain of every face.
-
-    Args:
-        corners: Positions of the faces' corners [m], of `gather_corners`.
-        garment: Rest frames.
-    """
+    """Return the components 00, 11 and 01 of the Green strain of every face, by its corners [m]."""
     first, second = deformation_gradient(corners, garment)
-    return (
-        0.5 * (dot3(first, first) - 1.0),
-        0.5 * (dot3(second, second) - 1.0),
-        0.5 * dot3(first, second),
-    )
+    diagonal = 0.5 * (dot3(first, first) - 1.0), 0.5 * (dot3(second, second) - 1.0)
+    return (*diagonal, 0.5 * dot3(first, second))
 
 
 def strain_energies(strains: Vector3, garment: Garment, material: Material) -> Float[Array, " faces"]:

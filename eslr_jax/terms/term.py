@@ -148,7 +148,8 @@ class Term:
 
     def energy(self, x: Vector3, problem: FrameProblem, data: Any) -> Float[Array, ""]:
         """Return the energy [J] at positions x at t + 1, by components [m]."""
-        return sum_elements(self.elements(x, problem, data), x)
+        parts = self.elements(x, problem, data)
+        return sum((jnp.sum(part.energies) for part in parts), jnp.zeros((), x[0].dtype))
 
     def remainder(self, problem: FrameProblem) -> Callable[[Vector3, Any], Float[Array, ""]] | None:
         """Return the part of the energy that the blocks of `corner_energies` leave out; None where nothing is."""
@@ -194,11 +195,6 @@ def mesh_corners(
     if on == "hinges":
         return gather_corners(x, garment.hinges, garment.hinge_incidence), garment.hinges
     return (x,), jnp.arange(x[0].shape[0], dtype=jnp.int32)[:, None]
-
-
-def sum_elements(parts: tuple[Elements, ...], x: Vector3) -> Float[Array, ""]:
-    """Return the sum of the energies of elements [J], in the precision of x."""
-    return sum((jnp.sum(part.energies) for part in parts), jnp.zeros((), x[0].dtype))
 
 
 def vertex_shares(parts: tuple[Elements, ...], num_vertices: int) -> Float[Array, " vertices"]:

@@ -23,9 +23,8 @@ REACH = 0.08
 _MEETS = 0.04  # [m] between layers that may touch during the frames around
 _FAR_AT_REST = 2.0 * _MEETS  # [m] between places of one piece that may meet; nearer ones bend towards
 _SPACING = 0.1  # [s] between the frames that are looked at to decide what is modelled
-_MOST_COMPARED = (
-    4000  # vertices of a piece that are compared with each other; a part of a finer one is enough
-)
+# Vertices of a piece that are compared with each other; a part of a finer one is enough.
+_MOST_COMPARED = 4000
 skinned_frames = jax.jit(skin_garment)
 
 

@@ -74,9 +74,7 @@ class Checkpoints:
         for step in steps:
             try:
                 plain = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
-            except (
-                Exception
-            ) as error:  # orbax, its storage and JAX each have classes of their own for bad bytes
+            except Exception as error:  # orbax, its storage and JAX have classes of their own for bad bytes
                 reasons.append(f"{step}: {one_line(error)[:_LONGEST]}")
                 continue
             for damaged in steps[: len(reasons)] if jax.process_index() == 0 else []:

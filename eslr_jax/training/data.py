@@ -136,9 +136,15 @@ def build_training_data(
     if has_shapes:
         if not body.shape_directions.shape[-1]:
             raise ConfigError("the body has no shapes; train with shape_range = 0")
+        # Offsets of joint transforms are linear in the joints' places.
+        nowhere, directions = np.zeros((len(rotations), 3)), body.joint_shape_directions
+        joints = [
+            joint_transforms(rotations, nowhere, directions[..., k], body.parents)[..., 3]
+            for k in range(directions.shape[-1])
+        ]
         shapes = Shapes(
             surface=body.shape_directions[surface.vertex_ids],
-            joints=_joint_shifts(rotations, body),
+            joints=jnp.stack(joints, axis=-1),
             garments=jnp.stack([_garment_shifts(garment, body) for garment in garments]),
         )
     return TrainingData(
@@ -153,16 +159,6 @@ def build_training_data(
         start_frames=jnp.asarray(np.flatnonzero(frames_left), jnp.int32),
         shapes=shapes,
     )
-
-
-def _joint_shifts(rotations: np.ndarray, body: Body) -> Float[Array, "frames joints 3 shapes"]:
-    """Return how the offsets of joint transforms move with the shape: they are linear in the joints' places."""
-    nowhere = np.zeros((len(rotations), 3))
-    shifts = [
-        joint_transforms(rotations, nowhere, body.joint_shape_directions[..., k], body.parents)[..., 3]
-        for k in range(body.joint_shape_directions.shape[-1])
-    ]
-    return jnp.stack(shifts, axis=-1)
 
 
 def _garment_shifts(garment: Garment, body: Body) -> Float[Array, "vertices 3 shapes"]:

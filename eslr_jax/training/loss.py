@@ -62,8 +62,7 @@ def physics_loss(
         scale = 1.0
         if config.energy_set == "consistent":
             scale = _FALL * problem.gravity * jnp.sum(problem.masses)
-        is_last = config.refinement_weights == "last"
-        loss = (energies[-1] if is_last else jnp.mean(energies)) / scale
+        loss = jnp.mean(energies) / scale
     last = jax.tree.map(lambda values: values[-1], terms)
     return loss, LossReport(onward, last, guess_value)
 

@@ -144,7 +144,7 @@ def rigidity(is_smoke: bool) -> list[Answer]:
             material = with_rigidity(garment, (RIGIDITY, RIGIDITY))
             found = cantilever_rigidity(garment, material.plate)
             answers.append(Answer("rigidity of a cantilever", setting, "N m", found, RIGIDITY, 0.05))
-            angles, _ = dihedral_angles(jnp.asarray(tube(positions, 0.12, 0.4), jnp.float32), garment)
+            angles = dihedral_angles(jnp.asarray(tube(positions, 0.12, 0.4), jnp.float32), garment)
             energies = 0.5 * np.sum(np.asarray(plate_curvatures(angles, material.plate)) ** 2, axis=0)
             # Free edges may unbend: faces in the middle tell the rigidity.
             middle = positions[faces].mean(axis=1)

@@ -25,7 +25,7 @@ def plate_of(garment, along=RIGIDITY, across=RIGIDITY, direction=(0.0, 0.0, 1.0)
 
 @jax.jit
 def face_energies(x, garment, plate):
-    angles, _ = dihedral_angles(x, garment)
+    angles = dihedral_angles(x, garment)
     return 0.5 * jnp.sum(jnp.stack(plate_curvatures(angles, plate)) ** 2, axis=0)
 
 
