@@ -1,7 +1,8 @@
 """Pytrees that travel through the simulator. SI units, Y up, right-handed.
 
-Padding: arrays are padded to a bucket. Padded faces, hinges and edges point at a garment's last vertex, which may
-be a padded one, and carry zero area, so every sum over them is exactly zero. An index is never out of range.
+Padding: arrays are padded to a bucket. The last vertex of a padded garment is a real row with zero area; padded
+faces, hinges and edges point at it and carry zero area, so every sum over them is exactly zero. An index is
+never out of range.
 """
 
 from __future__ import annotations

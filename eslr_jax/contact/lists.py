@@ -40,11 +40,11 @@ def joint_meshes(garment: Garment, surface: BodySurface | None, *, has_layers: b
     """Return the primitives of a garment and of the part of a body that it can reach."""
     count = garment.vertex_areas.shape[0]
     vertex_ids = jnp.arange(count, dtype=jnp.int32)[None]
-    is_real, is_edge = garment.vertex_mask, garment.edges[:, 0] != garment.edges[:, 1]  # not padded
+    is_real = garment.vertex_mask
     parts = [
         (vertex_ids, is_real, garment.vertex_blocks),
         (garment.faces.T, garment.rest_areas > 0, garment.face_blocks),
-        (garment.edges.T, is_real[garment.edges].all(axis=1) & is_edge, garment.edge_blocks),
+        (garment.edges.T, is_real[garment.edges[:, 0]] & is_real[garment.edges[:, 1]], garment.edge_blocks),
     ]
     bodies = [None, None, None]
     if surface is not None:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from eslr_jax.errors import CapacityError
 from eslr_jax.mesh.topology import moved_incidence
-from eslr_jax.types import Garment, Material
+from eslr_jax.types import Garment
 
 BLOCK = 8  # vertices that a search handles together, see `Garment.vertex_blocks`
 FACE_BLOCK = 16  # likewise faces; at most 32
 EDGE_BLOCK = 16  # likewise edges
-STEPS_PER_OCTAVE = 16  # a size is rounded up by at most a sixteenth of itself
+STEPS_PER_OCTAVE = 16  # a size is rounded up by at most a sixteenth
 
 
 class Bucket(NamedTuple):
@@ -36,19 +36,15 @@ def round_up(count: int, steps: int = STEPS_PER_OCTAVE) -> int:
     return -(-count // step) * step
 
 
-def choose_bucket(garment: Garment, vertices: int | None = None) -> Bucket:
+def choose_bucket(garment: Garment) -> Bucket:
     """Return the bucket of an unpadded garment; almost a function of its vertex count alone.
 
     A mesh of n vertices without handles has fewer than 2 n faces, 3 n hinges and 6 n directed edges. Sizes
     follow these bounds, so garments of similar vertex counts share a bucket. A mesh beyond them gets its own
-    counts rounded up.
-
-    Args:
-        garment: The garment.
-        vertices: Of the bucket; by default the next larger size.
+    counts rounded up. One vertex is always spare, for the padding to point at.
     """
     have = garment_bucket(garment)
-    vertices = round_up(have.vertices + 1) if vertices is None else vertices
+    vertices = round_up(have.vertices + 1)
 
     def holding(bound: int, count: int) -> int:
         return bound if count <= bound else round_up(count)
@@ -96,7 +92,7 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
         The padded garment, with NumPy leaves of the same dtypes.
 
     Raises:
-        CapacityError: The bucket is too small.
+        CapacityError: The bucket is too small, or has no spare vertex.
     """
     bucket = choose_bucket(garment) if bucket is None else bucket
     have = garment_bucket(garment)
@@ -105,6 +101,9 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
             raise CapacityError(f"the garment has {name} {has}, the bucket holds {wants}; use choose_bucket")
     if have == bucket:
         return garment
+    if have.vertices == bucket.vertices:
+        needed = have.vertices + 1
+        raise CapacityError(f"padding needs a vertex to point at; give the bucket at least {needed} vertices")
     leaves = {name: np.asarray(getattr(garment, name)) for name in garment.__dataclass_fields__}
     last = bucket.vertices - 1
     values = {
@@ -150,41 +149,3 @@ def pad_garment(garment: Garment, bucket: Bucket | None = None) -> Garment:
         spare = -(-count // size) - len(leaves[name])
         padded[name] = np.pad(leaves[name], ((0, spare), (0, 0)), constant_values=count - 1)
     return dataclasses.replace(garment, **padded)
-
-
-def pad_material(material: Material, garment: Garment, bucket: Bucket) -> Material:
-    """Return the fabric of an unpadded garment for one that is padded to a bucket of as many vertices.
-
-    What a fabric has by face or by hinge is repeated where it is padded: without area it counts for nothing.
-    """
-    have = garment_bucket(garment)
-    faces, hinges = bucket.faces - have.faces, bucket.hinges - have.hinges
-
-    def longer(values: Any, rows: int, axis: int = 0) -> Any:
-        if not np.ndim(values):
-            return values
-        width = [(0, 0)] * np.ndim(values)
-        width[axis] = (0, rows)
-        return np.pad(np.asarray(values), width, mode="edge")
-
-    plate, threads = material.plate, material.threads
-    if plate is not None:
-        rows = np.asarray(plate.rows)
-        plate = plate.replace(
-            hinges=longer(plate.hinges, faces),
-            incidence=moved_incidence(plate.incidence, 9, have.faces, bucket.faces, bucket.hinges),
-            rows=np.pad(rows, ((0, 0), (0, 0), (0, faces))),
-        )
-    if threads is not None:
-        threads = threads.replace(
-            warp=longer(threads.warp, faces),
-            stiffness=longer(threads.stiffness, faces, 1),
-            limits=None if threads.limits is None else longer(threads.limits, faces, 1),
-        )
-    return material.replace(
-        lame_mu=longer(material.lame_mu, faces),
-        lame_lambda=longer(material.lame_lambda, faces),
-        bending_stiffness=longer(material.bending_stiffness, hinges),
-        plate=plate,
-        threads=threads,
-    )

@@ -14,9 +14,9 @@ from eslr_jax.types import BodySurface
 _PATCH_SIZE = 16
 
 
-# Vertices of a padded surface. A part of a body between the first two numbers is padded to the second: so shirts,
-# shorts and trousers share programs. Larger ones are rounded up, by a quarter at most.
-_SMALL, _SHARED, _STEPS = 1024, 4096, 4
+# A part of a body of so many vertices or more is padded, by an eighth at most: then most motions of a garment,
+# which reaches a little more or less of the body in each, share programs; a T-shirt's frame takes 2 % longer.
+_SHARED, _STEPS = 1024, 8
 
 
 def compact_groups(points: Float[np.ndarray, "points 3"], size: int) -> Int[np.ndarray, "groups size"]:
@@ -64,28 +64,19 @@ def prepare_surface(
     )
 
 
-def padded_vertices(surface: BodySurface) -> int:
-    """Return the number of vertices that a surface is padded to, so that others share its sizes."""
-    count = len(surface.vertex_ids)
-    if count < _SMALL:
-        return count
-    wanted = round_up(max(count + 1, _SHARED), _STEPS)
-    fits = len(surface.faces) <= 2 * wanted and len(surface.edges) <= 3 * wanted
-    return wanted if fits else count
-
-
-def pad_surface(surface: BodySurface, num_vertices: int) -> BodySurface:
-    """Pad a surface to a number of vertices, of `padded_vertices`, with twice the faces and thrice the edges.
+def pad_surface(surface: BodySurface) -> BodySurface:
+    """Pad a large surface to a number of vertices that others have, with twice the faces and thrice the edges.
 
     Padded faces and edges point at the last vertex. What is padded is in groups of its own, which are far away
-    (`types.FAR`), so no search looks into them.
+    (`types.FAR`), so no search looks into them. The `vertex_ids` of padded vertices name no vertex of the body.
 
     Args:
         surface: Of `prepare_surface`.
-        num_vertices: With padded ones, whose `vertex_ids` name no vertex of the body.
     """
     have = len(surface.vertex_ids)
-    if num_vertices == have:
+    num_vertices = round_up(have + 1, _STEPS)
+    is_sheet = len(surface.faces) <= 2 * num_vertices and len(surface.edges) <= 3 * num_vertices
+    if have < _SHARED or not is_sheet:
         return surface
     last, num_faces, num_edges = num_vertices - 1, 2 * num_vertices, 3 * num_vertices
 

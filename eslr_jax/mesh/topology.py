@@ -117,7 +117,7 @@ def moved_incidence(
     Entry corner * n + item, of n items, becomes corner * m + item, and so does what fills rows, corners * n.
     """
     corner, item = np.divmod(table, max(num_items, 1))
-    moved = np.full((num_rows, degree or table.shape[1]), corners * padded_items, table.dtype)
+    moved = np.full((num_rows, degree), corners * padded_items, table.dtype)
     is_filled = table == corners * num_items
     rows, columns = table.shape
     moved[:rows, :columns] = np.where(is_filled, corners * padded_items, corner * padded_items + item)

@@ -13,10 +13,10 @@ import numpy as np
 from eslr_jax.errors import ConfigError, MeshError
 from eslr_jax.mesh.padding import choose_bucket, common_bucket
 from eslr_jax.mesh.prepare import pad_alike
+from eslr_jax.mesh.surface import pad_surface
 from eslr_jax.pose.motion import check_length
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.scene import Integrator, first_state, scene_from, slice_tracks, worn_material
-from eslr_jax.simulation.shapes import share_start
 from eslr_jax.terms import Term, scene_terms
 from eslr_jax.terms.worn import Worn, looseness, skinned_frames, surface_near, within
 from eslr_jax.types import Body, BodyMotion, BodySurface, ClothState, Garment, Material, Scene
@@ -184,7 +184,12 @@ def _build(
     def scene(start: ClothState) -> Scene:
         return scene_from(start, garment, poses, material, terms, pin_targets=pins, substeps=substeps)
 
-    given = (*jax.tree.map(jnp.asarray, share_start(garment, poses, terms)), terms)
+    begin = poses.replace(
+        positions=poses.positions[:2],
+        joint_transforms=poses.joint_transforms[:2],
+        surface=jax.tree.map(jnp.asarray, pad_surface(poses.surface)),
+    )
+    given = garment, begin, terms
     program = find_program(first_state, given, **starting)
     on_shapes(scene(program.results))
     return scene(program.wait()(*given))

@@ -14,14 +14,14 @@ from jaxtyping import Array, Int
 from eslr_jax.config import SimConfig
 from eslr_jax.errors import CapacityError, ConfigError, EslrError, MotionError, NonFiniteError, Status
 from eslr_jax.fabric.validate import validate_material, validate_timestep
+from eslr_jax.mesh.surface import pad_surface
 from eslr_jax.networks.network import Network, check_network
 from eslr_jax.simulation.frame import FrameInput, frame_inputs, without_tracks
 from eslr_jax.simulation.program import find_program
 from eslr_jax.simulation.rollout import Frames, join_frames, scan_frames
 from eslr_jax.simulation.scene import initial_state, slice_tracks
-from eslr_jax.simulation.shapes import share_shapes
 from eslr_jax.simulation.stepper import make_stepper, past_state
-from eslr_jax.types import ClothState, Scene, Trajectory
+from eslr_jax.types import FAR, ClothState, Obstacle, Scene, Trajectory
 
 _CHUNK = 10  # frames per call of the compiled scan: progress is shown, and scenes of any length share it
 
@@ -118,7 +118,7 @@ def _in_chunks(
     total, chunk = scene.num_frames - 1, _chunk_of(scene)
     # The last chunk goes on beyond the last frame, and what it simulates there is dropped: all stands still.
     held = np.minimum(np.arange(scene.num_frames + chunk), total)
-    shared = share_shapes(jax.device_get(scene))  # on the host, where it compiles nothing
+    shared = _share_programs(jax.device_get(scene))  # on the host, where it compiles nothing
     inputs = frame_inputs(slice_tracks(shared, held))
     constant = jax.tree.map(jnp.asarray, _without_frames(shared))
 
@@ -212,7 +212,7 @@ def begin_compiling(
 
     Args:
         params: A network, or None.
-        scene: The scene, or its shapes, of `jax.eval_shape`.
+        scene: The scene; its initial state may be shapes alone.
         config: As for `simulate`.
         is_paced: Whether `simulate` will get a pace.
     """
@@ -222,7 +222,17 @@ def begin_compiling(
         bound = jnp.int32(0) if is_paced else None
         return params, _without_frames(scene), scene.initial_state, inputs, bound
 
-    find_program(_scan, jax.eval_shape(first_chunk, params, share_shapes(scene)), config=config).begin()
+    find_program(_scan, jax.eval_shape(first_chunk, params, _share_programs(scene)), config=config).begin()
+
+
+def _share_programs(scene: Scene) -> Scene:
+    """Return a scene whose body is padded, so that other motions run the same program (host)."""
+    body = scene.body
+    if body is None:
+        return scene
+    surface, positions = pad_surface(body.surface), np.asarray(body.positions)
+    added = ((0, 0), (0, len(surface.vertex_ids) - positions.shape[1]), (0, 0))
+    return scene.replace(body=Obstacle(surface, np.pad(positions, added, constant_values=FAR)))
 
 
 def _chunk_of(scene: Scene) -> int:

@@ -55,21 +55,23 @@ def test_signed_distance_normal_and_gate(sphere):
     np.testing.assert_array_equal(contacts.is_near, [True, True, False])
 
 
-def test_a_padded_body_is_found_as_the_body_itself(sphere):
-    _, vertices, surface = sphere
+def test_a_padded_body_is_found_as_the_body_itself():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.25)
+    surface = prepare_surface(mesh.vertices, mesh.faces)
+    padded = pad_surface(surface)
+    extra = len(padded.vertex_ids) - len(surface.vertex_ids)
+    assert extra > 0
+    vertices = np.asarray(mesh.vertices, np.float32)[surface.vertex_ids]
     cloth = jnp.asarray(np.random.default_rng(1).uniform(-0.4, 0.4, (200, 3)), jnp.float32)
-    plain, padded = (
+    alone, beside = (
         jax.jit(find_both_sides)(cloth, places, 1.1 * places, searched, None, cloth + 0.3)
         for places, searched in (
             (vertices, surface),
-            (
-                np.pad(vertices, ((0, 700 - len(vertices)), (0, 0)), constant_values=FAR),
-                pad_surface(surface, 700),
-            ),
+            (np.pad(vertices, ((0, extra), (0, 0)), constant_values=FAR), padded),
         )
     )
-    for name in plain[0].__dataclass_fields__:
-        for one, other in zip(plain, padded, strict=True):
+    for name in alone[0].__dataclass_fields__:
+        for one, other in zip(alone, beside, strict=True):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
 
 

@@ -122,19 +122,12 @@ def test_garments_of_like_size_share_a_bucket(builders):
     assert common_bucket([choose_bucket(first), garment_bucket(second)]) == choose_bucket(first)
 
 
-def test_items_alone_are_padded_at_the_last_vertex(garment):
-    bucket = choose_bucket(garment, 153)
-    assert bucket[:4] == (153, 306, 459, 918)
-    padded = pad_garment(garment, bucket)
-    for name, count in (("faces", 272), ("hinges", 391), ("edges", 425), ("senders", 850)):
-        np.testing.assert_array_equal(np.asarray(getattr(padded, name))[count:], 152, err_msg=name)
-    np.testing.assert_array_equal(padded.rest_positions, garment.rest_positions)
-
-
 def test_small_bucket_is_named(garment):
     bucket = choose_bucket(garment)
     with pytest.raises(CapacityError, match=r"faces 272, the bucket holds 10"):
         pad_garment(garment, bucket._replace(faces=10))
+    with pytest.raises(CapacityError, match="at least 154 vertices"):
+        pad_garment(garment, bucket._replace(vertices=153))
     assert pad_garment(garment, garment_bucket(garment)) is garment
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from eslr_jax.contact.nearest import find_contacts
 from eslr_jax.simulation.program import Program, find_program
-from eslr_jax.simulation.shapes import share_shapes
 from eslr_jax.terms.stretch import principal_stretches
 from eslr_jax.types import Garment, Obstacle, Scene
 
@@ -38,7 +37,6 @@ def measures_program(positions: Float[Array, "frames vertices 3"], scene: Scene)
 
 def _measured(positions: Any, scene: Scene) -> tuple:
     """Return what measures depend on, which is not what the scene models."""
-    scene = share_shapes(scene)
     return positions, scene.garment, scene.timestep, scene.body
 
 
