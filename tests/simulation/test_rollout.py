@@ -28,7 +28,7 @@ from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.gap import trajectory_gap
 from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
-from eslr_jax.terms import CLOTH, FAST, Gravity
+from eslr_jax.terms import FAST, Gravity
 
 SOLVER = SimConfig(iterations=15)
 SMALL = dataclasses.replace(MODELS["smooth-small"], latent_size=8)
@@ -58,9 +58,18 @@ def network():
     return SMALL.new_network()
 
 
+run = jax.jit(rollout, static_argnames="config")
+advance = jax.jit(step, static_argnames="config")
+
+
 @pytest.fixture(scope="module")
 def solved(cloth, poses):
-    return rollout(None, cloth, poses, config=SOLVER)
+    return run(None, cloth, poses, config=SOLVER)
+
+
+@pytest.fixture(scope="module")
+def scene(cloth, poses):
+    return prepare_scene(cloth, poses, terms=FAST)
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +87,28 @@ def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
 
 @pytest.mark.slow
 def test_jit_equals_the_plain_call(cloth, poses, solved):
-    found = jax.jit(rollout, static_argnames="config")(None, cloth, poses, config=SOLVER)
+    found = rollout(None, cloth, poses, config=SOLVER)
     np.testing.assert_allclose(found.positions, solved.positions, atol=ROUNDING)
 
 
-def test_steps_one_by_one_are_the_rollout(cloth, poses, solved):
-    scene = prepare_scene(cloth, poses, terms=FAST)
-    state, advance = scene.initial_state, jax.jit(partial(step, None, scene, config=SOLVER))
+def test_steps_one_by_one_are_the_rollout(scene, solved):
+    state = scene.initial_state
     for frame in range(scene.num_frames - 1):
-        state, report = advance(state, frame)
+        state, report = advance(None, scene, state, frame, config=SOLVER)
         np.testing.assert_allclose(state.position, solved.positions[frame + 1], atol=ROUNDING)
         assert int(report.iterations) == int(solved.iterations[frame + 1])
+
+
+def test_other_values_compile_nothing_anew(scene):
+    start, gravity = scene.initial_state, scene.term(Gravity)
+    advance(None, scene, start, 0, config=SOLVER)
+    before = advance._cache_size()
+    faster = scene.replace(
+        terms=scene.with_term(gravity.replace(acceleration=0.3 * gravity.acceleration)).terms,
+        material=jax.tree.map(jnp.asarray, FABRICS[1]),
+    )
+    advance(None, faster, start.replace(velocity=2 * start.velocity), 0, config=SOLVER)
+    assert advance._cache_size() == before
 
 
 @pytest.mark.slow  # a batch maps its scenes too, see test_batch.py
@@ -141,7 +161,7 @@ def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved
 
 def test_non_finite_positions_raise_with_the_frame(cloth, poses):
     broken = poses.replace(positions=poses.positions.at[2].set(jnp.nan))
-    trajectory = rollout(None, cloth, broken, config=SOLVER)
+    trajectory = run(None, cloth, broken, config=SOLVER)
     with pytest.raises(NonFiniteError, match="frame 2"):
         raise_for_status(trajectory)
 
@@ -160,20 +180,6 @@ def test_weights_of_another_architecture_are_refused(cloth, poses, network):
 def test_single_frame_is_refused(cloth, poses):
     with pytest.raises(MotionError, match="two frames"):
         prepare_scene(cloth, drifting_ball(1))
-
-
-def test_other_values_compile_nothing_anew(cloth, poses):
-    scene = prepare_scene(cloth, poses, terms=CLOTH)
-    rollout_scene(None, scene, SOLVER)
-    before = rollout_scene._cache_size()
-    gravity = scene.term(Gravity)
-    faster = scene.replace(
-        initial_state=scene.initial_state.replace(velocity=2 * scene.initial_state.velocity),
-        terms=scene.with_term(gravity.replace(acceleration=0.3 * gravity.acceleration)).terms,
-        material=jax.tree.map(jnp.asarray, FABRICS[1]),
-    )
-    rollout_scene(None, faster, SOLVER)
-    assert rollout_scene._cache_size() == before
 
 
 @pytest.mark.slow

@@ -222,11 +222,12 @@ def test_a_program_is_compiled_once_for_scenes_of_any_length(scene):
 def compiled_early(pace):
     """Simulate by a program that was compiled while the scene was prepared; return the trajectory."""
     config = SimConfig(iterations=10)  # of no other test, whose programs are kept
-    prepare_scene(square(), drifting_ball(14))  # its start is a program too
+    prepare_scene(square(), drifting_ball(14), terms=CLOTH)  # its start is a program too
     before = _program.cache_info().misses
     scene = prepare_scene(
         square(),
         drifting_ball(14),
+        terms=CLOTH,
         on_shapes=lambda shapes: begin_compiling(None, shapes, config, is_paced=pace is not None),
     )
     assert _program.cache_info().misses == before + 1
@@ -347,7 +348,7 @@ def test_a_body_too_fast_to_follow_is_told(scene):
 
 def test_a_body_that_jumps_away_from_the_cloth_is_not_too_fast_to_follow(scene):
     body = scene.body
-    fallen = scene.replace(
+    fallen = without_pushes(scene).replace(
         body=body.replace(positions=body.positions.at[5:].add(jnp.array([0.0, -0.4, 0.0])))
     )
     trajectory = simulate(None, fallen, config=SOLVER).trajectory
