@@ -85,6 +85,15 @@ def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
     assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
 
 
+def test_a_trajectory_is_plain_arrays_by_name(tmp_path, solved):
+    arrays = solved.to_dict()
+    assert {type(array) for array in arrays.values()} == {np.ndarray}
+    np.testing.assert_array_equal(arrays["stretch_energy"], solved.energies["stretch"])
+    np.testing.assert_array_equal(arrays["positions"], solved.positions)
+    assert "terms" not in arrays
+    np.savez(tmp_path / "a.npz", **arrays)
+
+
 @pytest.mark.slow
 def test_jit_equals_the_plain_call(cloth, poses, solved):
     found = rollout(None, cloth, poses, config=SOLVER)
