@@ -13,7 +13,6 @@ from eslr_jax import (
     CheckpointError,
     ConfigError,
     MotionError,
-    NonFiniteError,
     SimConfig,
     Status,
     plan_scene,
@@ -26,7 +25,6 @@ from eslr_jax import (
 from eslr_jax.fabric.materials import COTTON
 from eslr_jax.networks.registry import MODELS
 from eslr_jax.pipeline.report.gap import trajectory_gap
-from eslr_jax.simulation.simulate import raise_for_status
 from eslr_jax.simulation.stepper import keeps_tolerance
 from eslr_jax.terms import FAST, Gravity
 
@@ -83,6 +81,7 @@ def test_cloth_over_a_ball_falls_around_it_and_stays_outside(solved):
     assert positions[-1, 0, 1] < positions[0, 0, 1] - 0.02, "corners fall"
     middle = positions[-1].reshape(8, 8, 3)[3:5, 3:5].reshape(-1, 3)
     assert middle[:, 1].min() > 0.095, "the middle rests on the ball"
+    assert float(solved.friction_loads[-1].sum()) > 0.1 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"
 
 
 def test_a_trajectory_is_plain_arrays_by_name(tmp_path, solved):
@@ -153,26 +152,11 @@ def test_a_plan_leaves_out_what_the_scene_does_not_need(cloth, poses, solved):
     np.testing.assert_allclose(planned.positions, solved.positions, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_a_trajectory_tells_its_energies_and_friction_loads(cloth, poses, solved):
-    from eslr_jax.pipeline.report.foreign import find_friction_loads
-    from eslr_jax.pipeline.report.gap import reached_potentials, trajectory_states
-
-    scene = prepare_scene(cloth, poses).replace(pin_targets=None)
-    trajectory = rollout_scene(None, scene, SOLVER)
-    states, inputs = trajectory_states(trajectory, scene)
-    found = reached_potentials(trajectory.positions[1:], states, inputs, scene)
-    np.testing.assert_allclose(sum(trajectory.energies.values())[1:], found, rtol=1e-4)
-    loads = find_friction_loads(trajectory.positions, trajectory.velocities, scene)
-    np.testing.assert_allclose(loads, trajectory.friction_loads, rtol=1e-3, atol=1e-6)
-    assert float(trajectory.friction_loads[-1].sum()) > 0.1 * 9.81 * 0.2 * 0.24**2, "the ball carries cloth"
-
-
-def test_non_finite_positions_raise_with_the_frame(cloth, poses):
+def test_non_finite_positions_are_told_with_the_frame(cloth, poses):
     broken = poses.replace(positions=poses.positions.at[2].set(jnp.nan))
     trajectory = run(None, cloth, broken, config=SOLVER)
-    with pytest.raises(NonFiniteError, match="frame 2"):
-        raise_for_status(trajectory)
+    assert Status.NON_FINITE in Status(int(trajectory.status))
+    assert int(trajectory.first_bad_frame) == 2
 
 
 def test_weights_without_their_description_are_refused(cloth, poses, network):
