@@ -159,9 +159,9 @@ def test_non_finite_positions_are_told_with_the_frame(cloth, poses):
     assert int(trajectory.first_bad_frame) == 2
 
 
-def test_weights_without_their_description_are_refused(cloth, poses, network):
+def test_weights_without_their_description_are_refused(scene, network):
     with pytest.raises(ConfigError, match="load_model"):
-        simulate(network.params, prepare_scene(cloth, poses), config=ALONE)
+        simulate(network.params, scene, config=ALONE)
 
 
 def test_weights_of_another_architecture_are_refused(cloth, poses, network):
