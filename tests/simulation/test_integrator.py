@@ -16,7 +16,7 @@ from eslr_jax import (
     scene_terms,
     score_trajectory,
 )
-from eslr_jax.terms import Air
+from eslr_jax.terms import FAST, Air
 
 GRAVITY = 9.81  # [m/s^2]
 
@@ -71,7 +71,8 @@ def test_bdf2_with_few_iterations_stays_where_the_cloth_is():
 
 @pytest.mark.slow
 def test_the_gap_of_a_bdf2_trajectory_is_that_of_its_own_problems():
-    draped = prepare_scene(square(), drifting_ball(13), integrator="bdf2")
+    """Without strict contact, whose pushes leave the minimum."""
+    draped = prepare_scene(square(), drifting_ball(13), terms=FAST, integrator="bdf2")
     trajectory = rollout_scene(None, draped, SimConfig(iterations=100))
     assert score_trajectory(trajectory, draped, every=6)["gap_relative_max"] < 1e-3
 
